@@ -1,0 +1,16 @@
+"""The errors that faintspot raises for what a user gave it, always in one line."""
+
+
+class InputError(ValueError):
+    """A value from outside (argument, file, configuration) that cannot be used.
+
+    The message is one line: it names the value, what was expected and where it was found.
+    The command line prints it and exits with code 2.
+    """
+
+
+class MissingExtraError(ImportError):
+    """An optional dependency is absent; the message names the extra that installs it."""
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(f"{purpose} needs {package}: install it with pip install 'faintspot[{extra}]'")

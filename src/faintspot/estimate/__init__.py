@@ -1,0 +1,1 @@
+"""What is done to a stack of sub-aperture images, as plain functions."""

@@ -1,0 +1,25 @@
+"""Why a sub-aperture's slope is what it is: one bit a reason."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+
+class SubapertureFlag(IntFlag):
+    """Bits of `Slopes.flags`. The first two make a slope invalid; the others only inform."""
+
+    NO_LIGHT = 1
+    """Nothing usable is left after the background subtraction; the slope is that of the reference (0)."""
+    TOO_MANY_BAD_PIXELS = 2
+    """More bad pixels than the settings allow; the slope is that of the reference (0)."""
+    BAD_PIXELS = 4
+    """Some pixels were bad (masked, NaN or infinite) and were filled from their neighbours."""
+    SATURATED = 8
+    """At least one pixel reached the saturation level."""
+    INFEASIBLE_STRENGTH = 16
+    """The strength is at or above the image's own rms: the denoised image is constant."""
+    NOT_CONVERGED = 32
+    """The iteration limit came before the tolerance was reached."""
+
+
+INVALID = SubapertureFlag.NO_LIGHT | SubapertureFlag.TOO_MANY_BAD_PIXELS

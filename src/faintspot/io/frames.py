@@ -1,0 +1,219 @@
+"""Frames in: one long sequence from FITS, NumPy and Zarr files, read in blocks of bounded memory."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.io.locations import StoredArray, one_line, split_location
+
+_SIGNATURES = {b"SIMPLE": "fits", b"\x1f\x8b": "fits", b"\x93NUMPY": "npy", b"PK\x03\x04": "npz"}
+
+
+class FrameSource:
+    """Frames of one or several files as one sequence, for one thread at a time.
+
+    Reading in order is cheap for every format; in compressed files going back starts from the front.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Height and width of a frame in pixels.
+    n_frames : int
+        Number of frames in all files together.
+    dtype : numpy.dtype
+        Data type of every block.
+    description : str
+        The file names, for messages.
+    """
+
+    def __init__(self, arrays: Sequence[StoredArray]) -> None:
+        self._arrays = arrays
+        self._starts = [0, *accumulate(_frame_count(array) for array in arrays)]
+        self._open: StoredArray = arrays[0]
+        self.shape: tuple[int, int] = (arrays[0].shape[-2], arrays[0].shape[-1])
+        self.n_frames: int = self._starts[-1]
+        self.dtype: np.dtype[Any] = np.result_type(*(array.dtype for array in arrays))
+        others = f" and {len(arrays) - 1} more" if len(arrays) > 1 else ""
+        self.description: str = f"{arrays[0].name}{others}"
+
+    def block(self, start: int, stop: int) -> NDArray[Any]:
+        """Return frames `start` to `stop` (exclusive), shape (stop - start, height, width).
+
+        The array is the caller's own, in native byte order.
+
+        Raises
+        ------
+        InputError
+            When the range is not within the sequence, or a file is damaged there; it names the frame.
+        """
+        if not 0 <= start < stop <= self.n_frames:
+            raise InputError(f"frames {start} to {stop} of {self.description}: expected 0 to {self.n_frames}")
+        first = bisect_right(self._starts, start) - 1
+        parts = []
+        for number in range(first, len(self._arrays)):
+            begin, end = self._starts[number], self._starts[number + 1]
+            if begin >= stop:
+                break
+            parts.append(self._read(self._arrays[number], max(start, begin) - begin, min(stop, end) - begin))
+        whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return whole.astype(self.dtype, copy=False)
+
+    def blocks(self, start: int, stop: int, size: int) -> Iterator[tuple[int, NDArray[Any]]]:
+        """Yield (first frame, block) from `start` to `stop` in blocks of up to `size` frames."""
+        for first in range(start, stop, size):
+            yield first, self.block(first, min(first + size, stop))
+
+    def close(self) -> None:
+        """Close the file that is open, if any."""
+        self._open.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _read(self, array: StoredArray, start: int, stop: int) -> NDArray[Any]:
+        """Read from one file, keeping no more than one open: there may be thousands."""
+        if array is not self._open:
+            self._open.close()
+            self._open = array
+        if len(array.shape) == 2:
+            return array.read(0, array.shape[0])[np.newaxis]
+        return array.read(start, stop)
+
+
+def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> FrameSource:
+    """Open files of frames, concatenated in the order given.
+
+    FITS (plain, .gz, .fz), .npy, .npz and Zarr stores are told apart by content. Each holds a cube
+    (n, height, width) or a single frame (height, width).
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        Files; "file.npz:key", "file.fits:EXTNAME" or "store.zarr:path" choose one of several arrays. Without,
+        it is the first image of a FITS file, or the array named "frames", or the only 2-D or 3-D one.
+    key : str, optional
+        The array to choose in every file whose name does not say.
+
+    Raises
+    ------
+    InputError
+        When a file is missing, damaged, of another format, or does not hold real frames of the others' size.
+    MissingExtraError
+        When the package that reads the format is not installed.
+    """
+    if isinstance(paths, str | Path):
+        paths = [paths]
+    if not paths:
+        raise InputError("frames: expected at least one file, got none")
+    arrays: list[StoredArray] = []
+    for path in paths:
+        array = _find_array(path, key)
+        _check_frames(array)
+        if arrays and array.shape[-2:] != arrays[0].shape[-2:]:
+            raise InputError(
+                f"{array.name}: its frames are {_size(array)} px (height x width), "
+                f"those of {arrays[0].name} are {_size(arrays[0])}: expected the same"
+            )
+        arrays.append(array)
+    return FrameSource(arrays)
+
+
+def read_array(location: str | Path) -> NDArray[Any]:
+    """Read one array whole (a dark, a flat, a bad-pixel map) from a FITS, .npy, .npz file or Zarr store.
+
+    Parameters
+    ----------
+    location : str or Path
+        The file; "file.npz:key", "file.fits:EXTNAME" or "store.zarr:path" choose one of several arrays.
+
+    Returns
+    -------
+    ndarray
+        Real or boolean values in native byte order, of the shape that is stored.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, damaged, of another format or does not hold a real array.
+    MissingExtraError
+        When the package that reads the format is not installed.
+    """
+    array = _find_array(location, None)
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{array.name}: expected real numbers, got dtype {array.dtype}")
+    if 0 in array.shape:
+        raise InputError(f"{array.name}: expected at least one value, got shape {array.shape}")
+    try:
+        return array.read(0, array.shape[0])
+    finally:
+        array.close()
+
+
+def _find_array(location: str | Path, key: str | None) -> StoredArray:
+    """Find the array in a file of any format; the modules for one format are imported when it is met."""
+    path, own_key = split_location(location)
+    key = own_key if own_key is not None else key
+    try:
+        kind = _kind(path)
+        if kind == "zarr":
+            from faintspot.io.zarr_files import find_zarr as find
+        elif kind == "fits":
+            from faintspot.io.fits_files import find_fits as find
+        elif kind == "npy":
+            from faintspot.io.numpy_files import find_npy as find
+        else:
+            from faintspot.io.numpy_files import find_npz as find
+        array = find(path, key)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from None
+    if not array.shape:
+        raise InputError(f"{array.name}: expected an array, got a single number")
+    return array
+
+
+def _kind(path: Path) -> str:
+    """Tell the format by the first bytes."""
+    if path.is_dir():
+        return "zarr"
+    with path.open("rb") as stream:
+        start = stream.read(8)
+    if not start:
+        raise InputError(f"{path}: expected frames, the file is empty")
+    for signature, kind in _SIGNATURES.items():
+        if start.startswith(signature):
+            return kind
+    raise InputError(f"{path}: expected a FITS, .npy or .npz file or a Zarr store, it is none of them")
+
+
+def _check_frames(array: StoredArray) -> None:
+    """Refuse what cannot be a cube or a frame."""
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{array.name}: expected frames of real numbers, got dtype {array.dtype}")
+    if len(array.shape) not in (2, 3):
+        raise InputError(
+            f"{array.name}: expected (frames, height, width) or (height, width), got shape {array.shape}"
+        )
+    if 0 in array.shape:
+        raise InputError(f"{array.name}: expected at least one frame and pixel, got shape {array.shape}")
+
+
+def _frame_count(array: StoredArray) -> int:
+    return array.shape[0] if len(array.shape) == 3 else 1
+
+
+def _size(array: StoredArray) -> str:
+    return f"{array.shape[-2]} x {array.shape[-1]}"

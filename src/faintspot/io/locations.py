@@ -1,0 +1,91 @@
+"""Which array in which file: "file", "file.npz:key", "file.fits:EXTNAME", "store.zarr:path"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+
+PREFERRED_NAME = "frames"
+
+
+class StoredArray(Protocol):
+    """An array in a file whose first axis can be read in parts; for one thread at a time."""
+
+    @property
+    def name(self) -> str:
+        """File and key, for messages."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the whole array."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Data type of what `read` returns."""
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of the first axis, in native byte order."""
+
+    def close(self) -> None:
+        """Close what is open; a later `read` opens it again."""
+
+
+def split_location(location: str | Path) -> tuple[Path, str | None]:
+    """Split "file:key" into file and key; a name that exists as it stands has no key.
+
+    Raises
+    ------
+    InputError
+        When there is no such file or directory.
+    """
+    whole = Path(location)
+    if whole.exists():
+        return whole, None
+    before, separator, key = str(location).rpartition(":")
+    if separator and key and before and Path(before).exists():
+        return Path(before), key
+    raise InputError(f"{location}: no such file or directory")
+
+
+def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> str:
+    """Return the name of the array to read: `key`, or "frames", or the only 2-D or 3-D one.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    dimensions : mapping
+        Number of dimensions of every array in the file.
+    key : str or None
+        The name that was asked for.
+
+    Raises
+    ------
+    InputError
+        When there is no such array, or no way to choose one.
+    """
+    listed = ", ".join(dimensions) or "none"
+    if key is not None:
+        if key not in dimensions:
+            raise InputError(f"{path}: no array {key!r}; it contains: {listed}")
+        return key
+    if PREFERRED_NAME in dimensions:
+        return PREFERRED_NAME
+    images = [name for name, count in dimensions.items() if count in (2, 3)]
+    if len(images) != 1:
+        raise InputError(
+            f"{path}: expected one array of frames, or one named 'frames'; "
+            f"it contains: {listed}; choose one with {path.name}:NAME"
+        )
+    return images[0]
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an error of another library in one line."""
+    return " ".join(str(error).split()) or type(error).__name__

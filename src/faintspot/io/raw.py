@@ -1,0 +1,172 @@
+"""Arrays that lie as plain bytes in a file or a compressed stream, read block by block."""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import math
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.io.locations import one_line
+
+_PIECE_BYTES = 1 << 20
+DAMAGE = (
+    OSError,
+    EOFError,
+    zlib.error,
+    lzma.LZMAError,
+    zipfile.BadZipFile,
+    RuntimeError,
+    NotImplementedError,
+)
+
+
+def open_plain_or_gzip(path: Path) -> IO[bytes]:
+    """Open a file for reading; one that starts with the gzip signature is decompressed on the way."""
+    return cast(IO[bytes], gzip.open(path, "rb")) if is_gzip(path) else path.open("rb")
+
+
+def is_gzip(path: Path) -> bool:
+    """Tell by its first bytes whether a file is gzip-compressed."""
+    with path.open("rb") as stream:
+        return stream.read(2) == b"\x1f\x8b"
+
+
+class RawArray:
+    """A C-ordered array at a byte offset of a file or of a stream that only runs forward.
+
+    A stream is decompressed once from front to back as long as blocks are asked for in order; going
+    back starts it again. Memory use is one block, whatever the size of the file.
+
+    Parameters
+    ----------
+    name : str
+        File and key, for messages.
+    open_stream : callable
+        Opens the stream at its first byte.
+    offset : int
+        Where the array starts, in bytes (of the decompressed stream).
+    dtype : numpy.dtype
+        How the numbers are stored, in any byte order.
+    shape : tuple of int
+        Shape of the array; at least one dimension.
+    forward_only : bool
+        Whether the stream is compressed: going forward means reading, and its checksum is verified
+        after the last item.
+    convert : callable, optional
+        Makes the values from the stored numbers (native byte order), block by block.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        open_stream: Callable[[], IO[bytes]],
+        *,
+        offset: int,
+        dtype: np.dtype[Any],
+        shape: tuple[int, ...],
+        forward_only: bool,
+        convert: Callable[[NDArray[Any]], NDArray[Any]] | None = None,
+    ) -> None:
+        self.name = name
+        self.shape = shape
+        self._open_stream = open_stream
+        self._offset = offset
+        self._stored = dtype
+        self._forward_only = forward_only
+        self._convert = convert or (lambda array: array)
+        self._item_bytes = math.prod(shape[1:]) * dtype.itemsize
+        self._stream: IO[bytes] | None = None
+        self._position = 0
+        self.dtype: np.dtype[Any] = self._convert(np.zeros(1, dtype.newbyteorder("="))).dtype
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of the first axis, in native byte order.
+
+        Raises
+        ------
+        InputError
+            When the file is damaged or ends too early; it names the first item that is lost.
+        """
+        block = np.empty((stop - start, *self.shape[1:]), self._stored)
+        view = memoryview(block.reshape(-1).view(np.uint8).data)
+        first = self._offset + start * self._item_bytes
+        try:
+            self._go_to(first)
+            self._fill(view)
+            if self._forward_only and stop == self.shape[0]:
+                self._read_to_end()
+        except DAMAGE as error:
+            lost = min(max(start, (self._position - self._offset) // self._item_bytes), self.shape[0] - 1)
+            self.close()
+            what = "frame" if len(self.shape) == 3 else "row"
+            raise InputError(
+                f"{self.name}: {what} {lost} (counted from 0) cannot be read: "
+                f"the file is damaged or incomplete ({one_line(error)})"
+            ) from None
+        if not block.dtype.isnative:
+            block = block.byteswap(inplace=True).view(block.dtype.newbyteorder("="))
+        return self._convert(block)
+
+    def close(self) -> None:
+        """Close the stream; a later `read` opens it again."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def _go_to(self, position: int) -> None:
+        if self._stream is None or (self._forward_only and position < self._position):
+            self.close()
+            self._position = 0
+            self._stream = self._open_stream()
+        if not self._forward_only:
+            self._stream.seek(position)
+            self._position = position
+        while self._position < position:
+            piece = self._stream.read(min(_PIECE_BYTES, position - self._position))
+            if not piece:
+                raise EOFError("it ends too early")
+            self._position += len(piece)
+
+    def _fill(self, view: memoryview) -> None:
+        """Fill `view` from the stream, from a compressed one item by item so that a loss is located."""
+        assert self._stream is not None
+        filled = 0
+        while filled < len(view):
+            piece = self._item_bytes if self._forward_only else len(view)
+            read = self._stream.readinto(view[filled : filled + piece])  # type: ignore[attr-defined]
+            if not read:
+                raise EOFError("it ends too early")
+            filled += read
+            self._position += read
+
+    def _read_to_end(self) -> None:
+        """Read what follows the array: only at its end does a compressed stream verify its checksum."""
+        assert self._stream is not None
+        while piece := self._stream.read(_PIECE_BYTES):
+            self._position += len(piece)
+
+
+class MappedArray:
+    """An array that NumPy has mapped or loaded already."""
+
+    def __init__(self, name: str, array: NDArray[Any]) -> None:
+        self.name = name
+        self.shape: tuple[int, ...] = array.shape
+        self.dtype: np.dtype[Any] = array.dtype.newbyteorder("=")
+        self._array = array
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of the first axis, C-ordered in native byte order."""
+        return np.array(self._array[start:stop], dtype=self.dtype, order="C")
+
+    def close(self) -> None:
+        """Nothing is open beyond the mapping."""

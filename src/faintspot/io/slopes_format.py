@@ -1,0 +1,188 @@
+"""What a file of slopes contains, and what all writers share."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One quantity of every frame and sub-aperture."""
+
+    dtype: str
+    units: str
+    long_name: str
+    csv_name: str
+
+
+VARIABLES: Mapping[str, Variable] = {
+    "x": Variable("float32", "px", "spot position along columns, from the sub-aperture's centre", "x_px"),
+    "y": Variable("float32", "px", "spot position along rows, from the sub-aperture's centre", "y_px"),
+    "flux": Variable("float32", "e-", "light left after background subtraction", "flux_e"),
+    "valid": Variable("bool", "1", "position was measured (else it is the reference position)", "valid"),
+    "flags": Variable("uint8", "1", "why a position is not valid, as bits", "flags"),
+    "iterations": Variable("int32", "1", "iterations of the denoiser", "iterations"),
+    "bad_pixels": Variable("int32", "1", "pixels that were replaced", "bad_pixels"),
+}
+
+RESERVED_ATTRIBUTES = frozenset({"n_frames", "n_subapertures", "finished_frames", "complete", "coordinates"})
+
+COORDINATE_UNITS: Mapping[str, str] = {"centre_x": "px", "centre_y": "px"}
+
+
+@dataclass(frozen=True)
+class StoredSlopes:
+    """Slopes read from a file.
+
+    Attributes
+    ----------
+    variables : mapping
+        x, y (px), flux (e-), valid, flags, iterations, bad_pixels, each (n_finished, n_subapertures).
+    coordinates : mapping
+        Per sub-aperture (n_subapertures,), as centre_x and centre_y (px in the frame).
+    attributes : mapping
+        What the writer was given: configuration, sources, fingerprint; a .csv has none.
+    complete : bool
+        Whether all frames of the run are there.
+    n_finished : int
+        Number of frames that are there.
+    """
+
+    variables: Mapping[str, NDArray[Any]]
+    coordinates: Mapping[str, NDArray[Any]]
+    attributes: Mapping[str, Any]
+    complete: bool
+    n_finished: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is to be written: sizes, attributes (JSON values, with a fingerprint) and coordinates."""
+
+    n_frames: int
+    n_subapertures: int
+    attributes: Mapping[str, Any]
+    coordinates: Mapping[str, NDArray[Any]]
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Frames and sub-apertures."""
+        return self.n_frames, self.n_subapertures
+
+    @property
+    def fingerprint(self) -> str:
+        """What two runs have in common when one may continue the other's output."""
+        return str(self.attributes["fingerprint"])
+
+
+class SlopeWriter(Protocol):
+    """Takes slopes block by block; a `with` statement closes it."""
+
+    def finished(self) -> int:
+        """Return how many frames it has: the next block starts there."""
+
+    def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
+        """Add frames `start`, `start` + 1 ...: every variable of `VARIABLES`, (n, n_subapertures).
+
+        Raises
+        ------
+        InputError
+            When the block does not fit, or the disk is full or not writable.
+        """
+
+    def close(self) -> None:
+        """Finish the output when it has all frames; otherwise leave it to be resumed."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+def checked_block(run: Run, finished: int, start: int, block: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """Return the block's variables in the file's types, or say what is wrong with them."""
+    if start != finished:
+        raise InputError(f"slopes: expected the block that starts at frame {finished}, got frame {start}")
+    if set(block) != set(VARIABLES):
+        raise InputError(f"slopes: expected {', '.join(VARIABLES)}, got {', '.join(block)}")
+    n = len(np.atleast_1d(block["x"]))
+    if not 0 < n <= run.n_frames - finished:
+        raise InputError(f"slopes: expected 1 to {run.n_frames - finished} more frames, got {n}")
+    arrays = {}
+    for name, variable in VARIABLES.items():
+        array = np.asarray(block[name])
+        if array.shape != (n, run.n_subapertures):
+            raise InputError(f"slopes: {name}: expected shape {(n, run.n_subapertures)}, got {array.shape}")
+        arrays[name] = array.astype(variable.dtype, copy=False)
+    return arrays
+
+
+@contextlib.contextmanager
+def output_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError while writing into one line that says what to do."""
+    advice = {
+        errno.ENOSPC: "the disk is full: free some space and run again, what is finished is kept",
+        errno.EDQUOT: "the disk quota is used up: free some space and run again, what is finished is kept",
+        errno.EACCES: "no permission to write there: choose another folder",
+        errno.EPERM: "no permission to write there: choose another folder",
+        errno.EROFS: "the file system is read-only: choose another folder",
+    }
+    try:
+        yield
+    except OSError as error:
+        reason = advice.get(error.errno or 0, f"{error.strerror or error}: choose another name")
+        raise InputError(f"{path}: cannot be written: {reason}") from None
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a small file so that a reader sees the old or the new one, never a part."""
+    temporary = path.with_name(f".{path.name}.new")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def json_values(name: str, value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a mapping as plain JSON values: NumPy numbers, arrays and paths are converted."""
+
+    def plain(item: Any) -> Any:
+        if isinstance(item, np.generic | np.ndarray):
+            return item.tolist()
+        if isinstance(item, Path):
+            return str(item)
+        raise TypeError(f"{type(item).__name__} cannot be stored")
+
+    try:
+        values: dict[str, Any] = json.loads(json.dumps(dict(value), default=plain, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected numbers, texts and lists of them ({error})") from None
+    return values
+
+
+def belongs_to_another_run(path: Path) -> InputError:
+    """Return the error for an output that a different run has begun or finished."""
+    return InputError(
+        f"{path}: belongs to another run (other frames or configuration): choose another name or --overwrite"
+    )
+
+
+def exists_already(path: Path) -> InputError:
+    """Return the error for an output that is not to be touched."""
+    return InputError(f"{path}: exists already: choose another name or --overwrite")

@@ -1,0 +1,1 @@
+"""The same work as faintspot.estimate, fast: sub-apertures in SIMD lanes."""

@@ -1,0 +1,31 @@
+"""How kernels are compiled: once per machine, kept on disk, anew whenever any kernel's source changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+
+@cache
+def _kernels_stamp() -> tuple[tuple[float, int], ...]:
+    """Modification time and size of every source file that a kernel may have inlined."""
+    package = Path(__file__).parent.parent
+    sources = sorted([*package.glob("kernels/*.py"), package / "checks.py", package / "flags.py"])
+    return tuple((source.stat().st_mtime, source.stat().st_size) for source in sources)
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """Compile with Numba: cached on disk, without the GIL, division by zero as in NumPy.
+
+    Numba's cache asks only whether a function's own file has changed, but kernels inline each other across
+    files; so their cache is stamped with all of them.
+    """
+    dispatcher = njit(cache=True, nogil=True, error_model="numpy")(function)
+    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if cache_file is not None and hasattr(cache_file, "_source_stamp"):
+        cache_file._source_stamp = _kernels_stamp()
+    return dispatcher

@@ -1,0 +1,62 @@
+"""What the machine offers: vector width, and scratch memory aligned to it."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from faintspot.errors import InputError
+from faintspot.kernels.simd import Lanes
+
+WIDTHS = (4, 8, 16)
+_ENVIRONMENT = "FAINTSPOT_SIMD_WIDTH"
+
+
+@cache
+def _native_width() -> int:
+    """float32 numbers in one vector register of this machine."""
+    import llvmlite.binding as llvm
+
+    features = llvm.get_host_cpu_features()
+    if features.get("avx512f") and features.get("avx512vl"):
+        return 16
+    return 8 if features.get("avx2") else 4
+
+
+@cache
+def _lanes(dtype: str, width: int) -> Lanes:
+    return Lanes(dtype, width)
+
+
+def lanes_for(dtype: DTypeLike, width: int | None = None) -> Lanes:
+    """The vector to compute with: W sub-apertures at once in float32, half of that in float64.
+
+    Parameters
+    ----------
+    dtype : float32 or float64
+    width : int, optional
+        float32 lanes: 4, 8 or 16. Default: the environment variable FAINTSPOT_SIMD_WIDTH, else what the
+        machine has.
+
+    Raises
+    ------
+    InputError
+        When the width is none of these.
+    """
+    wanted: Any = width if width is not None else os.environ.get(_ENVIRONMENT, _native_width())
+    if str(wanted) not in {str(choice) for choice in WIDTHS}:
+        raise InputError(f"SIMD width = {wanted!r} (argument or {_ENVIRONMENT}): expected 4, 8 or 16")
+    name = np.dtype(dtype).name
+    return _lanes(name, int(wanted) if name == "float32" else int(wanted) // 2)
+
+
+def aligned_zeros(size: int, dtype: DTypeLike) -> NDArray[Any]:
+    """A zeroed array that starts on a cache line: loads of whole vectors then never straddle two."""
+    itemsize = np.dtype(dtype).itemsize
+    memory = np.zeros(size + 64 // itemsize, dtype)
+    start = (-memory.ctypes.data % 64) // itemsize
+    return memory[start : start + size]

@@ -1,0 +1,74 @@
+"""Sharing the groups of a job among threads, each with scratch memory of its own."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from faintspot.kernels import brightest, total_variation
+from faintspot.kernels.host import aligned_zeros
+from faintspot.kernels.simd import Lanes
+
+_FEWEST_GROUPS = 16  # a thread with less to do costs more than it saves
+_local = threading.local()
+
+
+def available_cpus() -> int:
+    """Number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    """Long-lived threads; a forked process gets its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="faintspot")
+
+
+def new_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
+    """Scratch memory for one thread: image, output, state, rows, numbers, counts, flags."""
+    width, pixels = lanes.width, ny * nx
+    return (
+        aligned_zeros(pixels * width, lanes.dtype),
+        aligned_zeros(pixels * width, lanes.dtype),
+        aligned_zeros(total_variation.STATE_VECTORS * pixels * width, lanes.dtype),
+        aligned_zeros((pixels + 2 * nx + 1) * width, lanes.dtype),
+        aligned_zeros((total_variation.LANE_ROWS + brightest.LANE_ROWS) * width, lanes.dtype),
+        np.zeros(total_variation.COUNT_ROWS * width, np.int64),
+        np.zeros(2 * width, np.int64),
+    )
+
+
+def _thread_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
+    """Return the scratch of the calling thread, made anew only when the shape of the work changes."""
+    key = (lanes, ny, nx)
+    if getattr(_local, "key", None) != key:
+        _local.scratch = new_scratch(lanes, ny, nx)
+        _local.key = key
+    return _local.scratch  # type: ignore[no-any-return]
+
+
+def run_groups(
+    job: Callable[[int, int, tuple[Any, ...]], None],
+    n_groups: int,
+    lanes: Lanes,
+    window: tuple[int, int],
+    threads: int | None = None,
+) -> None:
+    """Call `job(start, stop, scratch)` so that every group is done once, on up to `threads` threads."""
+    wanted = available_cpus() if threads is None else threads
+    shares = max(1, min(wanted, n_groups // _FEWEST_GROUPS))
+
+    def work(share: int) -> None:
+        start, stop = n_groups * share // shares, n_groups * (share + 1) // shares
+        job(start, stop, _thread_scratch(lanes, *window))
+
+    if shares == 1:
+        work(0)
+    else:
+        list(_pool(os.getpid(), wanted).map(work, range(shares)))

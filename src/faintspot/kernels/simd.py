@@ -1,0 +1,282 @@
+"""An explicit vector type for Numba: kernels work on W sub-apertures at once, yet read like scalar code.
+
+A *lane* is one sub-aperture. ``Lanes("float32", 16)`` is a kind of vector: passed to a compiled function, it
+selects the specialisation, and ``load(lanes, array, offset)`` gives W consecutive numbers as one value
+that knows ``+ - * /``, comparisons and the functions below. Only generic LLVM operations are used, so the
+same code compiles to AVX-512, AVX2, SSE or NEON.
+
+Offsets count array elements and are not checked: kernels own their scratch memory.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from llvmlite import ir
+from numba import extending
+from numba.core import cgutils, types
+from numba.core.datamodel import models, register_default
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import NativeValue, typeof_impl, unbox
+
+intrinsic: Any = extending.intrinsic  # to a type checker, what it returns has the signature of its typing
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """A kind of vector: `width` numbers of type `dtype` ("float32" or "float64")."""
+
+    dtype: str
+    width: int
+
+
+class LanesKind(types.Type):
+    """Numba's type of a Lanes object: no data, it only tells functions which vector to use."""
+
+    def __init__(self, dtype: str, width: int) -> None:
+        self.scalar = types.float32 if dtype == "float32" else types.float64
+        self.width = width
+        super().__init__(name=f"LanesKind({dtype}, {width})")
+
+
+class Vector(types.Type):
+    """Numba's type of W numbers in one register."""
+
+    def __init__(self, scalar: types.Float, width: int) -> None:
+        self.scalar = scalar
+        self.width = width
+        super().__init__(name=f"Vector({scalar}, {width})")
+
+
+class Mask(types.Type):
+    """Numba's type of W truth values."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        super().__init__(name=f"Mask({width})")
+
+
+def _llvm_scalar(scalar: types.Float) -> ir.Type:
+    return ir.FloatType() if scalar == types.float32 else ir.DoubleType()
+
+
+def _llvm_vector(vector: Vector) -> ir.VectorType:
+    return ir.VectorType(_llvm_scalar(vector.scalar), vector.width)
+
+
+@typeof_impl.register(Lanes)
+def _typeof_lanes(value: Lanes, context: Any) -> LanesKind:
+    return LanesKind(value.dtype, value.width)
+
+
+@unbox(LanesKind)
+def _unbox_lanes(kind: Any, value: Any, context: Any) -> NativeValue:
+    return NativeValue(context.context.get_dummy_value())
+
+
+register_default(LanesKind)(models.OpaqueModel)
+
+
+@register_default(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Vector) -> None:
+        super().__init__(manager, kind, _llvm_vector(kind))
+
+
+@register_default(Mask)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Mask) -> None:
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.width))
+
+
+# Operators -------------------------------------------------------------------------------------------
+
+
+def _register_binary(operation: Any, emit: Callable[..., Any], comparison: bool) -> None:
+    """Make `operation` work on two vectors of the same kind."""
+
+    @infer_global(operation)
+    class _Template(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            if len(args) == 2 and isinstance(args[0], Vector) and args[0] == args[1]:
+                return signature(Mask(args[0].width) if comparison else args[0], *args)
+            return None
+
+    @lower_builtin(operation, Vector, Vector)
+    def _lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return emit(builder, *args)
+
+
+_register_binary(operator.add, lambda b, x, y: b.fadd(x, y), False)
+_register_binary(operator.sub, lambda b, x, y: b.fsub(x, y), False)
+_register_binary(operator.mul, lambda b, x, y: b.fmul(x, y), False)
+_register_binary(operator.truediv, lambda b, x, y: b.fdiv(x, y), False)
+_register_binary(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), True)
+_register_binary(operator.ge, lambda b, x, y: b.fcmp_ordered(">=", x, y), True)
+_register_binary(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), True)
+_register_binary(operator.le, lambda b, x, y: b.fcmp_ordered("<=", x, y), True)
+
+
+# Memory ----------------------------------------------------------------------------------------------
+
+
+def _element_pointer(
+    context: Any, builder: Any, array_type: Any, array: Any, offset: Any, vector: Vector
+) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    pointer = builder.gep(data, [offset])
+    return builder.bitcast(pointer, _llvm_vector(vector).as_pointer())
+
+
+@intrinsic
+def load(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
+    """Load W consecutive elements of a contiguous array, from element `offset`."""
+    vector = Vector(lanes.scalar, lanes.width)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[2], sig.args[2], types.intp)
+        pointer = _element_pointer(context, builder, sig.args[1], args[1], place, vector)
+        return builder.load(pointer, align=lanes.scalar.bitwidth // 8)
+
+    return vector(lanes, array, offset), emit
+
+
+@intrinsic
+def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
+    """Store W consecutive elements of a contiguous array, from element `offset`."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[1], sig.args[1], types.intp)
+        pointer = _element_pointer(context, builder, sig.args[0], args[0], place, value)
+        builder.store(args[2], pointer, align=value.scalar.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, offset, value), emit
+
+
+@intrinsic
+def splat(typing_context: Any, lanes: Any, number: Any) -> Any:
+    """The same number in every lane."""
+    vector = Vector(lanes.scalar, lanes.width)
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        scalar = context.cast(builder, args[1], sig.args[1], lanes.scalar)
+        llvm_vector = _llvm_vector(vector)
+        index = ir.Constant(ir.IntType(32), 0)
+        first = builder.insert_element(ir.Constant(llvm_vector, ir.Undefined), scalar, index)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [index] * lanes.width)
+        return builder.shuffle_vector(first, ir.Constant(llvm_vector, ir.Undefined), zeros)
+
+    return vector(lanes, number), emit
+
+
+# Functions -------------------------------------------------------------------------------------------
+
+
+def _call(builder: Any, name: str, vector: Vector, args: Any, flags: tuple[str, ...] = ()) -> Any:
+    llvm_vector = _llvm_vector(vector)
+    suffix = f"v{vector.width}f{vector.scalar.bitwidth}"
+    function_type = ir.FunctionType(llvm_vector, [llvm_vector] * len(args))
+    function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.{name}.{suffix}")
+    return builder.call(function, args, fastmath=flags)
+
+
+@intrinsic
+def multiply_add(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return a * b + c, in one rounding where the hardware can."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _call(builder, "fmuladd", a, args)
+
+    return a(a, b, c), emit
+
+
+@intrinsic
+def square_root(typing_context: Any, a: Any) -> Any:
+    """Correctly rounded square root."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _call(builder, "sqrt", a, args)
+
+    return a(a), emit
+
+
+@intrinsic
+def reciprocal_square_root(typing_context: Any, a: Any) -> Any:
+    """1 / sqrt(a).
+
+    In float32 the compiler may use the hardware's estimate and one Newton step (relative error about
+    1e-7); in float64 it is the correctly rounded division of the correctly rounded root.
+    """
+    flags = ("fast",) if a.scalar == types.float32 else ()
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        one = ir.Constant(_llvm_vector(a), [ir.Constant(_llvm_scalar(a.scalar), 1.0)] * a.width)
+        return builder.fdiv(one, _call(builder, "sqrt", a, args, flags), flags=flags)
+
+    return a(a), emit
+
+
+@intrinsic
+def absolute(typing_context: Any, a: Any) -> Any:
+    """|a|."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _call(builder, "fabs", a, args)
+
+    return a(a), emit
+
+
+@intrinsic
+def maximum(typing_context: Any, a: Any, b: Any) -> Any:
+    """The larger of a and b; b where either is NaN (one instruction on every target)."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[0], args[1])
+
+    return a(a, b), emit
+
+
+@intrinsic
+def minimum(typing_context: Any, a: Any, b: Any) -> Any:
+    """The smaller of a and b; b where either is NaN."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[0], args[1])
+
+    return a(a, b), emit
+
+
+@intrinsic
+def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
+    """Choose a where the mask is true, else b."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(*args)
+
+    return a(mask, a, b), emit
+
+
+@intrinsic
+def any_lane(typing_context: Any, mask: Any) -> Any:
+    """Whether the mask is true in at least one lane."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(args[0], ir.IntType(mask.width))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(mask.width), 0))
+
+    return types.boolean(mask), emit
+
+
+@intrinsic
+def width_of(typing_context: Any, lanes: Any) -> Any:
+    """W, as a compile-time constant."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return ir.Constant(ir.IntType(64), lanes.width)
+
+    return types.int64(lanes), emit

@@ -1,0 +1,405 @@
+"""Constrained total-variation denoising of a group of W sub-apertures, one in each SIMD lane.
+
+The state holds, for every pixel, five vectors side by side (one memory stream): two versions of the dual
+field p = (px, py), which take turns as the current and the previous one, and the normalised image g.
+One iteration is one sweep over the rows. v = div q - g / lambda of row y is all that row y - 1 still lacks
+for its update, so three rolling rows of vectors in scratch replace every other intermediate image.
+
+The multiplier follows from the constraint, lambda = sqrt(N) noise_std / ||div q||, renewed in every
+iteration from the norm that the preceding sweep has summed up; the fixed point is the same as with the
+norm of the running iteration, and one sweep is enough.
+
+References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 (IEEE Trans. Image Process.
+18, 2419).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from faintspot.kernels.compiling import compiled
+from faintspot.kernels.simd import (
+    load,
+    maximum,
+    minimum,
+    multiply_add,
+    reciprocal_square_root,
+    select,
+    splat,
+    square_root,
+    store,
+    width_of,
+)
+
+STATE_VECTORS = 5  # vectors per pixel: px, py of both versions, g
+IMAGE = 4  # place of g among them
+
+CHECK_INTERVAL = 5  # iterations between two convergence tests
+FIRST_MULTIPLIER = 0.4  # lambda of the first iterations, in units of the strength
+
+FGP = 0
+CHAMBOLLE = 1
+FGP_STEP = 0.125
+CHAMBOLLE_STEP = 0.25
+
+# Rows of the table of per-lane numbers (n_rows, W), in the precision of the lanes.
+STRENGTH, TOLERANCE = 0, 1  # in: noise_std in image units, relative change at which to stop
+MEAN, SCALE = 2, 3  # of the image: what normalisation takes off
+RADIUS = 4  # sqrt(N) * strength / scale: the norm that lambda * div p must have
+CHANGE, SIZE = 5, 6  # squared norms that the convergence test compares
+FINISHING = 7  # 1 in lanes whose result is written next
+MULTIPLIER = 8  # out: lambda in image units
+LANE_ROWS = 9
+
+# Rows of the table of per-lane whole numbers (n_rows, W).
+LIMIT, ITERATIONS, CONVERGED, INFEASIBLE, ACTIVE = 0, 1, 2, 3, 4
+COUNT_ROWS = 5
+
+
+@compiled
+def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any, momentum: Any) -> Any:
+    """Extrapolate: q = p + momentum * (p - p_previous) at one pixel."""
+    width = width_of(lanes)
+    px = load(lanes, state, place + current * width)
+    py = load(lanes, state, place + (current + 1) * width)
+    qx = multiply_add(momentum, px - load(lanes, state, place + previous * width), px)
+    qy = multiply_add(momentum, py - load(lanes, state, place + (previous + 1) * width), py)
+    return qx, qy
+
+
+@compiled
+def _project(px: Any, py: Any, one: Any) -> Any:
+    """The nearest dual vector of length at most one."""
+    shrink = reciprocal_square_root(maximum(multiply_add(px, px, py * py), one))
+    return px * shrink, py * shrink
+
+
+@compiled
+def sweep_fgp(
+    lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, momentum: Any, inverse: Any
+) -> Any:
+    """One accelerated projected-gradient iteration on every pixel; return ||div q||^2 per lane.
+
+    The new p replaces the previous one. `inverse` is 1 / lambda; `rows` has room for 3 nx + 1 vectors.
+    """
+    width = width_of(lanes)
+    previous = 2 - current
+    step, one, zero = splat(lanes, FGP_STEP), splat(lanes, 1.0), splat(lanes, 0.0)
+    minus_inverse = zero - inverse
+    pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
+    row_qx, row_qy, row_v = 0, nx * width, 2 * nx * width
+    norm = zero
+    q_left, v = zero, zero
+    for x in range(nx):
+        place = x * pixel
+        qx, qy = _extrapolate(lanes, state, place, current, previous, momentum)
+        d = qx - q_left + qy
+        norm = multiply_add(d, d, norm)
+        v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
+        store(rows, row_qx + x * width, qx)
+        store(rows, row_qy + x * width, qy)
+        store(rows, row_v + x * width, v)
+        q_left = qx
+    store(rows, row_v + nx * width, v)  # no gradient across the right edge
+    for y in range(1, ny):
+        v_above = load(lanes, rows, row_v)
+        q_left = zero
+        for x in range(nx):
+            place = y * line + x * pixel
+            qx, qy = _extrapolate(lanes, state, place, current, previous, momentum)
+            qy_above = load(lanes, rows, row_qy + x * width)
+            d = (qx - q_left) + (qy - qy_above)
+            norm = multiply_add(d, d, norm)
+            v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
+            v_right = load(lanes, rows, row_v + (x + 1) * width)
+            px = multiply_add(step, v_right - v_above, load(lanes, rows, row_qx + x * width))
+            py = multiply_add(step, v - v_above, qy_above)
+            px, py = _project(px, py, one)
+            store(state, place - line + previous * width, px)
+            store(state, place - line + (previous + 1) * width, py)
+            store(rows, row_qx + x * width, qx)
+            store(rows, row_qy + x * width, qy)
+            store(rows, row_v + x * width, v)
+            q_left, v_above = qx, v_right
+        store(rows, row_v + nx * width, v)
+    last = (ny - 1) * line
+    v_above = load(lanes, rows, row_v)
+    for x in range(nx):  # no gradient across the lower edge: py stays zero
+        v_right = load(lanes, rows, row_v + (x + 1) * width)
+        px = multiply_add(step, v_right - v_above, load(lanes, rows, row_qx + x * width))
+        px, py = _project(px, zero, one)
+        store(state, last + x * pixel + previous * width, px)
+        store(state, last + x * pixel + (previous + 1) * width, py)
+        v_above = v_right
+    return norm
+
+
+@compiled
+def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any) -> Any:
+    """One iteration of Chambolle's fixed point on every pixel; return ||div p||^2 per lane.
+
+    `rows` has room for ny * nx vectors: v of the whole image. Meant to be compared with, not to be fast.
+    """
+    width = width_of(lanes)
+    step, one, zero = splat(lanes, CHAMBOLLE_STEP), splat(lanes, 1.0), splat(lanes, 0.0)
+    minus_inverse = zero - inverse
+    pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
+    norm = zero
+    for y in range(ny):
+        for x in range(nx):
+            place = y * line + x * pixel
+            d = _divergence(lanes, state, place, current * width, y, x, line, pixel)
+            norm = multiply_add(d, d, norm)
+            v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
+            store(rows, (y * nx + x) * width, v)
+    for y in range(ny):
+        for x in range(nx):
+            place = y * line + x * pixel
+            here = (y * nx + x) * width
+            v = load(lanes, rows, here)
+            gx = load(lanes, rows, here + (width if x < nx - 1 else 0)) - v
+            gy = load(lanes, rows, here + (nx * width if y < ny - 1 else 0)) - v
+            shrink = one / multiply_add(step, square_root(multiply_add(gx, gx, gy * gy)), one)
+            for axis, gradient in ((0, gx), (1, gy)):
+                old = load(lanes, state, place + (current + axis) * width)
+                new = multiply_add(step, gradient, old) * shrink
+                store(state, place + (2 - current + axis) * width, new)
+    return norm
+
+
+@compiled
+def _divergence(
+    lanes: Any, state: Any, place: Any, version: Any, y: Any, x: Any, line: Any, pixel: Any
+) -> Any:
+    """Divergence of p at one pixel, of the version of p that starts `version` elements after the pixel."""
+    width = width_of(lanes)
+    d = load(lanes, state, place + version) + load(lanes, state, place + version + width)
+    if x > 0:
+        d = d - load(lanes, state, place - pixel + version)
+    if y > 0:
+        d = d - load(lanes, state, place - line + version + width)
+    return d
+
+
+@compiled
+def _measure_change(
+    lanes: Any, state: Any, ny: Any, nx: Any, current: Any, inverse: Any, numbers: Any
+) -> None:
+    """Sum ||div p - div p_previous||^2 and ||div p - g / lambda||^2 per lane, for the convergence test."""
+    width = width_of(lanes)
+    zero = splat(lanes, 0.0)
+    minus_inverse = zero - inverse
+    pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
+    change, size = zero, zero
+    for y in range(ny):
+        for x in range(nx):
+            place = y * line + x * pixel
+            d = _divergence(lanes, state, place, current * width, y, x, line, pixel)
+            move = d - _divergence(lanes, state, place, (2 - current) * width, y, x, line, pixel)
+            v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
+            change = multiply_add(move, move, change)
+            size = multiply_add(v, v, size)
+    store(numbers, CHANGE * width, change)
+    store(numbers, SIZE * width, size)
+
+
+@compiled
+def _write_finished(
+    lanes: Any, state: Any, output: Any, ny: Any, nx: Any, current: Any, numbers: Any
+) -> None:
+    """Write u = g - lambda div p of the lanes that finish now, with lambda such that the constraint holds."""
+    width = width_of(lanes)
+    zero = splat(lanes, 0.0)
+    pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
+    norm = zero
+    for y in range(ny):
+        for x in range(nx):
+            d = _divergence(lanes, state, y * line + x * pixel, current * width, y, x, line, pixel)
+            norm = multiply_add(d, d, norm)
+    finishing = load(lanes, numbers, FINISHING * width) > zero
+    mean, scale = load(lanes, numbers, MEAN * width), load(lanes, numbers, SCALE * width)
+    multiplier = load(lanes, numbers, RADIUS * width) / square_root(norm)
+    multiplier = select(norm > zero, multiplier, zero)
+    old = load(lanes, numbers, MULTIPLIER * width)
+    store(numbers, MULTIPLIER * width, select(finishing, multiplier * scale, old))
+    for y in range(ny):
+        for x in range(nx):
+            place = y * line + x * pixel
+            d = _divergence(lanes, state, place, current * width, y, x, line, pixel)
+            u = load(lanes, state, place + IMAGE * width) - multiplier * d
+            here = (y * nx + x) * width
+            store(output, here, select(finishing, multiply_add(u, scale, mean), load(lanes, output, here)))
+
+
+@compiled
+def _prepare(
+    lanes: Any, image: Any, state: Any, output: Any, ny: Any, nx: Any, smallest_range: Any, numbers: Any
+) -> None:
+    """Normalise the images into the state, with p = 0, and copy them to the output.
+
+    Normalisation (mean to zero, largest deviation to one) keeps every intermediate of order one, whatever
+    the unit of the images; a range below `smallest_range` counts as constant. Leaves the sum of squared
+    normalised deviations in SIZE.
+    """
+    width = width_of(lanes)
+    zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
+    pixels = splat(lanes, ny * nx)
+    total = zero
+    low = high = load(lanes, image, 0)
+    for y in range(ny):
+        row = zero  # sums by row: smaller rounding error than one long sum
+        for x in range(nx):
+            g = load(lanes, image, (y * nx + x) * width)
+            row = row + g
+            low, high = minimum(g, low), maximum(g, high)
+        total = total + row
+    mean = total / pixels
+    scale = maximum(high - mean, mean - low)
+    scale = select((high - low) > splat(lanes, smallest_range), scale, zero)
+    inverse = one / select(scale > zero, scale, one)
+    squares = zero
+    for i in range(ny * nx):
+        g = load(lanes, image, i * width)
+        store(output, i * width, g)
+        g = (g - mean) * inverse
+        squares = multiply_add(g, g, squares)
+        for j in range(IMAGE):
+            store(state, (i * STATE_VECTORS + j) * width, zero)
+        store(state, (i * STATE_VECTORS + IMAGE) * width, g)
+    store(numbers, MEAN * width, mean)
+    store(numbers, SCALE * width, scale)
+    store(numbers, SIZE * width, squares)
+
+
+@compiled
+def _decide_beforehand(width: Any, pixels: Any, smallest: Any, output: Any, numbers: Any, counts: Any) -> Any:
+    """Settle the lanes that need no iteration; return how many remain active.
+
+    Constant images and strength zero (or below the rounding error of the image) return the image itself;
+    a strength at or above the image's own rms returns its mean.
+    """
+    active = 0
+    for lane in range(width):
+        strength, scale = numbers[STRENGTH * width + lane], numbers[SCALE * width + lane]
+        counts[ITERATIONS * width + lane] = 0
+        counts[CONVERGED * width + lane] = 1
+        counts[INFEASIBLE * width + lane] = 0
+        counts[ACTIVE * width + lane] = 0
+        numbers[MULTIPLIER * width + lane] = 0.0
+        numbers[RADIUS * width + lane] = 1.0
+        if scale <= 0.0 or strength <= smallest * scale:
+            if scale <= 0.0 and strength > 0.0:
+                counts[INFEASIBLE * width + lane] = 1
+                numbers[MULTIPLIER * width + lane] = math.inf
+            continue
+        radius = math.sqrt(pixels) * (strength / scale)
+        if radius * radius >= numbers[SIZE * width + lane]:
+            counts[INFEASIBLE * width + lane] = 1
+            numbers[MULTIPLIER * width + lane] = math.inf
+            for i in range(pixels):
+                output[i * width + lane] = numbers[MEAN * width + lane]
+            continue
+        numbers[RADIUS * width + lane] = radius
+        if counts[LIMIT * width + lane] <= 0:
+            counts[CONVERGED * width + lane] = 0
+            continue
+        counts[ACTIVE * width + lane] = 1
+        active += 1
+    return active
+
+
+@compiled
+def _next_limit(width: Any, counts: Any) -> Any:
+    """The smallest iteration limit among the active lanes."""
+    limit = 1 << 62
+    for lane in range(width):
+        if counts[ACTIVE * width + lane]:
+            limit = min(limit, counts[LIMIT * width + lane])
+    return limit
+
+
+@compiled
+def _mark_finished(width: Any, iteration: Any, measured: Any, numbers: Any, counts: Any) -> Any:
+    """Mark the active lanes that have converged or reached their limit; return how many."""
+    finished = 0
+    for lane in range(width):
+        numbers[FINISHING * width + lane] = 0.0
+        if not counts[ACTIVE * width + lane]:
+            continue
+        tolerance = numbers[TOLERANCE * width + lane]
+        bound = tolerance * tolerance * numbers[SIZE * width + lane]
+        converged = measured and numbers[CHANGE * width + lane] <= bound
+        if converged or iteration >= counts[LIMIT * width + lane]:
+            counts[CONVERGED * width + lane] = 1 if converged else 0
+            counts[ITERATIONS * width + lane] = iteration
+            counts[ACTIVE * width + lane] = 0
+            numbers[FINISHING * width + lane] = 1.0
+            finished += 1
+    return finished
+
+
+@compiled
+def denoise_group(
+    lanes: Any,
+    algorithm: Any,
+    ny: Any,
+    nx: Any,
+    image: Any,
+    output: Any,
+    state: Any,
+    rows: Any,
+    numbers: Any,
+    counts: Any,
+) -> None:
+    """Denoise the W images of a group.
+
+    Parameters
+    ----------
+    lanes : Lanes
+    algorithm : int
+        FGP or CHAMBOLLE.
+    ny, nx : int
+    image, output : (ny * nx * W,) arrays
+        Input, kept as it is, and result: all lanes of a pixel side by side.
+    state, rows : arrays
+        Scratch of STATE_VECTORS * ny * nx * W and (ny * nx + 2 * nx + 1) * W numbers.
+    numbers : (LANE_ROWS * W,) array
+        STRENGTH and TOLERANCE are read, MULTIPLIER is written, the rest is scratch.
+    counts : (COUNT_ROWS * W,) int64 array
+        LIMIT is read; ITERATIONS, CONVERGED, INFEASIBLE are written.
+    """
+    width = width_of(lanes)
+    # Strengths below the images' rounding error count as zero; ranges whose inverse overflows, as constant.
+    smallest, smallest_range = (1e-8, 1e-30) if image.itemsize == 4 else (1e-17, 1e-290)
+    _prepare(lanes, image, state, output, ny, nx, smallest_range, numbers)
+    active = _decide_beforehand(width, ny * nx, smallest, output, numbers, counts)
+    if active == 0:
+        return
+    test_change = False
+    for lane in range(width):
+        test_change |= numbers[TOLERANCE * width + lane] > 0.0
+    zero = splat(lanes, 0.0)
+    inverse_radius = splat(lanes, 1.0) / load(lanes, numbers, RADIUS * width)
+    inverse = inverse_radius * splat(lanes, math.sqrt(ny * nx) / FIRST_MULTIPLIER)
+    limit = _next_limit(width, counts)
+    momentum_age, momentum, current, iteration = 1.0, 0.0, 0, 0
+    while active > 0:
+        iteration += 1
+        if algorithm == FGP:
+            norm = sweep_fgp(lanes, state, rows, ny, nx, current, splat(lanes, momentum), inverse)
+        else:
+            norm = sweep_chambolle(lanes, state, rows, ny, nx, current, inverse)
+        current = 2 - current
+        inverse = select(norm > zero, square_root(norm) * inverse_radius, inverse)
+        next_age = 0.5 * (1.0 + math.sqrt(1.0 + 4.0 * momentum_age * momentum_age))
+        momentum, momentum_age = (momentum_age - 1.0) / next_age, next_age
+        measured = test_change and iteration % CHECK_INTERVAL == 0
+        if measured:
+            _measure_change(lanes, state, ny, nx, current, inverse, numbers)
+        if measured or iteration >= limit:
+            finished = _mark_finished(width, iteration, measured, numbers, counts)
+            if finished > 0:
+                _write_finished(lanes, state, output, ny, nx, current, numbers)
+                active -= finished
+                limit = _next_limit(width, counts)

@@ -1,0 +1,172 @@
+"""Calibration: from raw frames in ADU to photo-electrons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between, numbers_between, real_array
+from faintspot.errors import InputError
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """From raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.
+
+    Parameters
+    ----------
+    dark : float or (h, w) array, ADU
+        What a frame without light holds: bias and dark current. NaN marks a bad pixel.
+    flat : (h, w) array, optional
+        Relative response of each pixel, 1 on average. NaN, zero or negative marks a bad pixel.
+    gain_e_per_adu : float
+        Electrons per ADU at the camera's output.
+    em_gain : float
+        Multiplication gain of an EMCCD; 1 for other cameras.
+    bad_pixels : (h, w) array of bool, or (n, 2) array of row and column, optional
+        Pixels not to use; they are filled from their neighbours within the sub-aperture.
+    saturation_adu : float, optional
+        Raw value from which a pixel counts as saturated. Default: the largest value of the frames' integer
+        dtype; none for floating-point frames.
+
+    Raises
+    ------
+    InputError
+        For a value out of range, or arrays of different shapes.
+    """
+
+    dark: Any = 0.0
+    flat: Any = None
+    gain_e_per_adu: float = 1.0
+    em_gain: float = 1.0
+    bad_pixels: Any = None
+    saturation_adu: float | None = None
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
+        if self.flat is not None:
+            put(self, "flat", _map("calibration.flat", self.flat))
+        for name in ("gain_e_per_adu", "em_gain"):
+            put(self, name, number_between(f"calibration.{name}", getattr(self, name), 0.0, low_open=True))
+        if self.saturation_adu is not None:
+            level = number_between("calibration.saturation_adu", self.saturation_adu, 0.0, low_open=True)
+            put(self, "saturation_adu", level)
+        if self.bad_pixels is not None:
+            put(self, "bad_pixels", _mask_or_list(self.bad_pixels))
+        shapes = {name: array.shape for name, array in self._arrays().items()}
+        if len(set(shapes.values())) > 1:
+            text = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise InputError(f"calibration: expected maps of one shape, got {text}")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Calibration):
+            return NotImplemented
+        mine, theirs = vars(self), vars(other)
+        return all(
+            (mine[name] is None) == (theirs[name] is None)
+            and (mine[name] is None or np.array_equal(mine[name], theirs[name], equal_nan=True))
+            for name in mine
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Read the table [calibration] of a configuration file (TOML)."""
+        from faintspot.sensor import configuration
+
+        return configuration.load(path, "calibration")  # type: ignore[no-any-return]
+
+    def save(self, path: str | Path) -> None:
+        """Write the table [calibration] of a configuration file (TOML); other tables stay as they are."""
+        from faintspot.sensor import configuration
+
+        configuration.save(path, self)
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The maps of the size of a frame."""
+        arrays = {"dark": self.dark, "flat": self.flat, "bad_pixels": self.bad_pixels}
+        return {
+            name: value
+            for name, value in arrays.items()
+            if isinstance(value, np.ndarray) and not (name == "bad_pixels" and value.dtype != np.bool_)
+        }
+
+    def maps(self, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
+        """Return dark (ADU) and electrons per ADU of every pixel, NaN in bad ones: (2, h, w) float32.
+
+        Raises
+        ------
+        InputError
+            When a map or a bad pixel does not fit into the frame.
+        """
+        for name, array in self._arrays().items():
+            if array.shape != frame_shape:
+                raise InputError(
+                    f"calibration.{name}: expected the frame's shape {frame_shape}, got {array.shape}"
+                )
+        maps = np.empty((2, *frame_shape), np.float32)
+        maps[0] = self.dark
+        gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
+        if self.flat is not None:
+            usable = np.isfinite(self.flat) & (self.flat > 0)
+            gain = np.divide(gain, self.flat, where=usable, out=np.full(frame_shape, np.nan))
+        if self.bad_pixels is not None:
+            gain[self._bad_mask(frame_shape)] = np.nan
+        maps[1] = gain
+        return maps
+
+    def saturation(self, dtype: np.dtype[Any]) -> float:
+        """Return the raw value from which a pixel of frames of this dtype is saturated (inf: none)."""
+        if self.saturation_adu is not None:
+            return self.saturation_adu
+        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
+
+    def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
+        if self.bad_pixels.dtype == np.bool_:
+            return self.bad_pixels  # type: ignore[no-any-return]
+        outside = np.any(self.bad_pixels >= np.array(frame_shape), axis=1)
+        if outside.any():
+            place = tuple(int(i) for i in self.bad_pixels[np.argmax(outside)])
+            raise InputError(f"calibration.bad_pixels: (row, column) {place} is outside {frame_shape}")
+        mask = np.zeros(frame_shape, bool)
+        mask[self.bad_pixels[:, 0], self.bad_pixels[:, 1]] = True
+        return mask
+
+
+def _map(name: str, value: Any) -> NDArray[np.float64]:
+    """An image in which NaN is allowed; a private, read-only copy."""
+    array = real_array(name, value).astype(np.float64)
+    if array.ndim != 2:
+        raise InputError(f"{name}: expected shape (h, w), got {array.shape}")
+    array.flags.writeable = False
+    return array
+
+
+def _scalar_or_map(name: str, value: Any) -> Any:
+    if np.ndim(value) == 0:
+        return number_between(name, value)
+    return _map(name, value)
+
+
+def _mask_or_list(value: Any) -> NDArray[Any]:
+    """A mask of bool, or rows and columns as (n, 2) int64."""
+    array = np.array(value)
+    if array.dtype != np.bool_:
+        if array.size == 0:
+            array = np.empty((0, 2), np.int64)
+        array = numbers_between("calibration.bad_pixels", array, 0, integer=True) if array.size else array
+        if array.ndim != 2 or array.shape[1] != 2:
+            raise InputError(
+                "calibration.bad_pixels: expected a boolean map (h, w) or a list of [row, column], "
+                f"got {array.dtype} of shape {array.shape}"
+            )
+    elif array.ndim != 2:
+        raise InputError(f"calibration.bad_pixels: expected shape (h, w), got {array.shape}")
+    array.flags.writeable = False
+    return array

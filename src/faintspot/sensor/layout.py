@@ -1,0 +1,305 @@
+"""Layout: where each sub-aperture is on the detector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.errors import InputError
+
+GEOMETRIES = ("square", "hexagonal")
+SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each sub-aperture is: one window of the same size for each lit lenslet.
+
+    Parameters
+    ----------
+    frame_shape : (int, int)
+        Height and width of a frame in pixels.
+    window : (int, int)
+        Height and width of every sub-aperture in pixels, 4 to 64.
+    corners : (n, 2) array of int
+        Row and column of each window's first pixel.
+    centres : (n, 2) array, optional
+        x, y of each sub-aperture's centre in frame pixels (pixel i has its centre at i), from which positions
+        are measured. Default: the middle of the window.
+    cells : (n, 2) array of int, optional
+        Row and column of each lenslet in its array, for maps.
+    geometry : {"square", "hexagonal"}
+    pitch_px : float, optional
+        Distance between neighbouring lenslets.
+    angle_deg : float
+        Angle of the lenslet array's rows from +x towards +y.
+
+    Raises
+    ------
+    InputError
+        For an empty layout, a window that leaves the frame, or windows that overlap.
+    """
+
+    frame_shape: tuple[int, int]
+    window: tuple[int, int]
+    corners: NDArray[np.int64]
+    centres: NDArray[np.float64] = None  # type: ignore[assignment]
+    cells: NDArray[np.int64] = None  # type: ignore[assignment]
+    geometry: str = "square"
+    pitch_px: float | None = None
+    angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "frame_shape", _pair("layout.frame_shape", self.frame_shape, 1, 2**31))
+        put(self, "window", _pair("layout.window", self.window, SMALLEST_WINDOW, LARGEST_WINDOW))
+        corners = _rows_of_two("layout.corners", self.corners)
+        corners = numbers_between("layout.corners", corners, -(2**31), 2**31, integer=True)
+        middle = corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1)
+        centres = middle if self.centres is None else _rows_of_two("layout.centres", self.centres)
+        pitch = np.array(self.window)
+        cells = (corners - corners.min(axis=0)) // pitch if self.cells is None else self.cells
+        cells = numbers_between("layout.cells", _rows_of_two("layout.cells", cells), integer=True)
+        for name, array in (("centres", centres), ("cells", cells)):
+            if len(array) != len(corners):
+                raise InputError(
+                    f"layout.{name}: expected {len(corners)} rows, one per corner, got {len(array)}"
+                )
+        one_of("layout.geometry", self.geometry, GEOMETRIES)
+        if self.pitch_px is not None:
+            put(self, "pitch_px", number_between("layout.pitch_px", self.pitch_px, 0.0, low_open=True))
+        put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
+        _check_inside(corners, self.window, self.frame_shape)
+        _check_overlap(corners, self.window)
+        for name, array in (("corners", corners), ("centres", centres.astype(np.float64)), ("cells", cells)):
+            array = array.copy()
+            array.flags.writeable = False
+            put(self, name, array)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Layout):
+            return NotImplemented
+        mine, theirs = vars(self), vars(other)
+        return all(np.array_equal(mine[name], theirs[name]) for name in mine)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __len__(self) -> int:
+        """Return the number of sub-apertures."""
+        return len(self.corners)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of one window."""
+        return self.window[0] * self.window[1]
+
+    @property
+    def offsets(self) -> NDArray[np.float64]:
+        """(n, 2): x, y of each sub-aperture's centre from the middle of its window, px."""
+        return self.centres - (self.corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1))
+
+    @classmethod
+    def grid(
+        cls,
+        shape: tuple[int, int],
+        *,
+        pixels: int | tuple[int, int],
+        outer_radius: float | None = None,
+        inner_radius: float | None = None,
+        pitch: int | tuple[int, int] | None = None,
+        origin: tuple[int, int] = (0, 0),
+        frame_shape: tuple[int, int] | None = None,
+    ) -> Layout:
+        """Make a regular grid of sub-apertures under an annular pupil.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Rows and columns of lenslets.
+        pixels : int or (int, int)
+            Height and width of a window.
+        outer_radius, inner_radius : float, optional
+            Of the pupil, in lenslets: a sub-aperture is lit when its centre is not farther than
+            `outer_radius` and not nearer than `inner_radius` from the middle of the grid. Default: all lit.
+            (7, 7) with 3.7 and 1.2 gives the 36 of a 4.2 m telescope with central obstruction.
+        pitch : int or (int, int), optional
+            Rows and columns from one window to the next. Default: `pixels`.
+        origin : (int, int)
+            Row and column of the first window's first pixel.
+        frame_shape : (int, int), optional
+            Default: just large enough.
+
+        Raises
+        ------
+        InputError
+            When nothing is lit, or as for `Layout`.
+        """
+        n_rows, n_columns = _pair("shape", shape, 1, 10_000)
+        window = _pair("pixels", pixels, SMALLEST_WINDOW, LARGEST_WINDOW)
+        step = window if pitch is None else _pair("pitch", pitch, 1, 10_000)
+        start = _pair("origin", origin, 0, 2**31)
+        outer = np.inf if outer_radius is None else number_between("outer_radius", outer_radius, 0.0)
+        inner = 0.0 if inner_radius is None else number_between("inner_radius", inner_radius, 0.0)
+        cells = np.stack(np.meshgrid(np.arange(n_rows), np.arange(n_columns), indexing="ij"), -1).reshape(
+            -1, 2
+        )
+        distance = np.hypot(*(cells - 0.5 * (np.array([n_rows, n_columns]) - 1)).T)
+        cells = cells[(distance <= outer) & (distance >= inner)]
+        if len(cells) == 0:
+            raise InputError(f"outer_radius = {outer:g}, inner_radius = {inner:g}: no sub-aperture is lit")
+        if frame_shape is None:
+            last = np.array(start) + (np.array([n_rows, n_columns]) - 1) * step + window
+            frame_shape = (int(last[0]), int(last[1]))
+        return cls(
+            frame_shape, window, np.array(start) + cells * step, cells=cells, pitch_px=float(min(step))
+        )
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: ArrayLike,
+        *,
+        geometry: str = "auto",
+        pitch_px: float | None = None,
+        pixels: int | tuple[int, int] | None = None,
+        bad_pixels: ArrayLike | None = None,
+        **options: Any,
+    ) -> Layout:
+        """Find the sub-apertures of a square or hexagonal lenslet array in a frame.
+
+        Parameters
+        ----------
+        frame : (h, w) or (n, h, w) array
+            A frame with spots, or several of the same field, which are averaged.
+        geometry : {"auto", "square", "hexagonal"}
+        pitch_px : float, optional
+            Distance between neighbouring lenslets, when known (to 20 %).
+        pixels : int or (int, int), optional
+            Window. Default: the largest square in which neighbours do not overlap.
+        bad_pixels : (h, w) array of bool, optional
+            True where a pixel must not be used.
+        **options
+            Passed on to `faintspot.sensor.lenslets.find_lenslets`.
+
+        Returns
+        -------
+        Layout
+            Of the lit sub-apertures whose windows lie within the frame.
+
+        Raises
+        ------
+        InputError
+            When no regular array of spots is found.
+        """
+        from faintspot.sensor.lenslets import find_lenslets
+
+        array = finite_or_masked("frame", frame)
+        grid = find_lenslets(array, geometry=geometry, pitch_px=pitch_px, bad_pixels=bad_pixels, **options)
+        if pixels is None:
+            side = min(LARGEST_WINDOW, int(np.floor(_clear_distance(grid.centres, grid.pitch_px) + 1e-6)))
+            window = (side, side)
+        else:
+            window = _pair("pixels", pixels, SMALLEST_WINDOW, LARGEST_WINDOW)
+        shape = (int(array.shape[-2]), int(array.shape[-1]))
+        middle = 0.5 * (np.array(window) - 1)
+        corners = np.floor(grid.centres[:, ::-1] - middle + 0.5).astype(np.int64)
+        within = np.all((corners >= 0) & (corners + np.array(window) <= np.array(shape)), axis=1)
+        if not within.any():
+            raise InputError(
+                f"frame: all {len(corners)} sub-apertures found leave the frame; try pixels < {window[0]}"
+            )
+        return cls(
+            shape,
+            window,
+            corners[within],
+            grid.centres[within],
+            grid.cells[within],
+            grid.geometry,
+            grid.pitch_px,
+            grid.angle_deg,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Layout:
+        """Read the table [layout] of a configuration file (TOML)."""
+        from faintspot.sensor import configuration
+
+        return configuration.load(path, "layout")  # type: ignore[no-any-return]
+
+    def save(self, path: str | Path) -> None:
+        """Write the table [layout] of a configuration file (TOML); other tables stay as they are."""
+        from faintspot.sensor import configuration
+
+        configuration.save(path, self)
+
+    def images(self, frame: ArrayLike) -> NDArray[Any]:
+        """Cut the windows out of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""
+        array = np.asarray(frame)
+        if array.shape[-2:] != self.frame_shape:
+            raise InputError(f"frame: expected (height, width) = {self.frame_shape}, got {array.shape[-2:]}")
+        rows = self.corners[:, 0, None, None] + np.arange(self.window[0])[:, None]
+        columns = self.corners[:, 1, None, None] + np.arange(self.window[1])
+        return array[..., rows, columns]
+
+
+def finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
+    """Return a real array of two or three dimensions, which may hold NaN."""
+    from faintspot.checks import real_array
+
+    array = real_array(name, value, minimum_dimensions=2)
+    if array.ndim > 3:
+        raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
+    return array
+
+
+def _pair(name: str, value: Any, low: float, high: float) -> tuple[int, int]:
+    """Two whole numbers, from one or two."""
+    array = numbers_between(name, value, low, high, integer=True)
+    if array.ndim > 1 or array.size not in (1, 2):
+        raise InputError(f"{name}: expected one or two whole numbers, got shape {array.shape}")
+    first, second = np.broadcast_to(array, 2)
+    return int(first), int(second)
+
+
+def _rows_of_two(name: str, value: Any) -> NDArray[Any]:
+    array = finite_array(name, value)
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise InputError(f"{name}: expected shape (n, 2), got {array.shape}")
+    return array
+
+
+def _check_inside(corners: NDArray[np.int64], window: tuple[int, int], frame_shape: tuple[int, int]) -> None:
+    outside = np.any((corners < 0) | (corners + np.array(window) > np.array(frame_shape)), axis=1)
+    if outside.any():
+        first = int(np.argmax(outside))
+        row, column = corners[first]
+        raise InputError(
+            f"layout: sub-aperture {first} (rows {row} to {row + window[0] - 1}, columns {column} to "
+            f"{column + window[1] - 1}) leaves the frame of {frame_shape[0]} x {frame_shape[1]} pixels"
+        )
+
+
+def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
+    from scipy.spatial import cKDTree
+
+    # Scaled by the window, two windows overlap when they are closer than 1 along both axes.
+    pairs = cKDTree(corners / np.array(window)).query_pairs(1.0 - 1e-9, p=np.inf, output_type="ndarray")
+    if len(pairs):
+        first, second = pairs[0]
+        raise InputError(
+            f"layout: sub-apertures {first} and {second} overlap; choose smaller windows than {window}"
+        )
+
+
+def _clear_distance(centres: NDArray[np.float64], pitch_px: float) -> float:
+    """Largest side of axis-aligned squares around the centres that do not overlap."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(centres)
+    distances = np.asarray(tree.query(centres, k=2, p=np.inf)[0])[:, 1]
+    return float(np.min(distances[np.isfinite(distances)], initial=pitch_px))

@@ -1,0 +1,274 @@
+"""Settings: how each sub-aperture's image is turned into a position."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from dataclasses import replace as dataclass_replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import numbers_between, one_of
+from faintspot.errors import InputError
+
+ALGORITHMS = ("fgp", "chambolle")
+RULES = ("subtract_next", "threshold", "subtract_kth")
+KEPT_FRACTION = 0.08  # of a window's pixels, where keep_brightest is not given: 20 of 16 x 16
+FEWEST_KEPT = 5
+
+PER_SUBAPERTURE = (
+    "noise_std",
+    "tolerance",
+    "max_iterations",
+    "keep_brightest",
+    "rule",
+    "denoise",
+    "flux_floor",
+    "max_bad_fraction",
+)
+
+
+@dataclass(frozen=True)
+class PerSubaperture:
+    """A value for every sub-aperture of a sensor of any size: one default, and others in some places."""
+
+    default: Any
+    others: Mapping[int, Any]
+
+    def __getitem__(self, index: int) -> Any:
+        """Value of sub-aperture `index`."""
+        return self.others.get(int(index), self.default)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How each sub-aperture's image is turned into a position; immutable.
+
+    Every value but `algorithm` is a scalar or holds one value per sub-aperture.
+
+    Parameters
+    ----------
+    noise_std : float or array, electrons
+        Strength of the denoising: the standard deviation of the noise to remove from a pixel. A good value
+        at low read noise is sqrt(read_noise^2 + 0.25 * flux / pixels). Needed where `denoise` is true.
+    tolerance : float or array
+        Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`.
+    max_iterations : int or array
+        Its iteration limit.
+    keep_brightest : int or array, optional
+        Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at
+        least 5.
+    rule : str or array of str
+        "subtract_next" | "threshold" | "subtract_kth"; see `faintspot.brightest_pixels`.
+    denoise : bool or array of bool
+        Whether to denoise at all.
+    algorithm : str
+        "fgp" | "chambolle".
+    flux_floor : float or array
+        A sub-aperture is flagged NO_LIGHT when the flux that is left after the background subtraction is not
+        above this fraction of its image's largest pixel.
+    max_bad_fraction : float or array
+        A sub-aperture with a larger fraction of bad pixels is invalid.
+
+    Raises
+    ------
+    InputError
+        For a value out of range, NaN, of the wrong kind, or arrays of different lengths.
+    """
+
+    noise_std: Any = None
+    tolerance: Any = 1e-2
+    max_iterations: Any = 200
+    keep_brightest: Any = None
+    rule: Any = "subtract_next"
+    denoise: Any = True
+    algorithm: str = "fgp"
+    flux_floor: Any = 1e-4
+    max_bad_fraction: Any = 0.25
+
+    def __post_init__(self) -> None:
+        one_of("algorithm", self.algorithm, ALGORITHMS)
+        for name in PER_SUBAPERTURE:
+            object.__setattr__(self, name, _checked(name, getattr(self, name)))
+        lengths = {name: len(value) for name in PER_SUBAPERTURE if _is_array(value := getattr(self, name))}
+        if len(set(lengths.values())) > 1:
+            sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
+            raise InputError(f"settings: expected arrays of one length, got {sizes}")
+        if self.noise_std is None and (self.denoise is True or _is_array(self.denoise)):
+            raise InputError("noise_std: expected a number (electrons), got none; or set denoise = false")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Settings):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Settings:
+        """Read the table [settings] of a configuration file (TOML)."""
+        from faintspot.sensor import configuration
+
+        return configuration.load(path, "settings")  # type: ignore[no-any-return]
+
+    def save(self, path: str | Path) -> None:
+        """Write the table [settings] of a configuration file (TOML); other tables stay as they are."""
+        from faintspot.sensor import configuration
+
+        configuration.save(path, self)
+
+    def replace(self, *, where: Sequence[int] | NDArray[Any] | int | None = None, **changes: Any) -> Settings:
+        """Return settings with some values changed.
+
+        Parameters
+        ----------
+        where : int or sequence of int, optional
+            Sub-apertures to change; default all. A boolean array selects as in NumPy.
+        **changes
+            New values by name; with `where`, a scalar or one value per selected sub-aperture.
+
+        Raises
+        ------
+        InputError
+            For an unknown name, a bad value, an index out of range.
+        """
+        known = [f.name for f in fields(self)]
+        for name in changes:
+            one_of("settings.replace", name, known)
+        if where is None:
+            return dataclass_replace(self, **changes)
+        selected = _indices(where)
+        mixed = {}
+        for name, value in changes.items():
+            if name not in PER_SUBAPERTURE:
+                raise InputError(f"{name}: expected one value for the whole sensor, not one for `where`")
+            mixed[name] = _changed_at(name, getattr(self, name), selected, value)
+        return dataclass_replace(self, **mixed)
+
+    def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:
+        """Return one value per sub-aperture, with defaults filled in.
+
+        Raises
+        ------
+        InputError
+            When the settings are for another number of sub-apertures, or `keep_brightest` is more than a
+            window of `pixels` pixels allows.
+        """
+        value = getattr(self, name)
+        if _is_array(value):
+            if len(value) != n_subapertures:
+                raise InputError(
+                    f"{name}: expected {n_subapertures} values, one per sub-aperture, got {len(value)}"
+                )
+            return value  # type: ignore[no-any-return]
+        if isinstance(value, PerSubaperture):
+            beyond = [index for index in value.others if index >= n_subapertures]
+            if beyond:
+                raise InputError(
+                    f"{name}: sub-aperture {beyond[0]} does not exist; there are {n_subapertures}"
+                )
+            default = self._default(name, pixels) if value.default is None else value.default
+            return np.array([value.others.get(i, default) for i in range(n_subapertures)])
+        return np.full(n_subapertures, self._default(name, pixels) if value is None else value)
+
+    @staticmethod
+    def _default(name: str, pixels: int) -> Any:
+        if name == "keep_brightest":
+            return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
+        return 0.0  # noise_std where nothing is denoised
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray)
+
+
+def _same(a: Any, b: Any) -> bool:
+    if _is_array(a) or _is_array(b):
+        return _is_array(a) and _is_array(b) and np.array_equal(a, b)
+    return bool(a == b)
+
+
+def _indices(where: Any) -> NDArray[np.int64]:
+    """Sub-aperture numbers from an int, a sequence of int or a boolean mask."""
+    array = np.atleast_1d(np.asarray(where))
+    if array.dtype == np.bool_:
+        array = np.flatnonzero(array)
+    return numbers_between("where", array, 0, integer=True).astype(np.int64)
+
+
+def _changed_at(name: str, old: Any, selected: NDArray[np.int64], value: Any) -> Any:
+    """Combine the old value with a new one in the selected places."""
+    new = _checked(name, value)
+    if _is_array(new) and len(new) != len(selected):
+        raise InputError(f"{name}: expected one value or {len(selected)}, as many as `where`, got {len(new)}")
+    if _is_array(old):
+        if selected.max(initial=-1) >= len(old):
+            raise InputError(f"where: sub-aperture {selected.max()} does not exist; there are {len(old)}")
+        result = old.astype(np.result_type(old, np.asarray(new)))
+        result[selected] = new
+        return result
+    others = dict(old.others) if isinstance(old, PerSubaperture) else {}
+    each = new if _is_array(new) else [new] * len(selected)
+    others.update({int(index): _plain(item) for index, item in zip(selected, each, strict=True)})
+    return PerSubaperture(old.default if isinstance(old, PerSubaperture) else old, others)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _checked(name: str, value: Any) -> Any:
+    """Check one setting, whatever its form; scalars become plain Python values, sequences arrays."""
+    if isinstance(value, PerSubaperture):
+        default = _checked(name, value.default)
+        others = {int(index): _checked(name, item) for index, item in value.others.items()}
+        return PerSubaperture(default, MappingProxyType(others))
+    if value is None and name in ("noise_std", "keep_brightest"):
+        return None
+    if name == "rule":
+        return _checked_each(name, value, lambda item: one_of("rule", item, RULES))
+    if name == "denoise":
+        return _checked_each(name, value, _checked_bool)
+    array = _checked_numbers(name, value)
+    if array.ndim > 1 or array.size == 0:
+        raise InputError(f"{name}: expected a number or one per sub-aperture, got shape {array.shape}")
+    if array.ndim == 0:
+        return array.item()
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def _checked_numbers(name: str, value: Any) -> NDArray[Any]:
+    if name == "max_iterations":
+        return numbers_between(name, value, 1, 2**24, integer=True)
+    if name == "keep_brightest":
+        return numbers_between(name, value, 1, integer=True)
+    if name == "tolerance":
+        return numbers_between(name, value, 0.0, 1.0)
+    if name == "noise_std":
+        return numbers_between(name, value, 0.0)
+    return numbers_between(name, value, 0.0, 1.0)
+
+
+def _checked_bool(value: Any) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"denoise = {value!r}: expected true or false")
+    return bool(value)
+
+
+def _checked_each(name: str, value: Any, check: Any) -> Any:
+    """Check a scalar, or each item of a sequence."""
+    if isinstance(value, str | bool | np.bool_):
+        return check(value)
+    try:
+        items = [check(item) for item in value]
+    except TypeError:
+        raise InputError(f"{name} = {value!r}: expected one value or one per sub-aperture") from None
+    array = np.array(items)
+    array.flags.writeable = False
+    return array

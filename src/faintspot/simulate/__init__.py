@@ -1,0 +1,7 @@
+"""Images with a known truth: spots, detectors, whole sensors."""
+
+from faintspot.simulate.detector import Detector
+from faintspot.simulate.frames import sensor_frames, subapertures
+from faintspot.simulate.spots import spots
+
+__all__ = ["Detector", "sensor_frames", "spots", "subapertures"]

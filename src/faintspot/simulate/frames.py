@@ -1,0 +1,231 @@
+"""Noisy images with known positions: stacks of sub-apertures and whole sensor frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between, numbers_between
+from faintspot.errors import InputError
+from faintspot.simulate.detector import Detector
+from faintspot.simulate.generators import spawn
+from faintspot.simulate.spots import image_shape, per_spot, spots
+
+_BLOCK_PIXELS = 1 << 21  # pixels simulated at a time: bounds the memory of the double-precision means
+
+
+def subapertures(
+    n: int,
+    *,
+    shape: tuple[int, int] = (16, 16),
+    flux_e: ArrayLike = 100.0,
+    profile: str = "diffraction",
+    size: ArrayLike = 1.0,
+    elongation: ArrayLike = 1.0,
+    angle_deg: ArrayLike = 0.0,
+    position_range_px: float = 1.0,
+    positions: ArrayLike | None = None,
+    detector: Detector | None = None,
+    rng: np.random.Generator | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Return noisy sub-aperture images in photo-electrons and the true positions of their spots.
+
+    The images are `Detector.to_electrons` of the detector's read-out: background and dark current are in
+    them, not subtracted. The spots are those of `faintspot.simulate.spots`; flux_e, size, elongation and
+    angle_deg are one number each or one per sub-aperture.
+
+    Parameters
+    ----------
+    n : int
+        How many sub-apertures.
+    shape : (int, int)
+        Rows and columns (ny, nx) of each image, px.
+    flux_e : float or array_like, shape (n,)
+        Electrons of the whole, infinite spot; what falls outside the image is lost.
+    profile, size, elongation, angle_deg
+        The spot's shape, see `faintspot.simulate.spots`.
+    position_range_px : float
+        True positions are uniform within plus and minus this, on each axis, px.
+    positions : array_like, shape (n, 2), optional
+        True x and y in px, instead of random ones.
+    detector : Detector, optional
+        Default: 0.1 e- read noise and nothing else.
+    rng : numpy.random.Generator, optional
+        Where positions and noise come from, each from a generator of its own: the same seed gives the same
+        positions whatever the detector.
+
+    Returns
+    -------
+    images : ndarray, float32, shape (n, ny, nx)
+        Photo-electrons.
+    truth : ndarray, float64, shape (n, 2)
+        True x and y, px.
+
+    Raises
+    ------
+    InputError
+        When a value is not finite, out of its range or of the wrong shape.
+    """
+    n = int(number_between("n", n, 1, integer=True))
+    ny, nx = image_shape("shape", shape)
+    position_rng, noise_rng = spawn(rng, 2)
+    truth = _true_positions(positions, position_range_px, (n, 2), position_rng)
+    camera = _camera(detector)
+    flux, sizes, elongations, angles = (
+        per_spot(name, value, n)
+        for name, value in (
+            ("flux_e", flux_e),
+            ("size", size),
+            ("elongation", elongation),
+            ("angle_deg", angle_deg),
+        )
+    )
+    images = np.empty((n, ny, nx), dtype=np.float32)
+    block = max(1, _BLOCK_PIXELS // (ny * nx))
+    for start in range(0, n, block):
+        part = slice(start, start + block)
+        mean_e = spots(
+            truth[part],
+            shape=(ny, nx),
+            flux_e=flux[part],
+            profile=profile,
+            size=sizes[part],
+            elongation=elongations[part],
+            angle_deg=angles[part],
+        )
+        images[part] = camera.to_electrons(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
+    return images, truth
+
+
+def sensor_frames(
+    corners: ArrayLike,
+    window: tuple[int, int],
+    frame_shape: tuple[int, int],
+    n_frames: int,
+    *,
+    flux_e: ArrayLike = 100.0,
+    profile: str = "diffraction",
+    size: ArrayLike = 1.0,
+    elongation: ArrayLike = 1.0,
+    angle_deg: ArrayLike = 0.0,
+    position_range_px: float = 1.0,
+    positions: ArrayLike | None = None,
+    detector: Detector | None = None,
+    rng: np.random.Generator | None = None,
+) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Return frames of a whole Shack-Hartmann sensor in ADU and the true positions of their spots.
+
+    The light of each spot stays within its own window, as behind a field stop. For more frames than fit
+    into memory, call it again with the same generator: the noise and positions go on.
+
+    Parameters
+    ----------
+    corners : array_like of int, shape (n, 2)
+        Row and column of the first pixel of each sub-aperture's window.
+    window : (int, int)
+        Rows and columns (ny, nx) of each window, px.
+    frame_shape : (int, int)
+        Rows and columns of the frame, px.
+    n_frames : int
+        How many frames.
+    flux_e : float or array_like, shape (n,)
+        Electrons per frame of each sub-aperture's whole, infinite spot.
+    profile, size, elongation, angle_deg
+        The spot's shape, see `faintspot.simulate.spots`; one number each or one per sub-aperture.
+    position_range_px : float
+        True positions are uniform within plus and minus this, on each axis, anew in every frame, px.
+    positions : array_like, shape (n, 2) or (n_frames, n, 2), optional
+        True x and y in px from each window's centre, the same or another in every frame, instead of
+        random ones.
+    detector : Detector, optional
+        Default: 0.1 e- read noise and nothing else. Its maps have the frame's shape.
+    rng : numpy.random.Generator, optional
+        Where positions and noise come from, each from a generator of its own.
+
+    Returns
+    -------
+    frames : ndarray, shape (n_frames, rows, columns)
+        ADU, of the type that `Detector.expose` returns.
+    truth : ndarray, float64, shape (n_frames, n, 2)
+        True x and y, px.
+
+    Raises
+    ------
+    InputError
+        When a value is not finite, out of its range or of the wrong shape, or a window leaves the frame.
+    """
+    n_frames = int(number_between("n_frames", n_frames, 1, integer=True))
+    rows, columns = image_shape("frame_shape", frame_shape)
+    window_shape = image_shape("window", window)
+    pixels = _window_pixels(corners, window_shape, (rows, columns))
+    n = len(pixels)
+    position_rng, noise_rng = spawn(rng, 2)
+    truth = _true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
+    camera = _camera(detector)
+    shape_of_spots = {
+        "flux_e": per_spot("flux_e", flux_e, n),
+        "size": per_spot("size", size, n),
+        "elongation": per_spot("elongation", elongation, n),
+        "angle_deg": per_spot("angle_deg", angle_deg, n),
+    }
+    blocks = []
+    block = max(1, _BLOCK_PIXELS // max(rows * columns, pixels.size))
+    for start in range(0, n_frames, block):
+        part = truth[start : start + block]
+        repeated = {name: np.tile(value, len(part)) for name, value in shape_of_spots.items()}
+        images = spots(part.reshape(-1, 2), shape=window_shape, profile=profile, **repeated)
+        mean_e = _place_windows(images.reshape(len(part), -1), pixels, (rows, columns))
+        blocks.append(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
+    return np.concatenate(blocks), truth
+
+
+def _camera(detector: Any) -> Detector:
+    """Return the detector to use; the default has 0.1 e- read noise and nothing else."""
+    if detector is None:
+        return Detector(read_noise_e=0.1)
+    if not isinstance(detector, Detector):
+        raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
+    return detector
+
+
+def _true_positions(
+    positions: Any, position_range_px: float, shape: tuple[int, ...], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return the given positions, or uniform random ones, in that shape (..., n, 2)."""
+    half = number_between("position_range_px", position_range_px, 0)
+    if positions is None:
+        return rng.uniform(-half, half, shape)
+    given = finite_array("positions", positions).astype(np.float64)
+    if given.shape not in (shape, shape[-2:]):
+        raise InputError(f"positions: expected shape {shape[-2:]} or {shape}, got {given.shape}")
+    return np.broadcast_to(given, shape).copy()
+
+
+def _window_pixels(corners: Any, window: tuple[int, int], frame: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the flat frame index of each window's pixels, shape (n, ny * nx)."""
+    first: NDArray[np.int64] = numbers_between("corners", corners, 0, integer=True)
+    if first.ndim != 2 or first.shape[1] != 2:
+        raise InputError(f"corners: expected shape (n, 2) holding row and column, got {first.shape}")
+    outside = np.flatnonzero(np.any(first + np.array(window) > np.array(frame), axis=1))
+    if outside.size:
+        row, column = first[outside[0]]
+        raise InputError(
+            f"corners[{outside[0]}] = ({row}, {column}): window {window} leaves the frame {frame}"
+        )
+    window_rows = first[:, 0, None, None] + np.arange(window[0])[:, None]
+    window_columns = first[:, 1, None, None] + np.arange(window[1])
+    flat: NDArray[np.int64] = (window_rows * frame[1] + window_columns).reshape(len(first), -1)
+    return flat
+
+
+def _place_windows(
+    images: NDArray[np.float64], pixels: NDArray[np.int64], frame: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Add up the windows' light in each frame; windows may overlap."""
+    n_pixels = frame[0] * frame[1]
+    where = pixels.ravel() + n_pixels * np.arange(len(images))[:, None]
+    light = np.zeros(len(images) * n_pixels)
+    np.add.at(light, where, images)
+    return light.reshape(len(images), *frame)

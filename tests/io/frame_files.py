@@ -1,0 +1,55 @@
+"""Files of frames in every format, for the tests of reading."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+
+fits = pytest.importorskip("astropy.io.fits")
+zarr = pytest.importorskip("zarr")
+
+FORMATS = ["npy", "fortran.npy", "npz", "deflated.npz", "fits", "fits.gz", "fits.fz"]
+FORMATS += ["v2.zarr", "v3.zarr", "group.zarr"]
+
+
+def cube(n: int = 11, height: int = 6, width: int = 8, dtype: str = "int16") -> NDArray[Any]:
+    return np.random.default_rng(5).integers(-900, 900, (n, height, width)).astype(dtype)
+
+
+def save(path: Path, frames: NDArray[Any]) -> Path:
+    """Write frames in the format that the name tells."""
+    name = path.name
+    if name.endswith("fortran.npy"):
+        np.save(path, np.asfortranarray(frames))
+    elif name.endswith("npy"):
+        np.save(path, frames)
+    elif name.endswith("deflated.npz"):
+        np.savez_compressed(path, frames=frames, dark=frames[0])
+    elif name.endswith("npz"):
+        np.savez(path, frames)
+    elif name.endswith("fz"):
+        lossless = {} if frames.dtype.kind != "f" else {"compression_type": "GZIP_1", "quantize_level": 0}
+        fits.CompImageHDU(frames, tile_shape=(1, *frames.shape[1:]), **lossless).writeto(path)
+    elif "fits" in name:
+        fits.PrimaryHDU(frames).writeto(path)
+    elif "group" in name:
+        group = zarr.create_group(str(path))
+        group.create_array("frames", data=frames, chunks=(4, *frames.shape[1:]))
+        group.create_array("dark", data=frames[0])
+    else:
+        zarr_format = 2 if "v2" in name else 3
+        zarr.create_array(str(path), data=frames, chunks=(4, *frames.shape[1:]), zarr_format=zarr_format)
+    return path
+
+
+def assert_message(error: pytest.ExceptionInfo[InputError], *parts: str) -> None:
+    message = str(error.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message, message
