@@ -30,6 +30,12 @@ def slope_error(images: NDArray[np.float32], truth: NDArray[np.float64], keep: i
     return float(errors.mean()), float(errors.std() / np.sqrt(n))
 
 
+def spots_as_seen(positions: Any, *, flux_e: Any, shape: tuple[int, int] = (16, 16), **spot: Any) -> Any:
+    """Noiseless images whose flux counts what a centred spot leaves within its image."""
+    centred = spots([[0.0, 0.0]], shape=shape, **spot)[0].sum()
+    return spots(positions, shape=shape, flux_e=np.asarray(flux_e) / centred, **spot)
+
+
 def test_subapertures_are_spots_seen_by_the_detector() -> None:
     images, truth = subapertures(5000, flux_e=80.0, size=1.5, rng=np.random.default_rng(1), detector=QUIET)
     assert images.shape == (5000, 16, 16)
@@ -37,7 +43,7 @@ def test_subapertures_are_spots_seen_by_the_detector() -> None:
     assert truth.shape == (5000, 2)
     assert truth.dtype == np.float64
     # Poisson sums: 4.9 standard errors, a false alarm in 1e6.
-    expected = spots(truth, flux_e=80.0, size=1.5).sum()
+    expected = spots_as_seen(truth, flux_e=80.0, size=1.5).sum()
     assert abs(images.sum(dtype=np.float64) - expected) <= 4.9 * np.sqrt(expected)
 
 
@@ -52,12 +58,14 @@ def test_positions_are_uniform_in_their_range() -> None:
 
 def test_given_positions_come_back_as_truth() -> None:
     given = np.array([[0.5, -3.0], [2.0, 1.0]])
-    images, truth = subapertures(2, positions=given, flux_e=[1e6, 4e6], detector=QUIET)
+    images, truth = subapertures(
+        2, positions=given, flux_e=[1e6, 4e6], detector=QUIET, rng=np.random.default_rng(11)
+    )
     np.testing.assert_array_equal(truth, given)
     truth[:] = 0
     assert given[0, 1] == -3
     # 1e6 electrons, peak pixel 2e5: Poisson noise is 5 * sqrt(2e5) at most.
-    mean_e = spots(given, flux_e=[1e6, 4e6])
+    mean_e = spots_as_seen(given, flux_e=[1e6, 4e6])
     assert np.all(np.abs(images - mean_e) <= 6 * np.sqrt(mean_e) + 20)
 
 
@@ -86,8 +94,10 @@ def test_seeds_and_detectors() -> None:
 def test_many_subapertures_are_made_in_blocks() -> None:
     # 1500 x 40 x 40 pixels are more than one block; parameters must follow their sub-aperture.
     flux = np.arange(1500) * 100.0
-    images, truth = subapertures(1500, shape=(40, 40), flux_e=flux, detector=QUIET)
-    mean_e = spots(truth, shape=(40, 40), flux_e=flux).sum(axis=(1, 2))
+    images, truth = subapertures(
+        1500, shape=(40, 40), flux_e=flux, detector=QUIET, rng=np.random.default_rng(12)
+    )
+    mean_e = spots_as_seen(truth, shape=(40, 40), flux_e=flux).sum(axis=(1, 2))
     # 1500 sums at 6 standard errors: a false alarm in 3e6.
     assert np.all(np.abs(images.sum(axis=(1, 2), dtype=np.float64) - mean_e) <= 6 * np.sqrt(mean_e) + 20)
 
@@ -96,22 +106,19 @@ def test_many_subapertures_are_made_in_blocks() -> None:
     "case", ["noise_rn0.1_f30", "noise_rn3_f200", "spot_gauss_s2_f80", "nx8_f30", "lgs_rn1_f80"]
 )
 def test_slope_errors_of_an_independent_simulation(case: str) -> None:
-    """The reference counts the flux inside the window, so each spot is brightened by what it loses there."""
     reference = json.loads(shared_file("reference/slope_error_cases.json").read_text())[case]
     given = reference["params"]
     rng = np.random.default_rng(2015)
     n_pixels = (given["n"], given["n"])
     profile = {"sinc2": "diffraction", "gauss": "gaussian"}[given["psf"]]
-    positions = rng.uniform(-given["rng_px"], given["rng_px"], (10000, 2))
-    kept = spots(positions, shape=n_pixels, profile=profile, size=given["size"], elongation=given["elong"])
     images, truth = subapertures(
         10000,
         shape=n_pixels,
-        flux_e=given["flux"] / kept.sum(axis=(1, 2)),
+        flux_e=given["flux"],
         profile=profile,
         size=given["size"],
         elongation=given["elong"],
-        positions=positions,
+        position_range_px=given["rng_px"],
         detector=Detector(given["rn"]),
         rng=rng,
     )
@@ -133,7 +140,7 @@ def test_sensor_frames_hold_each_spot_in_its_window() -> None:
     np.testing.assert_array_equal(truth[17], positions)
     expected = np.zeros((20, 24))
     for (row, column), image in zip(
-        CORNERS, spots(positions, shape=(8, 6), flux_e=[100.0, 0.0, 50.0]), strict=True
+        CORNERS, spots_as_seen(positions, shape=(8, 6), flux_e=[100.0, 0.0, 50.0]), strict=True
     ):
         expected[row : row + 8, column : column + 6] += image
     assert np.all(frames[:, expected == 0] == 0)
@@ -144,9 +151,16 @@ def test_sensor_frames_hold_each_spot_in_its_window() -> None:
 def test_windows_may_overlap() -> None:
     corners = [[0, 0], [0, 0]]
     frames, _ = sensor_frames(
-        corners, (6, 6), (6, 6), 1, positions=[[0, 0], [0, 0]], flux_e=1e6, detector=QUIET
+        corners,
+        (6, 6),
+        (6, 6),
+        1,
+        positions=[[0, 0], [0, 0]],
+        flux_e=1e6,
+        detector=QUIET,
+        rng=np.random.default_rng(14),
     )
-    expected = 2e6 * spots([[0, 0]], shape=(6, 6))[0]
+    expected = spots_as_seen([[0, 0]], shape=(6, 6), flux_e=2e6)[0]
     assert np.all(np.abs(frames[0] - expected) <= 6 * np.sqrt(expected))
 
 
@@ -174,9 +188,11 @@ def test_sensor_frames_are_the_detectors_adu() -> None:
 
 def test_many_frames_are_made_in_blocks() -> None:
     # 600 x 64 x 64 pixels are more than one block.
-    frames, truth = sensor_frames([[10, 20]], (16, 16), (64, 64), 600, flux_e=1e4, detector=QUIET)
+    frames, truth = sensor_frames(
+        [[10, 20]], (16, 16), (64, 64), 600, flux_e=1e4, detector=QUIET, rng=np.random.default_rng(13)
+    )
     total = frames[:, 10:26, 20:36].sum(axis=(1, 2), dtype=np.float64)
-    expected = spots(truth[:, 0], flux_e=1e4).sum(axis=(1, 2))
+    expected = spots_as_seen(truth[:, 0], flux_e=1e4).sum(axis=(1, 2))
     assert np.all(np.abs(total - expected) <= 6 * np.sqrt(expected))
     assert frames.sum(dtype=np.float64) == total.sum()
 

@@ -43,7 +43,8 @@ def subapertures(
     shape : (int, int)
         Rows and columns (ny, nx) of each image, px.
     flux_e : float or array_like, shape (n,)
-        Electrons of the whole, infinite spot; what falls outside the image is lost.
+        Electrons that a spot in the middle of its image leaves within it. Farther out more light is lost,
+        as behind a field stop.
     profile, size, elongation, angle_deg
         The spot's shape, see `faintspot.simulate.spots`.
     position_range_px : float
@@ -82,6 +83,7 @@ def subapertures(
             ("angle_deg", angle_deg),
         )
     )
+    flux = _whole_flux(flux, (ny, nx), profile, sizes, elongations, angles)
     images = np.empty((n, ny, nx), dtype=np.float32)
     block = max(1, _BLOCK_PIXELS // (ny * nx))
     for start in range(0, n, block):
@@ -131,7 +133,7 @@ def sensor_frames(
     n_frames : int
         How many frames.
     flux_e : float or array_like, shape (n,)
-        Electrons per frame of each sub-aperture's whole, infinite spot.
+        Electrons per frame that a spot in the middle of its window leaves within it.
     profile, size, elongation, angle_deg
         The spot's shape, see `faintspot.simulate.spots`; one number each or one per sub-aperture.
     position_range_px : float
@@ -165,11 +167,12 @@ def sensor_frames(
     truth = _true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
     camera = _camera(detector)
     shape_of_spots = {
-        "flux_e": per_spot("flux_e", flux_e, n),
         "size": per_spot("size", size, n),
         "elongation": per_spot("elongation", elongation, n),
         "angle_deg": per_spot("angle_deg", angle_deg, n),
     }
+    flux = per_spot("flux_e", flux_e, n)
+    shape_of_spots["flux_e"] = _whole_flux(flux, window_shape, profile, *shape_of_spots.values())
     blocks = []
     block = max(1, _BLOCK_PIXELS // max(rows * columns, pixels.size))
     for start in range(0, n_frames, block):
@@ -179,6 +182,28 @@ def sensor_frames(
         mean_e = _place_windows(images.reshape(len(part), -1), pixels, (rows, columns))
         blocks.append(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
     return np.concatenate(blocks), truth
+
+
+def _whole_flux(
+    flux_e: NDArray[np.float64],
+    shape: tuple[int, int],
+    profile: str,
+    size: NDArray[np.float64],
+    elongation: NDArray[np.float64],
+    angle_deg: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the flux of the whole, infinite spots that leave `flux_e` within their image when centred."""
+    kinds, which = np.unique(np.stack([size, elongation, angle_deg], axis=1), axis=0, return_inverse=True)
+    centred = spots(
+        np.zeros((len(kinds), 2)),
+        shape=shape,
+        profile=profile,
+        size=kinds[:, 0],
+        elongation=kinds[:, 1],
+        angle_deg=kinds[:, 2],
+    )
+    whole: NDArray[np.float64] = flux_e / centred.sum(axis=(1, 2))[which]
+    return whole
 
 
 def _camera(detector: Any) -> Detector:
