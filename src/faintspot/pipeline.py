@@ -122,6 +122,12 @@ class SlopePipeline:
         layout, settings, calibration = configuration.load_all(path)
         return cls(layout, settings, calibration, **options)
 
+    def fingerprint(self) -> bytes:
+        """Return bytes that differ between pipelines that could give different slopes for the same frame."""
+        parts = (self.layout.corners, self._calibration_maps, self._table)
+        text = f"{self.layout.window} {self.settings.algorithm} {self.calibration.saturation_adu}"
+        return b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + text.encode()
+
     def __call__(self, frame: ArrayLike) -> Slopes:
         """Measure the slopes of a frame (h, w) or of frames (n, h, w), in ADU.
 
@@ -154,9 +160,8 @@ class SlopePipeline:
         """Compute the slopes, and the stages where asked for."""
         frames = _kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
-        results = [np.empty((n_frames, n), np.float32) for _ in range(3)]
-        results += [np.empty((n_frames, n), np.uint8)]
-        results += [np.empty((n_frames, n), np.int32) for _ in range(2)]
+        dtypes = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32)
+        results = tuple(np.empty((n_frames, n), dtype) for dtype in dtypes)
         stages = np.empty((fused.STAGE_ROWS if explain else 0, n_frames, n, self.layout.pixels), np.float32)
         saturation = self.calibration.saturation(array.dtype)
         algorithm = ALGORITHMS[self.settings.algorithm]
@@ -174,13 +179,14 @@ class SlopePipeline:
                 start,
                 stop,
                 scratch,
-                tuple(results),
+                results,
                 stages,
             )
 
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)
-        return Slopes(*(result.reshape(*array.shape[:-2], n) for result in results)), stages
+        shaped: Any = (result.reshape(*array.shape[:-2], n) for result in results)
+        return Slopes(*shaped), stages
 
 
 def _kernel_frames(array: NDArray[Any]) -> NDArray[Any]:

@@ -80,28 +80,39 @@ def slopes_of_groups(
         Written where it has rows.
     """
     width = width_of(lanes)
-    image, output, state, rows, numbers, counts, flags = scratch
+    image, output, state, rows, numbers, counts, lane_counts = scratch
+    places, flags, pixel_counts = (
+        lane_counts[:width],
+        lane_counts[width : 2 * width],
+        lane_counts[2 * width :],
+    )
     n = corners.shape[0]
+    height, line = frames.shape[1:]
     n_groups = (n + width - 1) // width
     for item in range(start, stop):
         f, first = item // n_groups, (item % n_groups) * width
         for lane in range(width):
             s = min(first + lane, n - 1)
-            bad, saturated = gather_calibrated(
-                width,
-                frames[f],
-                calibration[0],
-                calibration[1],
-                saturation,
-                corners[s, 0],
-                corners[s, 1],
-                lane,
-                ny,
-                nx,
-                image,
-            )
-            flags[lane] = SATURATED if saturated > 0 else 0
-            flags[width + lane] = bad
+            places[lane] = corners[s, 0] * line + corners[s, 1]
+        gather_calibrated(
+            width,
+            frames,
+            f * height * line,
+            calibration,
+            height * line,
+            line,
+            places,
+            saturation,
+            ny,
+            nx,
+            image,
+            output,
+            pixel_counts,
+        )
+        for lane in range(width):
+            s = min(first + lane, n - 1)
+            bad = pixel_counts[lane]
+            flags[lane] = SATURATED if pixel_counts[width + lane] > 0 else 0
             if bad > 0:
                 fill_bad_pixels(width, lane, ny, nx, image, output)
                 flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else BAD_PIXELS
@@ -118,7 +129,9 @@ def slopes_of_groups(
         if stages.shape[0] > 0:
             _store_stage(width, output, stages[BACKGROUND, f], first)
         for lane in range(min(width, n - first)):
-            _store_slope(width, ny, nx, lane, f, first + lane, settings, numbers, counts, flags, slopes)
+            _store_slope(
+                width, ny, nx, lane, f, first + lane, settings, numbers, counts, flags, pixel_counts, slopes
+            )
 
 
 @compiled
@@ -147,6 +160,7 @@ def _store_slope(
     numbers: Any,
     counts: Any,
     flags: Any,
+    pixel_counts: Any,
     slopes: Any,
 ) -> None:
     """Write one sub-aperture's result; the reference position (slope 0) where it is invalid."""
@@ -170,7 +184,7 @@ def _store_slope(
     flux[f, s] = total
     flag[f, s] = bits
     iterations[f, s] = counts[total_variation.ITERATIONS * width + lane]
-    bad_pixels[f, s] = flags[width + lane]
+    bad_pixels[f, s] = pixel_counts[lane]
 
 
 @compiled

@@ -9,37 +9,64 @@ import numpy as np
 
 from faintspot.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
+from faintspot.kernels.simd import get, put
 
 
 @compiled
 def gather_calibrated(
     width: Any,
-    frame: Any,
-    dark: Any,
-    scale: Any,
+    frames: Any,
+    frame_start: Any,
+    calibration: Any,
+    frame_pixels: Any,
+    line: Any,
+    corners: Any,
     saturation: Any,
-    row: Any,
-    column: Any,
-    lane: Any,
     ny: Any,
     nx: Any,
     image: Any,
-) -> Any:
-    """Copy one sub-aperture of a frame into a lane, in electrons; return bad and saturated pixels.
+    tile: Any,
+    counts: Any,
+) -> None:
+    """Copy W sub-apertures of a frame into the lanes, in electrons.
 
     (raw - dark) * scale; a bad pixel has scale NaN. What is not finite or absurdly large becomes NaN.
+
+    Parameters
+    ----------
+    frame_start, line, corners : int, int, (W,) int64
+        Flat offsets: of the frame in `frames`, of one row from the next, of each sub-aperture in the frame.
+    calibration, frame_pixels : (2, h, w) array, int
+        Dark and scale, and the number of pixels of each.
+    saturation : float
+    image : (ny * nx * W,) array
+        Written.
+    tile : array
+        Scratch for nx * W numbers: one row of every sub-aperture, so that the frame is read and the image
+        written in order.
+    counts : (2 * W,) int64
+        Bad and saturated pixels of every lane; written.
     """
-    bad, saturated = 0, 0
+    limit, level, nan = np.float32(LARGEST_FLOAT32), np.float32(saturation), np.float32(math.nan)
+    for lane in range(2 * width):
+        counts[lane] = 0
     for y in range(ny):
+        for lane in range(width):
+            start = get(corners, lane) + y * line
+            bad, saturated = 0, 0
+            for x in range(nx):
+                raw = np.float32(get(frames, frame_start + start + x))
+                dark, scale = get(calibration, start + x), get(calibration, frame_pixels + start + x)
+                value = (raw - dark) * scale
+                good = abs(value) <= limit
+                bad += not good
+                saturated += raw >= level
+                put(tile, lane * nx + x, value if good else nan)
+            counts[lane] += bad
+            counts[width + lane] += saturated
         for x in range(nx):
-            raw = np.float32(frame[row + y, column + x])
-            value = (raw - dark[row + y, column + x]) * scale[row + y, column + x]
-            saturated += raw >= saturation
-            if not abs(value) <= LARGEST_FLOAT32:
-                bad += 1
-                value = math.nan
-            image[(y * nx + x) * width + lane] = value
-    return bad, saturated
+            for lane in range(width):
+                put(image, (y * nx + x) * width + lane, get(tile, lane * nx + x))
 
 
 @compiled
@@ -73,12 +100,14 @@ def fill_bad_pixels(width: Any, lane: Any, ny: Any, nx: Any, image: Any, origina
 @compiled
 def gather_image(width: Any, images: Any, index: Any, lane: Any, image: Any) -> None:
     """Copy one image of a stack (n, pixels) into a lane."""
-    for i in range(images.shape[1]):
-        image[i * width + lane] = images[index, i]
+    pixels = images.shape[1]
+    for i in range(pixels):
+        put(image, i * width + lane, get(images, index * pixels + i))
 
 
 @compiled
 def scatter_image(width: Any, image: Any, lane: Any, images: Any, index: Any) -> None:
     """Copy a lane into one image of a stack (n, pixels)."""
-    for i in range(images.shape[1]):
-        images[index, i] = image[i * width + lane]
+    pixels = images.shape[1]
+    for i in range(pixels):
+        put(images, index * pixels + i, get(image, i * width + lane))

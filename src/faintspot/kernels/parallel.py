@@ -31,7 +31,7 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 
 def new_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
-    """Scratch memory for one thread: image, output, state, rows, numbers, counts, flags."""
+    """Scratch memory for one thread: image, output, state, rows, numbers, counts, lane counts."""
     width, pixels = lanes.width, ny * nx
     return (
         aligned_zeros(pixels * width, lanes.dtype),
@@ -40,7 +40,7 @@ def new_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
         aligned_zeros((pixels + 2 * nx + 1) * width, lanes.dtype),
         aligned_zeros((total_variation.LANE_ROWS + brightest.LANE_ROWS) * width, lanes.dtype),
         np.zeros(total_variation.COUNT_ROWS * width, np.int64),
-        np.zeros(2 * width, np.int64),
+        np.zeros(4 * width, np.int64),
     )
 
 

@@ -159,6 +159,32 @@ def store(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
 
 
 @intrinsic
+def get(typing_context: Any, array: Any, offset: Any) -> Any:
+    """One element of a contiguous array of any number of dimensions, by its flat offset."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[1], sig.args[1], types.intp)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return builder.load(builder.gep(data, [place]))
+
+    return array.dtype(array, offset), emit
+
+
+@intrinsic
+def put(typing_context: Any, array: Any, offset: Any, value: Any) -> Any:
+    """Set one element of a contiguous array, by its flat offset."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[1], sig.args[1], types.intp)
+        number = context.cast(builder, args[2], sig.args[2], sig.args[0].dtype)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        builder.store(number, builder.gep(data, [place]))
+        return context.get_dummy_value()
+
+    return types.void(array, offset, value), emit
+
+
+@intrinsic
 def splat(typing_context: Any, lanes: Any, number: Any) -> Any:
     """The same number in every lane."""
     vector = Vector(lanes.scalar, lanes.width)

@@ -14,6 +14,8 @@ from faintspot.errors import InputError
 
 GEOMETRIES = ("square", "hexagonal")
 SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
+_LARGEST_SHIFT = 0.35  # of a window's side, by which windows are moved off the spots
+_WORTH_A_SHIFT = 0.05  # of the sub-apertures, which must be saved by it
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,7 @@ class Layout:
         pitch_px: float | None = None,
         pixels: int | tuple[int, int] | None = None,
         bad_pixels: ArrayLike | None = None,
+        move_windows: bool = True,
         **options: Any,
     ) -> Layout:
         """Find the sub-apertures of a square or hexagonal lenslet array in a frame.
@@ -183,13 +186,17 @@ class Layout:
             Window. Default: the largest square in which neighbours do not overlap.
         bad_pixels : (h, w) array of bool, optional
             True where a pixel must not be used.
+        move_windows : bool
+            Whether windows may be moved off the spots to save those at the frame's edge, see below.
         **options
             Passed on to `faintspot.sensor.lenslets.find_lenslets`.
 
         Returns
         -------
         Layout
-            Of the lit sub-apertures whose windows lie within the frame.
+            Of the lit sub-apertures whose windows lie within the frame. Windows have the spots' mean lattice
+            in their middle; where that would lose more than 5 % of the sub-apertures at the frame's edge, all
+            windows are moved alike, by up to 0.35 of their side. `centres` always holds the lattice.
 
         Raises
         ------
@@ -206,8 +213,11 @@ class Layout:
         else:
             window = _pair("pixels", pixels, SMALLEST_WINDOW, LARGEST_WINDOW)
         shape = (int(array.shape[-2]), int(array.shape[-1]))
-        middle = 0.5 * (np.array(window) - 1)
-        corners = np.floor(grid.centres[:, ::-1] - middle + 0.5).astype(np.int64)
+        middles = grid.centres[:, ::-1]
+        if move_windows:
+            moved = [_shift_inside(middles[:, i], window[i], shape[i]) for i in range(2)]
+            middles = np.stack(moved, axis=1)
+        corners = np.floor(middles - 0.5 * (np.array(window) - 1) + 0.5).astype(np.int64)
         within = np.all((corners >= 0) & (corners + np.array(window) <= np.array(shape)), axis=1)
         if not within.any():
             raise InputError(
@@ -294,6 +304,17 @@ def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
         raise InputError(
             f"layout: sub-apertures {first} and {second} overlap; choose smaller windows than {window}"
         )
+
+
+def _shift_inside(centres: NDArray[np.float64], side: int, length: int) -> NDArray[np.float64]:
+    """Move all windows alike along one axis, as little as needed, where that saves many at the edge."""
+    shifts = np.arange(-_LARGEST_SHIFT * side, _LARGEST_SHIFT * side + 0.25, 0.5)
+    starts = np.floor(centres + shifts[:, None] - 0.5 * (side - 1) + 0.5)
+    inside = np.count_nonzero((starts >= 0) & (starts + side <= length), axis=1)
+    best = np.lexsort((np.abs(shifts), -inside))[0]
+    unmoved = inside[np.argmin(np.abs(shifts))]
+    worth_it = inside[best] - unmoved > _WORTH_A_SHIFT * len(centres)
+    return centres + (shifts[best] if worth_it else 0.0)
 
 
 def _clear_distance(centres: NDArray[np.float64], pitch_px: float) -> float:

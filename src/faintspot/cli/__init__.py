@@ -1,0 +1,78 @@
+"""The command line: one thin file a command."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import click
+
+from faintspot import __version__
+from faintspot.errors import InputError, MissingExtraError
+
+_COMMANDS = {
+    "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
+    "layout": "Find the sub-apertures in a frame and write a configuration.",
+    "report": "Make a web page of pictures and tables from slopes.",
+    "slopes": "Turn recorded frames into slopes.",
+}
+
+
+class _LazyGroup(click.Group):
+    """Imports a command's module only when it is used, so that --help answers at once."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        """Return the names of all commands."""
+        return list(_COMMANDS)
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """Import one command."""
+        if name not in _COMMANDS:
+            return None
+        module = __import__(f"faintspot.cli.{name}", fromlist=["command"])
+        return module.command  # type: ignore[no-any-return]
+
+    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(_COMMANDS.items()))
+
+
+@click.group(
+    cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
+@click.version_option(__version__, prog_name="faintspot")
+def group() -> None:
+    """Wavefront slopes from faint Shack-Hartmann spots.
+
+    Removes the noise of each sub-aperture image by total-variation minimisation, subtracts the background by
+    keeping the brightest pixels, and takes the centre of gravity (Basden et al. 2015, arXiv:1503.06043).
+
+    \b
+    With frames of your own:
+      faintspot layout frames.fits -o faintspot.toml
+      faintspot slopes frames.fits --config faintspot.toml -o slopes.zarr
+      faintspot report slopes.zarr
+
+    \b
+    Without:
+      faintspot demo
+    """
+
+
+def main(arguments: list[str] | None = None) -> Any:
+    """Run the command line; an error of the user's ends with one line and exit code 2."""
+    try:
+        return group.main(args=arguments, prog_name="faintspot", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (InputError, MissingExtraError) as error:
+        click.echo(f"faintspot: error: {' '.join(str(error).split())}", err=True)
+        sys.exit(2)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("faintspot: interrupted; the same command goes on where it stopped", err=True)
+        sys.exit(130)
+    except MemoryError:
+        click.echo("faintspot: error: not enough memory; try fewer frames at a time (--block)", err=True)
+        sys.exit(2)

@@ -1,0 +1,51 @@
+"""The progress bar of long commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+
+class _Rate(ProgressColumn):
+    """Units per second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self.unit = unit
+
+    def render(self, task: Task) -> Text:
+        """Return the rate as text."""
+        return Text(
+            f"{task.completed / task.elapsed:,.0f} {self.unit}/s" if task.elapsed else f"- {self.unit}/s"
+        )
+
+
+@contextmanager
+def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on standard error; yields a function to call with finished and total counts."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(unit),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(what, total=None)
+
+        def advance(finished: int, total: int) -> None:
+            progress.update(task, completed=finished, total=total)
+
+        yield advance

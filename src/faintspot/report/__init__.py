@@ -1,0 +1,33 @@
+"""Pictures, tables and the report page (HTML) of a slopes run."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from faintspot.report.page import slopes_report as slopes_report
+    from faintspot.report.page import write_report as write_report
+    from faintspot.report.pictures import layout_picture as layout_picture
+    from faintspot.report.statistics import Arm as Arm
+    from faintspot.report.stored import report_of_stored as report_of_stored
+
+# Imported at first use: matplotlib and jinja2 are optional, and slow to import.
+_HOMES = {
+    "Arm": "faintspot.report.statistics",
+    "layout_picture": "faintspot.report.pictures",
+    "report_of_stored": "faintspot.report.stored",
+    "slopes_report": "faintspot.report.page",
+    "write_report": "faintspot.report.page",
+}
+
+__all__ = ["Arm", "layout_picture", "report_of_stored", "slopes_report", "write_report"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its home at first use."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'faintspot.report' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value

@@ -1,0 +1,147 @@
+"""How every picture of a report looks: figures without global state, colours, maps of sub-apertures."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import io
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import MissingExtraError
+from faintspot.sensor.layout import Layout
+
+try:
+    import matplotlib
+    from matplotlib.axes import Axes
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+except ImportError:
+    raise MissingExtraError("matplotlib", "web", "Drawing pictures") from None
+
+COLOUR_MAP = "cividis"
+# Okabe & Ito (2008): told apart with any colour vision.
+ARM_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7")
+ARM_MARKERS = ("+", "x", "1", "2")
+TRUTH_COLOUR = "#56B4E9"
+GREY = "#9a9a9a"
+LIGHT_GREY = "#e4e4e4"
+DOTS_PER_INCH = 144
+WIDTH = 13.0
+"""Inches of a picture as wide as the page."""
+
+_STYLE = {
+    "font.size": 12,
+    "axes.titlesize": 13,
+    "axes.labelsize": 12,
+    "legend.fontsize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "image.cmap": COLOUR_MAP,
+    "image.origin": "lower",
+}
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Make a drawing function use the report's style, whatever the user's own settings are."""
+
+    @functools.wraps(draw)
+    def with_style(*arguments: _Arguments.args, **options: _Arguments.kwargs) -> _Result:
+        with matplotlib.rc_context():
+            matplotlib.rcdefaults()
+            matplotlib.rcParams.update(_STYLE)
+            return draw(*arguments, **options)
+
+    return with_style
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty white figure, inches."""
+    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG picture."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=DOTS_PER_INCH)
+    return stream.getvalue()
+
+
+def data_uri(figure: Figure) -> str:
+    """Return a figure as a PNG picture within a text."""
+    return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
+
+
+def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
+    """Return the corners of each lenslet's square or hexagon in frame pixels, (n, 4 or 6, 2)."""
+    pitch = _pitch(layout)
+    if layout.geometry == "hexagonal":
+        angles, radius = 30.0 + 60.0 * np.arange(6), pitch / np.sqrt(3)
+    else:
+        angles, radius = 45.0 + 90.0 * np.arange(4), pitch / np.sqrt(2)
+    direction = np.deg2rad(angles + layout.angle_deg)
+    ring = 0.96 * radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    return layout.centres[:, None, :] + ring
+
+
+def subaperture_map(
+    axes: Axes,
+    layout: Layout,
+    values: NDArray[Any],
+    *,
+    label: str,
+    limits: tuple[float, float],
+    title: str,
+) -> None:
+    """Draw one value per sub-aperture at its place; without a value (NaN) it is an empty outline."""
+    shapes = subaperture_shapes(layout)
+    known = np.isfinite(values)
+    empty = PolyCollection(list(shapes[~known]), facecolors="white", edgecolors=GREY, linewidths=0.6)
+    filled = PolyCollection(list(shapes[known]), array=values[known], cmap=COLOUR_MAP, linewidths=0)
+    filled.set_clim(*limits)
+    axes.add_collection(empty)
+    axes.add_collection(filled)
+    place_axes(axes, layout)
+    axes.set_title(title)
+    colour_bar(axes, filled, label)
+
+
+def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str) -> None:
+    """Put a colour bar beside one or several axes."""
+    first = axes[0] if isinstance(axes, list) else axes
+    figure = first.get_figure()
+    assert figure is not None
+    bar = figure.colorbar(mappable, ax=axes, label=label, shrink=0.85, pad=0.02)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+
+
+def place_axes(axes: Axes, layout: Layout) -> None:
+    """Set the limits of axes in frame pixels so that all sub-apertures are within."""
+    shapes = subaperture_shapes(layout).reshape(-1, 2)
+    margin = 0.15 * _pitch(layout)
+    low, high = shapes.min(axis=0) - margin, shapes.max(axis=0) + margin
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+    axes.set_xlabel("column (px)")
+    axes.set_ylabel("row (px)")
+
+
+def limits_of(*arrays: NDArray[Any], low: float | None = None, percent: float = 100.0) -> tuple[float, float]:
+    """Return the colour limits for values of several maps together; never an empty range."""
+    values = np.concatenate([array[np.isfinite(array)] for array in map(np.ravel, arrays)])
+    if values.size == 0:
+        return 0.0, 1.0
+    start = float(np.percentile(values, 100.0 - percent)) if low is None else low
+    stop = float(np.percentile(values, percent))
+    return (start, stop) if stop > start else (start, start + max(1e-3, abs(start)))
+
+
+def _pitch(layout: Layout) -> float:
+    return float(max(layout.window)) if layout.pitch_px is None else layout.pitch_px

@@ -1,0 +1,321 @@
+"""Pictures of frames: the sensor and single sub-apertures after every step, and a layout on its frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.patheffects
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import FuncNorm
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.errors import InputError
+from faintspot.io.slopes_format import output_errors
+from faintspot.pipeline import Stages
+from faintspot.report.drawing import (
+    ARM_COLOURS,
+    ARM_MARKERS,
+    LIGHT_GREY,
+    TRUTH_COLOUR,
+    WIDTH,
+    colour_bar,
+    limits_of,
+    new_figure,
+    png,
+    styled,
+)
+from faintspot.sensor.layout import Layout
+
+Floats = NDArray[np.float64]
+
+STEPS = {
+    "raw": "raw",
+    "calibrated": "calibrated",
+    "denoised": "denoised",
+    "background_subtracted": "after background",
+}
+MOST_MARKED = 150
+"""With more sub-apertures than this the whole sensor's picture has no marks: they would hide the spots."""
+_MOST_NUMBERED = 1500
+_OUTLINE = [matplotlib.patheffects.withStroke(linewidth=3.0, foreground="black")]
+
+
+@dataclass(frozen=True)
+class Example:
+    """One frame after every step.
+
+    Attributes
+    ----------
+    layout : Layout
+    stages : mapping of Stages
+        By arm; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
+        marked. They must be measured from the sub-apertures' centres (no other reference).
+    truth : array (n_subapertures, 2), optional
+        True x, y, px.
+    """
+
+    layout: Layout
+    stages: Mapping[str, Stages]
+    truth: Floats | None = None
+
+    @property
+    def first(self) -> Stages:
+        """What is shown."""
+        return next(iter(self.stages.values()))
+
+    @property
+    def raw_is_calibrated(self) -> bool:
+        """Whether the raw frame is in electrons already."""
+        return bool(np.allclose(self.first.raw, self.first.calibrated, rtol=1e-5, equal_nan=True))
+
+    def positions(self) -> dict[str, Floats]:
+        """Return valid positions by arm, and the truth, from the middle of the window, px; NaN if invalid."""
+        found = {}
+        for name, stages in self.stages.items():
+            xy = np.stack([stages.slopes.x, stages.slopes.y], axis=-1).astype(np.float64)
+            found[name] = np.where(stages.slopes.valid[:, None], xy, np.nan) + self.layout.offsets
+        if self.truth is not None:
+            found["truth"] = self.truth + self.layout.offsets
+        return found
+
+
+@styled
+def whole_sensor(example: Example) -> Figure:
+    """Draw all windows at their places after every step, with the positions of the spots."""
+    layout = example.layout
+    sheets = {step: assembled(layout, getattr(example.first, step)) for step in STEPS}
+    n_rows, n_columns = sheets["raw"].shape
+    height = min(max(WIDTH / 4 * n_rows / n_columns, 1.5), 9.0) + 1.6
+    figure = new_figure(WIDTH + 2.0, height)
+    axes = list(figure.subplots(1, 4, sharex=True, sharey=True))
+    start = layout.corners.min(axis=0)
+    extent = (start[1] - 0.5, start[1] + n_columns - 0.5, start[0] - 0.5, start[0] + n_rows - 0.5)
+    _draw_steps(axes, sheets, example.raw_is_calibrated, extent, location="bottom")
+    axes[0].set_ylabel("row (px)")
+    middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
+    for panel in axes:
+        panel.set_xlabel("column (px)")
+        if panel is not axes[0] and len(layout) <= MOST_MARKED:
+            _mark(panel, {name: xy + middles for name, xy in example.positions().items()}, size=4.5)
+    if len(layout) <= MOST_MARKED:
+        _legend(figure, axes[1])
+    return figure
+
+
+@styled
+def zoom(example: Example) -> Figure:
+    """Draw the faintest, a median and the brightest valid sub-aperture after every step."""
+    chosen = example_subapertures(example.first)
+    height, width = example.layout.window
+    figure = new_figure(WIDTH, len(chosen) * (WIDTH / 4.6 * min(height / width, 2.0) + 0.35) + 0.6)
+    grid = figure.subplots(len(chosen), 4, squeeze=False, sharex=True, sharey=True)
+    extent = (-width / 2, width / 2, -height / 2, height / 2)
+    positions = example.positions()
+    for axes, (what, index) in zip(grid, chosen.items(), strict=True):
+        images = {step: getattr(example.first, step)[index] for step in STEPS}
+        _draw_steps(list(axes), images, example.raw_is_calibrated, extent)
+        flux = example.first.slopes.flux[index]
+        axes[0].set_ylabel(f"{what}\nno. {index}, {flux:.3g} e-\ny (px)")
+        for panel in axes[1:]:
+            _mark(panel, {name: xy[index : index + 1] for name, xy in positions.items()}, size=13)
+        if axes is not grid[0]:
+            for panel in axes:
+                panel.set_title("")
+    for panel in grid[-1]:
+        panel.set_xlabel("x (px)")
+    _legend(figure, grid[0, 1])
+    return figure
+
+
+def example_subapertures(stages: Stages) -> dict[str, int]:
+    """Return the numbers of the faintest, a median and the brightest valid sub-aperture, each once.
+
+    Without any valid one it is the sub-aperture with the most light after calibration.
+    """
+    valid = np.flatnonzero(stages.slopes.valid)
+    if valid.size == 0:
+        light = stages.calibrated.sum(axis=(-2, -1))
+        return {"none is valid": int(np.argmax(light))}
+    order = valid[np.argsort(stages.slopes.flux[valid], kind="stable")]
+    chosen = {"brightest": int(order[-1])}
+    if len(order) > 1:
+        chosen = {"faintest": int(order[0]), **chosen}
+    if len(order) > 2:
+        chosen = {"faintest": int(order[0]), "median": int(order[len(order) // 2]), **chosen}
+    return chosen
+
+
+def assembled(layout: Layout, images: NDArray[Any]) -> Floats:
+    """Return the windows' images (n, ny, nx) at their places; NaN between them."""
+    start = layout.corners.min(axis=0)
+    height, width = layout.corners.max(axis=0) - start + np.array(layout.window)
+    sheet = np.full((height, width), np.nan)
+    rows = (layout.corners[:, 0] - start[0])[:, None, None] + np.arange(layout.window[0])[:, None]
+    columns = (layout.corners[:, 1] - start[1])[:, None, None] + np.arange(layout.window[1])
+    sheet[rows, columns] = images
+    return sheet
+
+
+@styled
+def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
+    """Write a PNG picture of a frame with the sub-apertures' windows and numbers drawn on it.
+
+    The brightness follows asinh of the light above the sky, cut at the 99.5th percentile of the windows'
+    pixels, so hot pixels neither hide the spots nor set the scale.
+
+    Parameters
+    ----------
+    frame : (h, w) or (n, h, w) array
+        Several are averaged.
+    layout : Layout
+    path : str or Path
+        Replaced when it exists.
+
+    Raises
+    ------
+    InputError
+        When the frame is not of the layout's shape or the file cannot be written.
+    """
+    array = np.asarray(frame, dtype=np.float64)
+    if array.ndim == 3:
+        array = array.mean(axis=0)
+    inside = layout.images(array)
+    write_file(path, png(_layout_figure(array, inside, layout)))
+
+
+def write_file(path: str | Path, content: bytes) -> None:
+    """Write a file in one step: a reader sees the old or the new one; InputError when it cannot be."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.new")
+    with output_errors(path):
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: the folder {path.parent} does not exist: create it or choose another")
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(path)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
+    n_rows, n_columns = array.shape
+    side = 12.0
+    figure = new_figure(side, min(max(side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
+    axes = figure.subplots()
+    image = axes.imshow(array, cmap="gray", norm=_stretch(array, inside), interpolation="nearest")
+    colour_bar(axes, image, "frame's units")
+    boxes = _window_outlines(layout)
+    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors="#E69F00", linewidths=0.9))
+    points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
+    font = min(points / 3.0, 13.0)
+    if font >= 4 and len(layout) <= _MOST_NUMBERED:
+        for number, (row, column) in enumerate(layout.corners):
+            axes.text(
+                column,
+                row + layout.window[0] - 1,
+                str(number),
+                color="#E69F00",
+                fontsize=font,
+                va="top",
+                clip_on=True,
+            )
+    axes.set_xlabel("column (px)")
+    axes.set_ylabel("row (px)")
+    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
+    plural = "" if len(layout) == 1 else "s"
+    axes.set_title(
+        f"{len(layout)} sub-aperture{plural} of {layout.window[0]} x {layout.window[1]} px, "
+        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
+    )
+    return figure
+
+
+def _stretch(array: Floats, inside: Floats) -> FuncNorm:
+    """Return an asinh stretch around the sky level, in units of its noise; blind to hot and bad pixels."""
+    good = array[np.isfinite(array)]
+    sky = float(np.median(good)) if good.size else 0.0
+    noise = 1.4826 * float(np.median(np.abs(good - sky))) if good.size else 0.0
+    low, high = limits_of(inside, percent=99.5)
+    low, high = min(low, sky - 2 * noise), max(high, sky + 5 * noise)
+    if not high > low:
+        low, high = low - 1.0, low + 1.0
+    # Linear over the noise, logarithmic over the spots; never linear in less than a twentieth of the range.
+    unit = max(3 * noise, 0.05 * (high - low))
+    return FuncNorm(
+        (lambda v: np.arcsinh((v - sky) / unit), lambda u: sky + unit * np.sinh(u)), vmin=low, vmax=high
+    )
+
+
+def _window_outlines(layout: Layout) -> list[Any]:
+    height, width = layout.window
+    ring = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    return list(layout.corners[:, None, ::-1] + ring)
+
+
+def _draw_steps(
+    axes: list[Axes], images: Mapping[str, Floats], one_unit: bool, extent: Any, location: str = "right"
+) -> None:
+    """Draw the four steps side by side on one colour scale; raw on its own one when it is in ADU."""
+    electrons = limits_of(images["calibrated"], percent=99.8)
+    adu = electrons if one_unit else limits_of(images["raw"], percent=99.8)
+    for panel, (step, image) in zip(axes, images.items(), strict=True):
+        low, high = adu if step == "raw" else electrons
+        shown = panel.imshow(image, vmin=low, vmax=high, extent=extent, interpolation="nearest")
+        panel.set_facecolor(LIGHT_GREY)
+        panel.set_title(STEPS[step] + (" (ADU)" if step == "raw" and not one_unit else ""))
+        if step == "raw" and not one_unit:
+            _bar(panel, shown, "ADU", location)
+    _bar(axes if one_unit else axes[1:], shown, "e- per pixel", location)
+
+
+def _bar(axes: Axes | list[Axes], shown: Any, label: str, location: str) -> None:
+    if location == "right":
+        colour_bar(axes, shown, label)
+        return
+    first = axes[0] if isinstance(axes, list) else axes
+    figure = first.get_figure()
+    assert figure is not None
+    shrink = 0.8 if not isinstance(axes, list) else 0.5
+    bar = figure.colorbar(shown, ax=axes, label=label, location="bottom", shrink=shrink, aspect=30)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+
+
+def _mark(axes: Axes, positions: Mapping[str, Floats], size: float) -> None:
+    """Mark positions: the truth by a circle, each arm by a cross of its own."""
+    number = 0
+    for name, xy in positions.items():
+        if name == "truth":
+            axes.plot(*xy.T, "o", mfc="none", mec=TRUTH_COLOUR, ms=1.3 * size, mew=1.6, ls="", label=name)
+            continue
+        axes.plot(
+            *xy.T,
+            ARM_MARKERS[number % len(ARM_MARKERS)],
+            color="white" if number else ARM_COLOURS[0],
+            ms=size,
+            mew=1.3,
+            ls="",
+            label=name,
+            path_effects=_OUTLINE,
+        )
+        number += 1
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=len(labels),
+            facecolor="#777777",
+            labelcolor="white",
+            edgecolor="none",
+        )

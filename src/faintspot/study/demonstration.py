@@ -1,0 +1,127 @@
+"""The demonstration: a simulated faint star on a CANARY-like sensor, with and without denoising.
+
+7 x 7 sub-apertures of which 36 are lit, 16 x 16 pixels each, an EMCCD at high gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.estimate.noise import suggested_strength
+from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.settings import Settings
+from faintspot.simulate import Detector, sensor_frames
+from faintspot.study.metric import Estimate, absolute_errors, flux_gain_with_error
+
+FLUXES_E = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0)
+SHOWN_FLUX_E = 60.0
+POSITION_RANGE_PX = 1.0
+BEST_KEPT = (6, 8, 10, 12, 16, 20, 28, 40, 60)
+FIXED_KEPT = 40
+STRENGTH_FACTORS = (0.5, 0.7, 1.0, 1.4)
+
+DETECTOR = Detector(read_noise_e=45.0, em_gain=500.0, gain_e_per_adu=20.0, offset_adu=200.0, bits=16)
+CALIBRATION = Calibration(dark=200.0, gain_e_per_adu=20.0, em_gain=500.0)
+READ_NOISE_E = 45.0 / 500.0  # referred to photo-electrons
+EXCESS_NOISE = 2.0
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One way to measure at one flux, with what was chosen for it and its errors on other frames."""
+
+    settings: Settings
+    errors: NDArray[np.float64]
+    """(|dx| + |dy|) / 2 of every scored slope, px."""
+
+    @property
+    def slope_error(self) -> Estimate:
+        """R with its standard error, px."""
+        return Estimate(float(self.errors.mean()), float(self.errors.std() / np.sqrt(self.errors.size)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Both arms at all fluxes, in one mode ("best k" or "fixed k")."""
+
+    mode: str
+    plain: list[Arm]
+    denoised: list[Arm]
+
+    def difference(self, i: int) -> Estimate:
+        """R without minus R with denoising at flux i, with its paired standard error."""
+        difference = self.plain[i].errors - self.denoised[i].errors
+        return Estimate(float(difference.mean()), float(difference.std() / np.sqrt(difference.size)))
+
+    def flux_gain(self, rng: np.random.Generator) -> Estimate:
+        """Flux gain of denoising at SHOWN_FLUX_E."""
+        plain, denoised = (np.stack([arm.errors for arm in arms]) for arms in (self.plain, self.denoised))
+        return flux_gain_with_error(FLUXES_E, plain, denoised, SHOWN_FLUX_E, rng)
+
+
+def demonstration_layout() -> Layout:
+    """Return the layout: 36 of 7 x 7 sub-apertures of 16 x 16 pixels."""
+    return Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+
+
+def simulate(
+    layout: Layout, flux_e: float, n_frames: int, rng: np.random.Generator
+) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Return frames in ADU and the true positions (n_frames, n, 2), px."""
+    return sensor_frames(
+        layout.corners,
+        layout.window,
+        layout.frame_shape,
+        n_frames,
+        flux_e=flux_e,
+        position_range_px=POSITION_RANGE_PX,
+        detector=DETECTOR,
+        rng=rng,
+    )
+
+
+def compare(
+    n_frames: int, rng: np.random.Generator, progress: Callable[[int, int], None] | None = None
+) -> list[Comparison]:
+    """Measure R with and without denoising at all fluxes, in both modes.
+
+    Number of kept pixels and strength are chosen on the first half of the frames and scored on the other.
+    """
+    layout = demonstration_layout()
+    comparisons = [Comparison("best k", [], []), Comparison(f"fixed k = {FIXED_KEPT}", [], [])]
+    for i, flux in enumerate(FLUXES_E):
+        frames, truth = simulate(layout, flux, n_frames, rng)
+        best = float(suggested_strength(READ_NOISE_E, flux, layout.pixels, excess_noise=EXCESS_NOISE))
+        for comparison, kept in zip(comparisons, (BEST_KEPT, (FIXED_KEPT,)), strict=True):
+            without = [Settings(denoise=False, keep_brightest=k) for k in kept]
+            with_tv = [
+                Settings(noise_std=best * factor, keep_brightest=k)
+                for factor in STRENGTH_FACTORS
+                for k in kept
+            ]
+            comparison.plain.append(choose(layout, without, frames, truth))
+            comparison.denoised.append(choose(layout, with_tv, frames, truth))
+        if progress is not None:
+            progress(i + 1, len(FLUXES_E))
+    return comparisons
+
+
+def choose(
+    layout: Layout, candidates: list[Settings], frames: NDArray[Any], truth: NDArray[np.float64]
+) -> Arm:
+    """Choose the settings with the smallest R on the first half of the frames; score them on the other."""
+    half = len(frames) // 2
+
+    def errors(settings: Settings, part: slice) -> NDArray[np.float64]:
+        slopes = SlopePipeline(layout, settings, CALIBRATION)(frames[part])
+        return absolute_errors(slopes.x, slopes.y, truth[part]).ravel()
+
+    best = min(candidates, key=lambda settings: float(errors(settings, slice(half)).mean()))
+    return Arm(best, errors(best, slice(half, None)))
