@@ -89,11 +89,12 @@ def numbers_between(
     if np.any(wrong):
         raise InputError(f"{name} = {array[wrong].flat[0]:g}: expected {_range_text(low, high, low_open)}")
     if integer:
-        rounded = np.rint(array)
+        rounded: NDArray[Any] = np.rint(array)
         if np.any(rounded != array):
             raise InputError(f"{name} = {array[rounded != array].flat[0]:g}: expected a whole number")
         return rounded.astype(np.int64)
-    return array.astype(np.float64)
+    numbers: NDArray[Any] = array.astype(np.float64)
+    return numbers
 
 
 def number_between(

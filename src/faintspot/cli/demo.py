@@ -12,6 +12,7 @@ from rich.table import Table
 
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
+from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 from faintspot.sensor import configuration
 from faintspot.study import demonstration
@@ -104,7 +105,7 @@ def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.ran
             measure_recorded(
                 [folder / "frames.npy"], config, folder / f"{stem}.npz", overwrite=True, progress=advance
             )
-        pipeline = demonstration.SlopePipeline.from_file(config)
+        pipeline = SlopePipeline.from_file(config)
         slopes = pipeline(frames)
         arms.append(Arm(name, slopes.x, slopes.y, slopes.flux, slopes.flags, slopes.iterations))
         stages[name] = pipeline.explain(frames[0])

@@ -59,8 +59,8 @@ def gather_calibrated(
                 dark, scale = get(calibration, start + x), get(calibration, frame_pixels + start + x)
                 value = (raw - dark) * scale
                 good = abs(value) <= limit
-                bad += not good
-                saturated += raw >= level
+                bad += 0 if good else 1
+                saturated += 1 if raw >= level else 0
                 put(tile, lane * nx + x, value if good else nan)
             counts[lane] += bad
             counts[width + lane] += saturated

@@ -25,15 +25,15 @@ except ImportError:
 COLOUR_MAP = "cividis"
 # Okabe & Ito (2008): told apart with any colour vision.
 ARM_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7")
-ARM_MARKERS = ("+", "x", "1", "2")
 TRUTH_COLOUR = "#56B4E9"
 GREY = "#9a9a9a"
 LIGHT_GREY = "#e4e4e4"
 DOTS_PER_INCH = 144
+_MOST_WITH_GAPS = 600  # narrower than a pixel of the picture, gaps would only make a moiré
 WIDTH = 13.0
 """Inches of a picture as wide as the page."""
 
-_STYLE = {
+_STYLE: dict[str, Any] = {
     "font.size": 12,
     "axes.titlesize": 13,
     "axes.labelsize": 12,
@@ -55,7 +55,7 @@ def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]
     def with_style(*arguments: _Arguments.args, **options: _Arguments.kwargs) -> _Result:
         with matplotlib.rc_context():
             matplotlib.rcdefaults()
-            matplotlib.rcParams.update(_STYLE)
+            matplotlib.rcParams.update(_STYLE)  # type: ignore[arg-type]
             return draw(*arguments, **options)
 
     return with_style
@@ -69,7 +69,7 @@ def new_figure(width: float, height: float) -> Figure:
 def png(figure: Figure) -> bytes:
     """Return a figure as a PNG picture."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=DOTS_PER_INCH)
+    figure.savefig(stream, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", pad_inches=0.15)
     return stream.getvalue()
 
 
@@ -86,8 +86,10 @@ def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
     else:
         angles, radius = 45.0 + 90.0 * np.arange(4), pitch / np.sqrt(2)
     direction = np.deg2rad(angles + layout.angle_deg)
-    ring = 0.96 * radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    return layout.centres[:, None, :] + ring
+    gap = 0.96 if len(layout) <= _MOST_WITH_GAPS else 1.0
+    ring = gap * radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    shapes: NDArray[np.float64] = layout.centres[:, None, :] + ring
+    return shapes
 
 
 def subaperture_map(
@@ -104,6 +106,7 @@ def subaperture_map(
     known = np.isfinite(values)
     empty = PolyCollection(list(shapes[~known]), facecolors="white", edgecolors=GREY, linewidths=0.6)
     filled = PolyCollection(list(shapes[known]), array=values[known], cmap=COLOUR_MAP, linewidths=0)
+    filled.set_antialiased(len(layout) <= _MOST_WITH_GAPS)
     filled.set_clim(*limits)
     axes.add_collection(empty)
     axes.add_collection(filled)
@@ -112,19 +115,19 @@ def subaperture_map(
     colour_bar(axes, filled, label)
 
 
-def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str) -> None:
+def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:
     """Put a colour bar beside one or several axes."""
     first = axes[0] if isinstance(axes, list) else axes
     figure = first.get_figure()
     assert figure is not None
-    bar = figure.colorbar(mappable, ax=axes, label=label, shrink=0.85, pad=0.02)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar = figure.colorbar(mappable, ax=axes, label=label, location=location, shrink=0.85, pad=0.02, aspect=25)
+    bar.outline.set_visible(False)
 
 
 def place_axes(axes: Axes, layout: Layout) -> None:
     """Set the limits of axes in frame pixels so that all sub-apertures are within."""
     shapes = subaperture_shapes(layout).reshape(-1, 2)
-    margin = 0.15 * _pitch(layout)
+    margin = 0.25 * _pitch(layout)
     low, high = shapes.min(axis=0) - margin, shapes.max(axis=0) + margin
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])

@@ -60,10 +60,10 @@ def slope_arrows(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layo
             color=colour,
             angles="xy",
             scale_units="xy",
-            scale=longest / (0.9 * pitch),
+            scale=longest / (0.6 * pitch),
             width=0.004,
         )
-        panel.quiverkey(arrows, 0.86, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes")
+        panel.quiverkey(arrows, 0.8, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes")
         panel.plot(*layout.centres[~known].T, "x", color=GREY, markersize=5)
         panel.set_title(f"{arm.name}: mean slope", loc="left")
     return figure
@@ -73,7 +73,7 @@ def slope_arrows(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layo
 def iteration_counts(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layout) -> Figure:
     """Draw the mean iterations of every sub-aperture (first arm) and how often each number occurred."""
     figure, axes = _panels(1, 2, layout)
-    limits = limits_of(summaries[0].iterations)
+    limits = limits_of(summaries[0].iterations, low=0.0)
     title = f"{arms[0].name}: mean iterations"
     subaperture_map(
         axes[0, 0], layout, summaries[0].iterations, label="iterations", limits=limits, title=title
@@ -86,6 +86,9 @@ def iteration_counts(arms: Sequence[Arm], summaries: Sequence[Summary], layout: 
         counts = np.histogram(arm.iterations[arm.valid], edges)[0]
         panel.stairs(100.0 * counts / max(1, counts.sum()), edges, fill=True, color=colour, label=arm.name)
     panel.set_xlabel("iterations")
+    panel.set_yscale("log")
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.set_ylim(top=200)
     panel.set_ylabel("valid measurements (%)")
     panel.set_title("How many iterations it took")
     if len(arms) > 1:
@@ -161,7 +164,7 @@ def _outlines(layout: Layout) -> Any:
 
 
 def _arrow_limit(summaries: Sequence[Summary]) -> float:
-    """Return the length, px, that is drawn 0.9 of a pitch long: nearly the longest of all arms."""
+    """Return the length, px, that is drawn 0.6 of a pitch long: nearly the longest of all arms."""
     lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
     lengths = lengths[np.isfinite(lengths)]
     longest = float(np.percentile(lengths, 98)) if lengths.size else 0.0

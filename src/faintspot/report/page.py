@@ -123,8 +123,7 @@ def _checked_stages(stages: Mapping[str, Stages], n: int) -> dict[str, Stages]:
         if item.raw.ndim != 3 or len(item.raw) != n:
             raise InputError(
                 f"stages: {name}: expected images (n_subapertures, ny, nx) of one frame with {n} "
-                "sub-apertures, "
-                f"got shape {item.raw.shape}"
+                f"sub-apertures, got shape {item.raw.shape}"
             )
     return dict(stages)
 
@@ -135,8 +134,8 @@ def _sensor_in_words(n: int, layout: Layout | None) -> str:
     pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
     height, width = layout.frame_shape
     return (
-        f"{n} of {layout.window[0]} × {layout.window[1]} px, {layout.geometry}{pitch}, "
-        f"in frames of {height} × {width} px"
+        f"{n} of {layout.window[0]} × {layout.window[1]} px, {layout.geometry}{pitch}, in frames of "
+        f"{height} × {width} px"
     )
 
 

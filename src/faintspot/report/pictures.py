@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib.patheffects
 import numpy as np
+from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import FuncNorm
@@ -19,8 +19,6 @@ from faintspot.errors import InputError
 from faintspot.io.slopes_format import output_errors
 from faintspot.pipeline import Stages
 from faintspot.report.drawing import (
-    ARM_COLOURS,
-    ARM_MARKERS,
     LIGHT_GREY,
     TRUTH_COLOUR,
     WIDTH,
@@ -43,7 +41,7 @@ STEPS = {
 MOST_MARKED = 150
 """With more sub-apertures than this the whole sensor's picture has no marks: they would hide the spots."""
 _MOST_NUMBERED = 1500
-_OUTLINE = [matplotlib.patheffects.withStroke(linewidth=3.0, foreground="black")]
+_MARKS = (("+", "white"), ("x", "#D55E00"), ("1", "#E69F00"), ("2", "#CC79A7"))  # with a black outline
 
 
 @dataclass(frozen=True)
@@ -87,24 +85,27 @@ class Example:
 
 @styled
 def whole_sensor(example: Example) -> Figure:
-    """Draw all windows at their places after every step, with the positions of the spots."""
+    """Draw all windows at their places after every step; on the last, the positions of the spots."""
     layout = example.layout
     sheets = {step: assembled(layout, getattr(example.first, step)) for step in STEPS}
     n_rows, n_columns = sheets["raw"].shape
-    height = min(max(WIDTH / 4 * n_rows / n_columns, 1.5), 9.0) + 1.6
-    figure = new_figure(WIDTH + 2.0, height)
-    axes = list(figure.subplots(1, 4, sharex=True, sharey=True))
-    start = layout.corners.min(axis=0)
-    extent = (start[1] - 0.5, start[1] + n_columns - 0.5, start[0] - 0.5, start[0] + n_rows - 0.5)
-    _draw_steps(axes, sheets, example.raw_is_calibrated, extent, location="bottom")
-    axes[0].set_ylabel("row (px)")
-    middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
-    for panel in axes:
+    height = min(max(0.42 * WIDTH * n_rows / n_columns, 1.2), 9.0) + 0.7
+    figure = new_figure(WIDTH, 2 * height)
+    grid = figure.subplots(2, 2, sharex=True, sharey=True)
+    start = layout.corners.min(axis=0) - 0.5
+    extent = (start[1], start[1] + n_columns, start[0], start[0] + n_rows)
+    shown = _draw_steps(list(grid.flat), sheets, example.raw_is_calibrated, extent)
+    if not example.raw_is_calibrated:
+        colour_bar(list(grid[:, 0]), shown["raw"], "raw: ADU", location="left")
+    colour_bar(list(grid[:, 1]), shown["denoised"], "e- per pixel")
+    for panel in grid[:, 0]:
+        panel.set_ylabel("row (px)")
+    for panel in grid[1]:
         panel.set_xlabel("column (px)")
-        if panel is not axes[0] and len(layout) <= MOST_MARKED:
-            _mark(panel, {name: xy + middles for name, xy in example.positions().items()}, size=4.5)
     if len(layout) <= MOST_MARKED:
-        _legend(figure, axes[1])
+        middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
+        _mark(grid[1, 1], {name: xy + middles for name, xy in example.positions().items()}, size=6)
+        _legend(figure, grid[1, 1])
     return figure
 
 
@@ -113,24 +114,29 @@ def zoom(example: Example) -> Figure:
     """Draw the faintest, a median and the brightest valid sub-aperture after every step."""
     chosen = example_subapertures(example.first)
     height, width = example.layout.window
-    figure = new_figure(WIDTH, len(chosen) * (WIDTH / 4.6 * min(height / width, 2.0) + 0.35) + 0.6)
+    figure = new_figure(WIDTH, len(chosen) * (WIDTH / 5.3 * min(height / width, 2.0) + 0.25) + 0.9)
     grid = figure.subplots(len(chosen), 4, squeeze=False, sharex=True, sharey=True)
     extent = (-width / 2, width / 2, -height / 2, height / 2)
     positions = example.positions()
-    for axes, (what, index) in zip(grid, chosen.items(), strict=True):
+    for row, (what, index) in enumerate(chosen.items()):
+        axes = list(grid[row])
         images = {step: getattr(example.first, step)[index] for step in STEPS}
-        _draw_steps(list(axes), images, example.raw_is_calibrated, extent)
-        flux = example.first.slopes.flux[index]
-        axes[0].set_ylabel(f"{what}\nno. {index}, {flux:.3g} e-\ny (px)")
+        shown = _draw_steps(axes, images, example.raw_is_calibrated, extent, titles=row == 0)
+        if not example.raw_is_calibrated:
+            colour_bar(axes[0], shown["raw"], "ADU")
+        colour_bar(axes if example.raw_is_calibrated else axes[1:], shown["denoised"], "e- per pixel")
+        axes[0].set_ylabel(f"{what}\nno. {index}, {_flux(example.first, index)} e-\ny (px)")
         for panel in axes[1:]:
             _mark(panel, {name: xy[index : index + 1] for name, xy in positions.items()}, size=13)
-        if axes is not grid[0]:
-            for panel in axes:
-                panel.set_title("")
     for panel in grid[-1]:
         panel.set_xlabel("x (px)")
     _legend(figure, grid[0, 1])
     return figure
+
+
+def _flux(stages: Stages, index: int) -> str:
+    flux = float(stages.slopes.flux[index])
+    return f"{flux:.0f}" if abs(flux) >= 100 else f"{flux:.3g}"
 
 
 def example_subapertures(stages: Stages) -> dict[str, int]:
@@ -207,7 +213,7 @@ def write_file(path: str | Path, content: bytes) -> None:
 def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
     n_rows, n_columns = array.shape
     side = 12.0
-    figure = new_figure(side, min(max(side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
+    figure = new_figure(side, min(max(0.9 * side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
     axes = figure.subplots()
     image = axes.imshow(array, cmap="gray", norm=_stretch(array, inside), interpolation="nearest")
     colour_bar(axes, image, "frame's units")
@@ -218,8 +224,8 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
     if font >= 4 and len(layout) <= _MOST_NUMBERED:
         for number, (row, column) in enumerate(layout.corners):
             axes.text(
-                column,
-                row + layout.window[0] - 1,
+                column - 0.5 + 0.06 * layout.window[1],
+                row - 0.5 + 0.95 * layout.window[0],
                 str(number),
                 color="#E69F00",
                 fontsize=font,
@@ -260,51 +266,36 @@ def _window_outlines(layout: Layout) -> list[Any]:
 
 
 def _draw_steps(
-    axes: list[Axes], images: Mapping[str, Floats], one_unit: bool, extent: Any, location: str = "right"
-) -> None:
-    """Draw the four steps side by side on one colour scale; raw on its own one when it is in ADU."""
+    axes: list[Axes], images: Mapping[str, Floats], one_unit: bool, extent: Any, titles: bool = True
+) -> dict[str, Any]:
+    """Draw the four steps on one colour scale, raw on its own one when it is in ADU; return the images."""
     electrons = limits_of(images["calibrated"], percent=99.8)
     adu = electrons if one_unit else limits_of(images["raw"], percent=99.8)
+    shown = {}
     for panel, (step, image) in zip(axes, images.items(), strict=True):
         low, high = adu if step == "raw" else electrons
-        shown = panel.imshow(image, vmin=low, vmax=high, extent=extent, interpolation="nearest")
+        shown[step] = panel.imshow(image, vmin=low, vmax=high, extent=extent, interpolation="nearest")
         panel.set_facecolor(LIGHT_GREY)
-        panel.set_title(STEPS[step] + (" (ADU)" if step == "raw" and not one_unit else ""))
-        if step == "raw" and not one_unit:
-            _bar(panel, shown, "ADU", location)
-    _bar(axes if one_unit else axes[1:], shown, "e- per pixel", location)
-
-
-def _bar(axes: Axes | list[Axes], shown: Any, label: str, location: str) -> None:
-    if location == "right":
-        colour_bar(axes, shown, label)
-        return
-    first = axes[0] if isinstance(axes, list) else axes
-    figure = first.get_figure()
-    assert figure is not None
-    shrink = 0.8 if not isinstance(axes, list) else 0.5
-    bar = figure.colorbar(shown, ax=axes, label=label, location="bottom", shrink=shrink, aspect=30)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+        if titles:
+            panel.set_title(STEPS[step] + (" (ADU)" if step == "raw" and not one_unit else ""))
+    return shown
 
 
 def _mark(axes: Axes, positions: Mapping[str, Floats], size: float) -> None:
-    """Mark positions: the truth by a circle, each arm by a cross of its own."""
-    number = 0
+    """Mark positions: each arm by a cross of its own, the first one's on top, and the truth by a circle."""
+    width = 0.5 + 0.08 * size
+    outline: list[patheffects.AbstractPathEffect] = [
+        patheffects.withStroke(linewidth=2.6 * width, foreground="black")
+    ]
+    crosses = dict(zip((name for name in positions if name != "truth"), _MARKS, strict=False))
     for name, xy in positions.items():
         if name == "truth":
-            axes.plot(*xy.T, "o", mfc="none", mec=TRUTH_COLOUR, ms=1.3 * size, mew=1.6, ls="", label=name)
-            continue
-        axes.plot(
-            *xy.T,
-            ARM_MARKERS[number % len(ARM_MARKERS)],
-            color="white" if number else ARM_COLOURS[0],
-            ms=size,
-            mew=1.3,
-            ls="",
-            label=name,
-            path_effects=_OUTLINE,
-        )
-        number += 1
+            axes.plot(*xy.T, "o", ms=1.5 * size, mfc="none", mec=TRUTH_COLOUR, mew=width, ls="", label=name)
+        elif name in crosses:
+            marker, colour = crosses[name]
+            order = 3.0 - 0.1 * list(crosses).index(name)
+            axes.plot(*xy.T, marker, ms=size, mew=width, color=colour, ls="", label=name, zorder=order)
+            axes.lines[-1].set_path_effects(outline)
 
 
 def _legend(figure: Figure, axes: Axes) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.flags import SubapertureFlag
 from faintspot.report import drawing, maps, pictures
 from faintspot.report.statistics import (
     Arm,
@@ -134,10 +134,8 @@ def _key_numbers(run: Run) -> Section:
     span = f" ({frames.min()} to {frames.max()} frames each)" if frames.size else ""
     text = (
         f"One measurement is one sub-aperture in one frame: {n_frames} × {n} = {n_frames * n}. Flux, "
-        "iterations "
-        "and the fraction at the limit are of the valid ones. Jitter is the standard deviation over the "
-        "frames "
-        "of the position in a sub-aperture"
+        "iterations and the fraction at the limit are of the valid ones. Jitter is the standard deviation "
+        "over the frames of the position in a sub-aperture"
         + (", over the frames that are valid in every arm" if len(run.arms) > 1 else "")
         + f", from {len(frames)} of {n} sub-apertures{span}; it includes real motion of the spot."
     )
@@ -156,7 +154,7 @@ def _arm_numbers(arm: Arm, summary: Summary, scatter: Jitter) -> dict[str, str]:
         "slope jitter, median": _number(median(scatter.px), "px", 3),
         "slope jitter, median, x | y": f"{_number(median(scatter.x_px), '', 3)} | "
         + _number(median(scatter.y_px), "px", 3),
-        "slope jitter, median, robust to outliers": _number(median(scatter.robust_px), "px", 3),
+        "slope jitter, median, from absolute deviations": _number(median(scatter.robust_px), "px", 3),
     }
 
 
@@ -182,22 +180,17 @@ def _truth_numbers(run: Run, truth: Floats) -> tuple[list[dict[str, str]], str]:
             column |= _against(arm, last, truth, run.valid)
         columns.append(column)
     note = (
-        f"The true positions are known; they lie between {truth.min():.2f} and {truth.max():.2f} px. R "
-        "is the "
-        f"mean of (|dx| + |dy|) / 2 over the {np.count_nonzero(run.valid)} measurements that are valid "
-        "in every "
-        "arm, ± its standard error. The centroid gain is the slope of the measured on the true position: "
-        "below 1 "
-        "an estimator shrinks all motion."
+        f"The true positions are known; they lie between {truth.min():.2f} and {truth.max():.2f} px. R is "
+        f"the mean of (|dx| + |dy|) / 2 over the {np.count_nonzero(run.valid)} measurements that are valid "
+        "in every arm, ± its standard error. The centroid gain is the slope of the measured on the true "
+        "position: below 1 an estimator shrinks all motion."
     )
     if len(run.arms) > 1:
         note += (
             f" The flux gain says how many times less light gives the same R as {last.name!r}; it is a "
-            "range, as "
-            "R falls with flux^-1 where read noise rules (lower end when the arm is better) and with "
-            "flux^-1/2 "
-            "where photon noise does. It is worked out from R at this one flux, not measured by dimming "
-            "the light."
+            "range, as R falls as 1 / flux where read noise rules (lower end when the arm is better) and as "
+            "1 / √flux where photon noise does. It is worked out from R at this one flux, not measured by "
+            "dimming the light."
         )
     return columns, note
 
@@ -225,20 +218,17 @@ def _frame(run: Run) -> Section:
         else "Raw is in ADU and has a scale of its own; the other three share one scale in electrons."
     )
     shown = next(iter(run.stages))
-    marks = f"Images are those of {shown!r}. " + (
-        "Crosses are measured positions" + (", circles true ones" if truth is not None else "") + ". "
-    )
+    circles = " and circles true ones" if truth is not None else ""
+    marks = f"Images are those of {shown!r}. On the last one, crosses are measured positions{circles}. "
     if len(run.layout) > pictures.MOST_MARKED:
         marks = f"Images are those of {shown!r}; positions are not marked in so many sub-apertures. "
     whole = (
         f"Frame {run.example_frame} with all windows at their places. {scale} {marks}Look for spots that "
-        "leave "
-        "their window, for windows without a spot, and for anything left over after the background."
+        "leave their window, for windows without a spot, and for anything left over after the background."
     )
     zoomed = (
-        "The faintest, a median and the brightest valid sub-aperture of this frame, each row on a scale "
-        "of its own. "
-        "Look whether the noise goes and the spot stays, and whether the crosses sit on it."
+        "The faintest, a median and the brightest valid sub-aperture of this frame, each row on a scale of "
+        "its own. Look whether the noise goes and the spot stays, and whether the crosses sit on it."
     )
     return Section(
         "frame",
@@ -256,21 +246,19 @@ def _flux(run: Run) -> Section:
     for flag, meaning in FLAG_MEANINGS.items():
         counts = [arm.flag_count(flag) for arm in run.arms]
         cells = [f"{n} ({percentage(n / arm.flags.size)})" for n, arm in zip(counts, run.arms, strict=True)]
-        rows.append([str(flag.name), *cells, ("Invalid. " if flag & INVALID else "") + meaning])
+        rows.append([str(flag.name), *cells, meaning])
     table = Table(
         header,
         rows,
-        "Measurements with each flag (one may have several). All others only inform.",
+        "Measurements with each flag; one may have several. Only those that say so are invalid.",
         words=True,
     )
     if run.layout is None:
         return Section("flux", "Flux and validity", tables=[table], missing=NO_LAYOUT)
     caption = (
-        "Left: median flux left after the background subtraction. Right: in how many frames the slope "
-        "was valid. "
-        "An empty outline was never valid. Look for a smooth pupil: single dim sub-apertures are "
-        "vignetted or off "
-        "their spot, and a bright edge on one side means that the windows are shifted."
+        "Left: median flux left after the background subtraction. Right: in how many frames the slope was "
+        "valid. An empty outline was never valid. Look for a smooth pupil: single dim sub-apertures are "
+        "vignetted or off their spot, and a bright edge on one side means that the windows are shifted."
     )
     figure = maps.flux_and_validity(run.arms, run.summaries, run.layout)
     picture = _picture(figure, "Maps of flux and validity", caption)
@@ -284,12 +272,16 @@ def _slopes(run: Run) -> Section:
         f"{arm.name}: x {_number(_mean(summary.x_px), '', 3)}, y {_number(_mean(summary.y_px), 'px', 3)}"
         for arm, summary in zip(run.arms, run.summaries, strict=True)
     )
+    errors = "; ".join(
+        f"{arm.name}: {_number(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
+        for arm, item in zip(run.arms, run.jitters, strict=True)
+    )
     caption = (
-        "Mean slope of each sub-aperture over its valid frames, all panels at one scale (key above "
-        "each). Sub-"
-        "apertures without an arrow but a grey cross were never valid. All arrows alike are tilt or a "
-        "shifted layout, "
-        f"arrows to or from the middle are focus. Mean over the sensor: {tilts}."
+        "Mean slope of each sub-aperture over its valid frames, all panels at one scale (key above each). "
+        "Sub-apertures without an arrow but a grey cross were never valid. All arrows alike are tilt or a "
+        f"shifted layout, arrows to or from the middle are focus. Mean over the sensor: {tilts}. Arrows not "
+        f"longer than the standard error of a mean slope per axis (median {errors}, if frames are "
+        "independent) are noise."
     )
     figure = maps.slope_arrows(run.arms, run.summaries, run.layout)
     return Section("slopes", "Mean slopes", pictures=[_picture(figure, "Mean slopes as arrows", caption)])
@@ -305,10 +297,11 @@ def _iterations(run: Run) -> Section:
         )
     if run.layout is None:
         return Section("iterations", "Iterations", missing=NO_LAYOUT)
+    if not any(arm.valid.any() for arm, _ in denoised):
+        return Section("iterations", "Iterations", missing="Not drawn: no measurement is valid.")
     caption = (
         "Left: mean iterations of the denoiser. Right: how often each number occurred, over valid "
-        "measurements. "
-        "A pile at the right end is the iteration limit; faint sub-apertures take longest."
+        "measurements. A pile at the right end is the iteration limit; faint sub-apertures take longest."
     )
     arms, summaries = zip(*denoised, strict=True)
     figure = maps.iteration_counts(arms, summaries, run.layout)
@@ -327,26 +320,22 @@ def _jitter(run: Run) -> Section:
             "jitter", title, missing=f"{why} Jitter needs at least two valid frames of a sub-aperture."
         )
     text = [
-        "Jitter includes the real motion of the spots (atmosphere, vibration, guiding), so it is an "
-        "upper bound of "
-        "the noise. Less jitter is not better by itself: an estimator whose centroid gain is below 1 "
-        "shrinks noise "
-        "and motion alike."
+        "Jitter includes the real motion of the spots (atmosphere, vibration, guiding), so it is an upper "
+        "bound of the noise. Less jitter is not better by itself: an estimator whose centroid gain is below "
+        "1 shrinks noise and motion alike."
     ]
     if run.truth is not None:
         moved = jitter(run.truth[..., 0], run.truth[..., 1], run.valid)
         text.append(f"The true motion in these frames is {rms(moved.px):.3f} px rms.")
     caption = (
-        "Dots: standard deviation over the frames. Line: the same from the median absolute deviation, "
-        "which rare "
-        "outliers do not touch: dots far above their line are outliers, not noise. Dotted: medians."
+        "Dots: standard deviation over the frames. Line: the same from the median absolute deviation, which "
+        "rare outliers do not touch: dots far above their line are outliers, not noise. Dotted: medians."
     )
     shown = [_picture(maps.jitter_plot(run.arms, run.jitters), "Jitter of the sub-apertures", caption)]
     if run.layout is not None:
         where = (
             "Where the jitter is: rms of x and y over the frames, all maps on one scale. Look for the "
-            "pupil's edge and "
-            "for single sub-apertures that stand out (bad pixels, a neighbour's light)."
+            "pupil's edge and for single sub-apertures that stand out (bad pixels, a neighbour's light)."
         )
         shown.insert(
             0, _picture(maps.jitter_maps(run.arms, run.jitters, run.layout), "Maps of the jitter", where)

@@ -77,7 +77,7 @@ class Arm:
     @property
     def n_subapertures(self) -> int:
         """Number of sub-apertures."""
-        return self.x.shape[1]
+        return int(self.x.shape[1])
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -97,7 +97,8 @@ class Arm:
 @dataclass(frozen=True)
 class Summary:
     """One arm in numbers: of the whole run, and per sub-aperture, (n_subapertures,), over its valid "
-    "frames."""
+    "frames.
+    """
 
     valid_fraction: float
     median_flux_e: float
@@ -118,7 +119,8 @@ class Summary:
 @dataclass(frozen=True)
 class Jitter:
     """Scatter of each sub-aperture's position over the frames, px, (n_subapertures,); NaN below two "
-    "frames."""
+    "frames.
+    """
 
     n_frames: NDArray[np.int64]
     x_px: Floats
@@ -130,12 +132,13 @@ class Jitter:
     @property
     def px(self) -> Floats:
         """Rms of x and y."""
-        return np.sqrt((self.x_px**2 + self.y_px**2) / 2)
+        combined: Floats = np.sqrt((self.x_px**2 + self.y_px**2) / 2)
+        return combined
 
     @property
     def measured(self) -> NDArray[np.bool_]:
         """Where there were at least two frames."""
-        return self.n_frames >= 2  # type: ignore[no-any-return]
+        return self.n_frames >= 2
 
 
 @dataclass(frozen=True)
@@ -180,7 +183,8 @@ def summarise(arm: Arm) -> Summary:
 
 def valid_in_all(arms: Sequence[Arm]) -> NDArray[np.bool_]:
     """Return which measurements are valid in every arm, (n_frames, n_subapertures)."""
-    return np.logical_and.reduce([arm.valid for arm in arms])
+    valid: NDArray[np.bool_] = np.logical_and.reduce([arm.valid for arm in arms])
+    return valid
 
 
 def jitter(x: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> Jitter:
@@ -248,7 +252,7 @@ def absolute_errors(arm: Arm, truth: Floats) -> Floats:
 def standard_error(values: Floats, valid: NDArray[np.bool_]) -> float:
     """Return the standard error of the mean of the valid values; NaN from a single one.
 
-    Measurements of one frame, and of one sub-aperture, may have errors in common (a static bias): the error is
+    Measurements of one frame, and of one sub-aperture, may have errors in common (a static bias): it is
     computed with either as the independent unit, and the larger one returned.
     """
     n = np.count_nonzero(valid)
@@ -271,38 +275,38 @@ def column_blocks(n_frames: int, n_subapertures: int) -> Iterator[slice]:
 
 def mean_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
     """Return the mean of each column's valid values."""
-    sums = np.sum(values, axis=0, where=valid, dtype=np.float64)
+    sums: Floats = np.sum(values, axis=0, where=valid, dtype=np.float64)
     return _divide(sums, valid.sum(axis=0))
 
 
 def std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
     """Return the standard deviation (n - 1) of each column's valid values; NaN below two of them."""
     mean = mean_over_valid(values, valid)
-    squares = np.sum(np.square(values - np.nan_to_num(mean)), axis=0, where=valid)
+    squares: Floats = np.sum(np.square(values - np.nan_to_num(mean)), axis=0, where=valid)
     return np.sqrt(_divide(squares, valid.sum(axis=0) - 1))
 
 
 def median_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
     """Return the median of each column's valid values."""
-    ordered = np.sort(np.where(valid, values, np.inf), axis=0)
+    ordered: Floats = np.sort(np.where(valid, values, np.inf), axis=0)
     count = valid.sum(axis=0)
     columns = np.arange(ordered.shape[1])
     upper = ordered[np.minimum(count // 2, len(ordered) - 1), columns]
     lower = ordered[np.maximum(count - 1, 0) // 2, columns]
-    middle = np.full(len(count), np.nan)
-    np.add(lower, upper, out=middle, where=count > 0)
-    return middle / 2
+    return _divide(np.where(count > 0, lower + upper, 0.0), 2 * (count > 0))
 
 
 def robust_std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
     """Return 1.4826 times the median absolute deviation of each column's valid values; NaN below two."""
     middle = np.nan_to_num(median_over_valid(values, valid))
     spread = GAUSSIAN_MAD * median_over_valid(np.abs(values - middle), valid)
-    return np.where(valid.sum(axis=0) >= 2, spread, np.nan)
+    measured: Floats = np.where(valid.sum(axis=0) >= 2, spread, np.nan)
+    return measured
 
 
 def _divide(sums: Floats, counts: NDArray[np.int64]) -> Floats:
-    return np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    quotient: Floats = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    return quotient
 
 
 def _gain(arm: Arm, truth: Floats, valid: NDArray[np.bool_]) -> float:

@@ -115,8 +115,8 @@ def _open(path: Path) -> _Store:
     n = stored.variables["x"].shape[1]
     if store.layout is not None and len(store.layout) != n:
         store.notes.append(
-            f"The layout stored in {path.name} has {len(store.layout)} sub-apertures, the slopes have "
-            f"{n}: not used."
+            f"The layout stored in {path.name} has {len(store.layout)} sub-apertures, the slopes have {n}: "
+            "not used."
         )
         store.layout = None
     return store
@@ -249,11 +249,13 @@ def _frame(store: _Store, number: int, frames: Sequence[str | Path] | None) -> N
     if not places:
         raise InputError(f"{store.path.name} does not say where its frames came from")
     with open_frames(places) as source:
-        return source.block(number, number + 1)[0]
+        frame: NDArray[Any] = source.block(number, number + 1)[0]
+    return frame
 
 
 def _without_denoising(store: _Store, frame: NDArray[Any]) -> Stages:
-    assert store.layout is not None and store.settings is not None
+    assert store.layout is not None
+    assert store.settings is not None
     settings = store.settings.replace(denoise=False)
     return SlopePipeline(store.layout, settings, store.calibration).explain(frame)
 
@@ -268,8 +270,8 @@ def _disagreement(store: _Store, arm: Arm, stages: Stages, number: int) -> list[
     return [
         f"Measured again for the pictures, frame {number} gives positions that differ from those stored in "
         f"{store.path.name} by up to {distance.max():.2f} px: the run used reference positions or a "
-        "calibration "
-        "that is not known here, or the frames are not the same. The crosses show the new measurement."
+        "calibration that is not known here, or the frames are not the same. The crosses show the new "
+        "measurement."
     ]
 
 

@@ -12,11 +12,11 @@ from faintspot.sensor.layout import Layout
 from faintspot.sensor.settings import Settings
 
 FLAG_MEANINGS = {
-    SubapertureFlag.NO_LIGHT: "Nothing usable was left after the background subtraction. Slope invalid (0).",
-    SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow. Slope invalid (0).",
+    SubapertureFlag.NO_LIGHT: "Nothing usable was left after the background subtraction: invalid, slope 0.",
+    SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
     SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
-    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std is at or above the image's own rms: denoised to a constant.",
+    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std is not below the image's rms: denoised to a constant.",
     SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
 }
 _MOST_LISTED = 20
@@ -63,8 +63,7 @@ def settings_in_words(settings: Settings, layout: Layout) -> str:
     where = "" if denoised == len(layout) else f" in {denoised} of {len(layout)} sub-apertures"
     return (
         f"total-variation denoising{where} of strength {span('noise_std')} e- ({settings.algorithm}, "
-        "tolerance "
-        f"{span('tolerance')}, at most {span('max_iterations')} iterations); {kept}"
+        f"tolerance {span('tolerance')}, at most {span('max_iterations')} iterations); {kept}"
     )
 
 
@@ -94,20 +93,20 @@ def warnings_in_words(arms: Sequence[Arm], summaries: Sequence[Summary]) -> list
     if max(fractions) - min(fractions) > 0.01:
         lines.append(
             "The arms differ in how many measurements are valid. Jitter and slope error compare the "
-            "measurements "
-            "that are valid in every arm, which may be the easier ones."
+            "measurements that are valid in every arm, which may be the easier ones."
         )
     return lines
 
 
 def _of_arm(arm: Arm, summary: Summary) -> list[str]:
+    lines = _no_light(arm)
     if summary.valid_fraction == 0:
-        lines = ["No measurement is valid, so there are no slopes."]
-    else:
-        lines = []
-    lines += _no_light(arm)
+        lines.insert(0, "No measurement is valid, so there are no slopes.")
     for flag, (least, what, advice) in _ADVICE.items():
-        fraction = arm.flag_count(flag) / arm.x.size
+        count = arm.flag_count(flag)
+        if flag is SubapertureFlag.INFEASIBLE_STRENGTH:  # those without light are spoken of already
+            count -= arm.flag_count(flag | SubapertureFlag.NO_LIGHT)
+        fraction = count / arm.x.size
         if fraction > least:
             lines.append(f"{percentage(fraction)} of the measurements {what}. Next: {advice}.")
     never = np.flatnonzero(summary.valid_frames == 0)
