@@ -89,7 +89,7 @@ class SlopePipeline:
     Examples
     --------
     >>> import faintspot as fs
-    >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.7, inner_radius=1.2)
+    >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
     >>> pipeline = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12))
     >>> slopes = pipeline(frame)  # doctest: +SKIP
     """

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +18,7 @@ ALGORITHMS = {"fgp": FGP, "chambolle": CHAMBOLLE}
 SMALLEST_SIDE = 2
 
 
-@dataclass(frozen=True)
-class Denoised:
+class Denoised(NamedTuple):
     """Result of `tv_denoise` with `full_output`; every field but `images` has the leading shape."""
 
     images: NDArray[Any]
@@ -93,7 +91,7 @@ def tv_denoise(
     max_iterations : int
         At most so many iterations for each image.
     full_output : bool
-        Return a `Denoised` with iterations, multiplier, converged and infeasible, too.
+        Return a `Denoised`: the images and, for each, iterations, multiplier, converged and infeasible.
 
     Returns
     -------

@@ -66,6 +66,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
+@styled  # ticks are made only now
 def png(figure: Figure) -> bytes:
     """Return a figure as a PNG picture."""
     stream = io.BytesIO()

@@ -26,6 +26,7 @@ from faintspot.sensor.layout import Layout
 
 _PANEL_HEIGHT = 5.0
 _HISTOGRAM_BINS = 60
+_MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could not be seen
 
 
 @styled
@@ -49,6 +50,7 @@ def slope_arrows(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layo
     longest = _arrow_limit(summaries)
     key = _round_length(longest)
     pitch = layout.pitch_px or max(layout.window)
+    length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
     for panel, arm, summary, colour in zip(axes[0], arms, summaries, ARM_COLOURS, strict=False):
         panel.add_collection(_outlines(layout))
         place_axes(panel, layout)
@@ -60,8 +62,8 @@ def slope_arrows(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layo
             color=colour,
             angles="xy",
             scale_units="xy",
-            scale=longest / (0.6 * pitch),
-            width=0.004,
+            scale=longest / (length * pitch),
+            width=width,
         )
         panel.quiverkey(arrows, 0.8, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes")
         panel.plot(*layout.centres[~known].T, "x", color=GREY, markersize=5)
@@ -164,7 +166,7 @@ def _outlines(layout: Layout) -> Any:
 
 
 def _arrow_limit(summaries: Sequence[Summary]) -> float:
-    """Return the length, px, that is drawn 0.6 of a pitch long: nearly the longest of all arms."""
+    """Return the length, px, that sets the scale of the arrows: nearly the longest of all arms."""
     lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
     lengths = lengths[np.isfinite(lengths)]
     longest = float(np.percentile(lengths, 98)) if lengths.size else 0.0

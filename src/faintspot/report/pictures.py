@@ -231,6 +231,7 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
                 fontsize=font,
                 va="top",
                 clip_on=True,
+                path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
             )
     axes.set_xlabel("column (px)")
     axes.set_ylabel("row (px)")

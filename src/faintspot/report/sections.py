@@ -179,10 +179,11 @@ def _truth_numbers(run: Run, truth: Floats) -> tuple[list[dict[str, str]], str]:
         if len(run.arms) > 1:
             column |= _against(arm, last, truth, run.valid)
         columns.append(column)
+    shared = "valid" if len(run.arms) == 1 else "valid in every arm"
     note = (
         f"The true positions are known; they lie between {truth.min():.2f} and {truth.max():.2f} px. R is "
-        f"the mean of (|dx| + |dy|) / 2 over the {np.count_nonzero(run.valid)} measurements that are valid "
-        "in every arm, ± its standard error. The centroid gain is the slope of the measured on the true "
+        f"the mean of (|dx| + |dy|) / 2 over the {np.count_nonzero(run.valid)} measurements that are "
+        f"{shared}, ± its standard error. The centroid gain is the slope of the measured on the true "
         "position: below 1 an estimator shrinks all motion."
     )
     if len(run.arms) > 1:
@@ -272,16 +273,20 @@ def _slopes(run: Run) -> Section:
         f"{arm.name}: x {_number(_mean(summary.x_px), '', 3)}, y {_number(_mean(summary.y_px), 'px', 3)}"
         for arm, summary in zip(run.arms, run.summaries, strict=True)
     )
-    errors = "; ".join(
-        f"{arm.name}: {_number(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
-        for arm, item in zip(run.arms, run.jitters, strict=True)
-    )
+    noise = ""
+    if run.jitters[0].measured.any():
+        errors = "; ".join(
+            f"{arm.name}: {_number(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
+            for arm, item in zip(run.arms, run.jitters, strict=True)
+        )
+        noise = (
+            f" Arrows not longer than the standard error of a mean slope per axis (median {errors}, if "
+            "frames are independent) are noise."
+        )
     caption = (
         "Mean slope of each sub-aperture over its valid frames, all panels at one scale (key above each). "
         "Sub-apertures without an arrow but a grey cross were never valid. All arrows alike are tilt or a "
-        f"shifted layout, arrows to or from the middle are focus. Mean over the sensor: {tilts}. Arrows not "
-        f"longer than the standard error of a mean slope per axis (median {errors}, if frames are "
-        "independent) are noise."
+        f"shifted layout, arrows to or from the middle are focus. Mean over the sensor: {tilts}.{noise}"
     )
     figure = maps.slope_arrows(run.arms, run.summaries, run.layout)
     return Section("slopes", "Mean slopes", pictures=[_picture(figure, "Mean slopes as arrows", caption)])

@@ -288,7 +288,7 @@ def std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
 
 def median_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
     """Return the median of each column's valid values."""
-    ordered: Floats = np.sort(np.where(valid, values, np.inf), axis=0)
+    ordered: Floats = np.sort(np.where(valid, values.astype(np.float64), np.inf), axis=0)
     count = valid.sum(axis=0)
     columns = np.arange(ordered.shape[1])
     upper = ordered[np.minimum(count // 2, len(ordered) - 1), columns]

@@ -24,6 +24,7 @@ from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.settings import Settings
 
+_SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
 
@@ -128,9 +129,12 @@ def _rebuild(store: _Store) -> None:
         tables: dict[str, Any] = tomlkit.parse(store.text).unwrap()
     except TOMLKitError as error:
         raise InputError(f"not TOML: {str(error).splitlines()[0]}") from None
+    places = store.stored.coordinates
+    if _is_map(tables.get("layout", {}).get("centres")) and {"centre_x", "centre_y"} <= set(places):
+        tables["layout"]["centres"] = np.stack([places["centre_x"], places["centre_y"]], axis=1).tolist()
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "configuration"
-        copy.write_text(store.text, encoding="utf-8")
+        copy.write_text(tomlkit.dumps(tables), encoding="utf-8")
         try:
             store.layout = configuration.load(copy, "layout")
             store.settings = configuration.load(copy, "settings")
@@ -172,8 +176,14 @@ def _check_same_sensor(first: _Store, other: _Store) -> None:
     mine, theirs = (store.stored.variables["x"].shape[1] for store in (first, other))
     if mine != theirs:
         raise InputError(f"{other.path}: expected {mine} sub-apertures, as in {first.path}, got {theirs}")
-    both = first.layout is not None and other.layout is not None
-    if both and first.layout != other.layout:
+    if first.layout is None or other.layout is None:
+        return
+    same = all(
+        np.shape(a) == np.shape(b) and np.allclose(a, b, atol=_SAME_PLACE_PX)
+        for name in ("frame_shape", "window", "corners", "centres")
+        for a, b in [(getattr(first.layout, name), getattr(other.layout, name))]
+    )
+    if not same:
         raise InputError(f"{other.path}: expected the layout of {first.path}, got another")
 
 
@@ -236,7 +246,7 @@ def _example(
             stages[arm.name] = SlopePipeline(stores[0].layout, store.settings, store.calibration).explain(
                 frame
             )
-            notes += _disagreement(store, arm, stages[arm.name], number)
+            notes += _disagreement(store, arm, frame, number)
         if len(stores) == 1 and arms[0].is_denoised:
             stages["no TV"] = _without_denoising(stores[0], frame)
     except InputError as error:
@@ -248,7 +258,7 @@ def _frame(store: _Store, number: int, frames: Sequence[str | Path] | None) -> N
     places = list(frames) if frames is not None else store.sources
     if not places:
         raise InputError(f"{store.path.name} does not say where its frames came from")
-    with open_frames(places) as source:
+    with open_frames(places, key=store.stored.attributes.get("source_key") or None) as source:
         frame: NDArray[Any] = source.block(number, number + 1)[0]
     return frame
 
@@ -260,18 +270,21 @@ def _without_denoising(store: _Store, frame: NDArray[Any]) -> Stages:
     return SlopePipeline(store.layout, settings, store.calibration).explain(frame)
 
 
-def _disagreement(store: _Store, arm: Arm, stages: Stages, number: int) -> list[str]:
+def _disagreement(store: _Store, arm: Arm, frame: NDArray[Any], number: int) -> list[str]:
     """Say so when the example frame, measured again, gives other slopes than are stored."""
-    both = stages.slopes.valid & arm.valid[number]
-    again = np.stack([stages.slopes.x, stages.slopes.y])[:, both]
+    assert store.layout is not None
+    assert store.settings is not None
+    reference = store.stored.attributes.get("reference")
+    slopes = SlopePipeline(store.layout, store.settings, store.calibration, reference)(frame)
+    both = slopes.valid & arm.valid[number]
+    again = np.stack([slopes.x, slopes.y])[:, both]
     distance = np.abs(again - np.stack([arm.x[number], arm.y[number]])[:, both])
     if distance.size == 0 or distance.max() <= _SAME_POSITION_PX:
         return []
     return [
         f"Measured again for the pictures, frame {number} gives positions that differ from those stored in "
-        f"{store.path.name} by up to {distance.max():.2f} px: the run used reference positions or a "
-        "calibration that is not known here, or the frames are not the same. The crosses show the new "
-        "measurement."
+        f"{store.path.name} by up to {distance.max():.2f} px: the calibration or the frames are "
+        "not those of the run. The crosses show the new measurement."
     ]
 
 
@@ -286,4 +299,6 @@ def _facts(stores: Sequence[_Store], arms: Sequence[Arm]) -> dict[str, str]:
         known = store.settings is not None and store.layout is not None
         words = settings_in_words(store.settings, store.layout) if known else "not stored"  # type: ignore[arg-type]
         facts[f"Settings of {arm.name!r}" if len(arms) > 1 else "Settings"] = words
+    if any("reference" in store.stored.attributes for store in stores):
+        facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
     return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}

@@ -122,10 +122,11 @@ class Calibration:
         return maps
 
     def saturation(self, dtype: np.dtype[Any]) -> float:
-        """Return the raw value from which a pixel of frames of this dtype is saturated (inf: none)."""
+        """Return the raw value from which a pixel of frames of this dtype is saturated (NaN: none)."""
         if self.saturation_adu is not None:
             return self.saturation_adu
-        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.inf
+        # Not infinity: an infinite pixel would reach it.
+        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.nan
 
     def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
         if self.bad_pixels.dtype == np.bool_:

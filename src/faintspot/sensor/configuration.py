@@ -90,8 +90,9 @@ def to_text(*items: Layout | Calibration | Settings) -> str:
     for item in items:
         table = next(name for name, kind in TABLES.items() if isinstance(item, kind))
         values = _values(item)
-        shown = {key: f"map of {value.shape}" if _is_map(value) else value for key, value in values.items()}
-        document[table] = _toml_table(shown)
+        if table == "calibration":
+            values = {key: f"map of {value.shape}" if _is_map(value) else value for key, value in values.items()}
+        document[table] = _toml_table(values)
     return tomlkit.dumps(document)
 
 

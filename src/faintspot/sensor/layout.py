@@ -128,7 +128,7 @@ class Layout:
         outer_radius, inner_radius : float, optional
             Of the pupil, in lenslets: a sub-aperture is lit when its centre is not farther than
             `outer_radius` and not nearer than `inner_radius` from the middle of the grid. Default: all lit.
-            (7, 7) with 3.7 and 1.2 gives the 36 of a 4.2 m telescope with central obstruction.
+            (7, 7) with 3.5 and 0.5 gives the 36 of a 4.2 m telescope with central obstruction.
         pitch : int or (int, int), optional
             Rows and columns from one window to the next. Default: `pixels`.
         origin : (int, int)

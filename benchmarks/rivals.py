@@ -1,0 +1,236 @@
+"""faintspot against what one would otherwise use, on one processor.
+
+All do the same work: 16 x 16 pixels in float32, 20 iterations, the 12 brightest pixels, centre of gravity;
+each is first shown to give the same positions. faintspot reads them out of a camera frame; the others are
+handed the stack of images, ready made.
+
+- scikit-image: `denoise_tv_chambolle`, image after image, with the weight that faintspot's solution has (it
+  does not solve the constrained problem, so that something else would have to find the weight). It makes 20
+  iterations of Chambolle's algorithm (`eps=0`, the last update is not used), which come less close to the
+  solution than 20 of faintspot's; its positions are therefore compared where both have converged.
+- NumPy and JAX: faintspot's algorithm, see rival_numpy.py and rival_jax.py. All images at once, and in blocks
+  that fit the cache; the faster one counts.
+- C++: only the sweep, see sweep.cpp.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import faintspot as fs
+from benchmarks import sweeps
+from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, median_ratio, pinned
+from benchmarks.rival_numpy import NumpyRival, locate
+
+ITERATIONS, KEEP, NOISE_STD, FLUX_E = 20, 12, 0.45, 200.0
+NUMPY_BLOCKS = (64, 128, 256, 512)
+JAX_BLOCKS = (64, 128, 256)
+SKIMAGE_IMAGES = 36  # takes one image after the other: so many tell the time of one
+SAME_POSITION_PX = 1e-4  # same algorithm: only float32 rounding may differ
+SAME_SOLUTION_PX = 0.01  # another algorithm, where both have converged
+SAME_FIELD = 1e-4  # dual fields, of order one, after 20 sweeps in another order of rounding
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A frame, the same as a stack of images (n, ny, nx), and the pipeline that measures it."""
+
+    layout: fs.Layout
+    frame: Floats
+    images: Floats
+    pipeline: fs.SlopePipeline
+
+    def slopes(self) -> Floats:
+        """Return faintspot's positions (n, 2)."""
+        slopes = self.pipeline(self.frame)
+        return np.stack([slopes.x, slopes.y], axis=1)
+
+
+def layout_of(n: int, pixels: int = 16) -> fs.Layout:
+    """Return the layout with n sub-apertures: 36 (7 x 7), 4616 (80 x 80, obstructed) or a row of them."""
+    if n == 36:
+        return fs.Layout.grid((7, 7), pixels=pixels, outer_radius=3.5, inner_radius=0.5)
+    if n == 4616:
+        return fs.Layout.grid((80, 80), pixels=pixels, outer_radius=40, inner_radius=11.5)
+    return fs.Layout.grid((1, n), pixels=pixels)
+
+
+def problem(
+    n: int, pixels: int = 16, *, threads: int = 1, width: int | None = None, **settings: Any
+) -> Problem:
+    """Simulate faint spots and put them into a frame."""
+    layout = layout_of(n, pixels)
+    generator = np.random.default_rng(n)
+    images, _ = fs.simulate.subapertures(n, shape=(pixels, pixels), flux_e=FLUX_E, rng=generator)
+    frame = np.zeros(layout.frame_shape, np.float32)
+    for (row, column), image in zip(layout.corners, images, strict=True):
+        frame[row : row + pixels, column : column + pixels] = image
+    chosen = {"tolerance": 0.0, "max_iterations": ITERATIONS, "keep_brightest": KEEP} | settings
+    pipeline = fs.SlopePipeline(
+        layout, fs.Settings(noise_std=NOISE_STD, **chosen), threads=threads, width=width
+    )
+    return Problem(layout, frame, np.ascontiguousarray(images), pipeline)
+
+
+def available(package: str) -> bool:
+    """Whether an optional package is installed."""
+    return importlib.util.find_spec(package) is not None
+
+
+# Rivals ------------------------------------------------------------------------------------------------
+
+
+def numpy_rival(case: Problem, block: int) -> Callable[[], Floats]:
+    """Return the NumPy version, in blocks of at most `block` images."""
+    ny, nx = case.layout.window
+    rival = NumpyRival(ny, nx, min(block, len(case.images)), NOISE_STD, KEEP, ITERATIONS)
+    return lambda: rival(case.images)
+
+
+def jax_rival(case: Problem, block: int) -> Callable[[], Any]:
+    """Return the JAX version, in blocks of `block` images."""
+    from benchmarks.rival_jax import jax_rival as make
+
+    return make(case.images, block, NOISE_STD, KEEP, ITERATIONS)
+
+
+def skimage_rival(images: NDArray[Any], weights: NDArray[Any], iterations: int) -> Callable[[], NDArray[Any]]:
+    """Return scikit-image's denoising in a loop, then the same NumPy code as in the NumPy version."""
+    from skimage.restoration import denoise_tv_chambolle
+
+    def run() -> NDArray[Any]:
+        denoised = np.empty_like(images)
+        for i in range(len(images)):
+            denoised[i] = denoise_tv_chambolle(images[i], weight=weights[i], eps=0.0, max_num_iter=iterations)
+        return locate(denoised, KEEP)
+
+    return run
+
+
+def difference(case: Problem, rival: Callable[[], Any]) -> float:
+    """Return the largest difference between a rival's positions and faintspot's, px."""
+    return float(np.abs(np.asarray(rival()) - case.slopes()).max())
+
+
+def skimage_difference(case: Problem, count: int = 4, iterations: int = 2000) -> float:
+    """Return the largest difference of `count` positions where both have converged, px."""
+    images = case.images[:count].astype(np.float64)
+    ours = fs.tv_denoise(images, NOISE_STD, tolerance=1e-7, max_iterations=iterations, full_output=True)
+    theirs = skimage_rival(images, ours.multiplier, iterations)()
+    return float(np.abs(theirs - locate(ours.images, KEEP)).max())
+
+
+# Measurements ------------------------------------------------------------------------------------------
+
+
+def _row(name: str, n: int, times: Times, rival: str, differs_px: float, target: float) -> Row:
+    ratio = median_ratio(times, rival, "faintspot")
+    values = {
+        "faintspot us": best(times, "faintspot") / n * 1e6,
+        "rival us": best(times, rival) / n * 1e6,
+        "ratio of best": best(times, rival) / best(times, "faintspot"),
+        "median ratio": ratio,
+        "differs px": differs_px,
+    }
+    return Row(name, values, f">= {target:g}", min(ratio, values["ratio of best"]) >= target)
+
+
+def _check(name: str, differs: float, limit: float) -> float:
+    if not differs <= limit:
+        raise AssertionError(f"{name}: differs from faintspot by {differs:g}, expected at most {limit:g}")
+    return differs
+
+
+def _fastest(case: Problem, name: str, make: Callable[[Problem, int], Candidate], blocks: Any) -> Any:
+    """Return the name and the fastest of a rival's block sizes, after showing that it is right."""
+    n = len(case.images)
+    rivals = {block: make(case, block) for block in [b for b in blocks if b < n] + [n]}
+    for rival in rivals.values():
+        _check(name, difference(case, rival), SAME_POSITION_PX)
+    times = interleaved({str(block): rival for block, rival in rivals.items()}, seconds=0.0, fewest=5)
+    block = min(rivals, key=lambda b: best(times, str(b)))
+    return f"{name}, {f'blocks of {block}' if block < n else 'all at once'}", rivals[block]
+
+
+def _same_algorithm(n: int) -> list[Row]:
+    """Compare with NumPy and JAX."""
+    case = problem(n)
+    rivals: dict[str, Candidate] = dict([_fastest(case, "NumPy", numpy_rival, NUMPY_BLOCKS)])
+    if available("jax"):
+        rivals |= dict([_fastest(case, "JAX", jax_rival, JAX_BLOCKS)])
+    times = interleaved({"faintspot": case.slopes} | rivals, seconds=5.0 if n < 100 else 15.0)
+    return [_row(f"{n}: {name}", n, times, name, difference(case, run), 9.0) for name, run in rivals.items()]
+
+
+def _against_skimage(n: int) -> Row:
+    """Compare with scikit-image; of many images it gets the first SKIMAGE_IMAGES, for short turns."""
+    case = problem(n)
+    differs = _check("scikit-image", skimage_difference(case), SAME_SOLUTION_PX)
+    images = case.images[:SKIMAGE_IMAGES]
+    solved = fs.tv_denoise(images, NOISE_STD, tolerance=0.0, max_iterations=ITERATIONS, full_output=True)
+    rival = skimage_rival(images, solved.multiplier, ITERATIONS)
+    times = interleaved({"faintspot": case.slopes, "rival": rival}, seconds=5.0)
+    times["rival"] *= n / len(images)
+    return _row(f"{n}: scikit-image", n, times, "rival", differs, 200.0)
+
+
+def _threads_used(run: Candidate) -> float:
+    """Return processor time per wall time: above 1 where more than one thread works."""
+    run()
+    processor, wall = time.process_time(), time.perf_counter()
+    for _ in range(200):
+        run()
+    return (time.process_time() - processor) / (time.perf_counter() - wall)
+
+
+def _against_cpp() -> Table:
+    library = sweeps.cpp_library()
+    title = "One sweep (16 x 16 pixels): Numba against C++ with vector extensions"
+    if library is None:
+        return Table("rivals_cpp", title, [], ["no g++ here"])
+    rows, count = [], 200
+    for width in (16, 8, 4):
+        differs = _check(f"C++, W = {width}", sweeps.largest_difference(library, width), SAME_FIELD)
+        ours, theirs = sweeps.Group(width), sweeps.Group(width)
+        cpp = theirs.cpp(library)
+        candidates: dict[str, Candidate] = {
+            "numba": lambda group=ours: group.numba(count),  # type: ignore[misc]
+            "cpp": lambda run=cpp: run(count),  # type: ignore[misc]
+        }
+        times = interleaved(candidates, seconds=3.0)
+        ratio, scale = median_ratio(times, "numba", "cpp"), 1e9 / (count * sweeps.SIDE**2)
+        values = {
+            "Numba ns/pixel": best(times, "numba") * scale,
+            "C++ ns/pixel": best(times, "cpp") * scale,
+            "ratio of best": best(times, "numba") / best(times, "cpp"),
+            "median ratio": ratio,
+            "differs": differs,
+        }
+        rows.append(Row(f"W = {width}", values, "<= 1.1", max(ratio, values["ratio of best"]) <= 1.1))
+    return Table("rivals_cpp", title, rows, ["ns for one pixel of all W images; both the same arithmetic"])
+
+
+def run() -> list[Table]:
+    """Run the comparisons."""
+    notes = ["us per sub-aperture, best of all turns; a target is met when both ratios meet it"]
+    with pinned():
+        rows = []
+        for n in (36, 4616):
+            rows += _same_algorithm(n)
+            if available("skimage"):
+                rows.append(_against_skimage(n))
+        if available("jax"):
+            used = _threads_used(jax_rival(problem(36), 36))
+            notes.append(f"JAX used {used:.2f} threads")
+        notes += [f"not installed: {package}" for package in ("jax", "skimage") if not available(package)]
+        title = "Frame to slopes, one thread: faintspot against others"
+        return [Table("rivals", title, rows, notes), _against_cpp()]

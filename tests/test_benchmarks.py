@@ -1,0 +1,37 @@
+"""The benchmarks' rivals do the same work as faintspot; nothing here is timed."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from benchmarks import rivals, sweeps
+
+
+@pytest.fixture(scope="module")
+def case() -> rivals.Problem:
+    return rivals.problem(20)
+
+
+@pytest.mark.parametrize("block", [8, 20])
+def test_numpy_gives_the_same_positions(case: rivals.Problem, block: int) -> None:
+    assert rivals.difference(case, rivals.numpy_rival(case, block)) <= rivals.SAME_POSITION_PX
+
+
+@pytest.mark.parametrize("block", [8, 20])
+def test_jax_gives_the_same_positions(case: rivals.Problem, block: int) -> None:
+    pytest.importorskip("jax")
+    assert rivals.difference(case, rivals.jax_rival(case, block)) <= rivals.SAME_POSITION_PX
+
+
+def test_scikit_image_converges_to_the_same_positions(case: rivals.Problem) -> None:
+    pytest.importorskip("skimage")
+    assert rivals.skimage_difference(case, count=2) <= rivals.SAME_SOLUTION_PX
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
+@pytest.mark.parametrize("width", [4, 8, 16])
+def test_cpp_gives_the_same_fields(width: int) -> None:
+    library = sweeps.cpp_library()
+    assert library is not None
+    assert sweeps.largest_difference(library, width) <= rivals.SAME_FIELD
