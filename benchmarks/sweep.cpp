@@ -1,5 +1,5 @@
 // The sweep of faintspot.kernels.total_variation.sweep_fgp in C++: same layout, same arithmetic, GCC's vector
-// extensions. `state` holds five vectors a pixel (px, py of both versions, g), `rows` three rolling rows.
+// extensions. `state` holds five vectors a pixel (2 px, 2 py of both versions, g), `rows` qx, qy, v of the row above.
 
 #include <cstddef>
 #include <cstring>
@@ -19,27 +19,25 @@ template <int W> static inline Vector<W> load(const float *place) {
 
 template <int W> static inline void store(float *place, Vector<W> v) { std::memcpy(place, &v, sizeof v); }
 
-// The hardware's estimate and one Newton step.
-template <int W> static inline Vector<W> reciprocal_square_root(Vector<W> a) {
+// 2 / sqrt(a): the hardware's estimate and one Newton step.
+template <int W> static inline Vector<W> twice_reciprocal_square_root(Vector<W> a) {
   Vector<W> e;
 #if defined(__AVX512F__) && defined(__AVX512VL__)
   if constexpr (W == 16) e = (Vector<W>)_mm512_rsqrt14_ps((__m512)a);
   if constexpr (W == 8) e = (Vector<W>)_mm256_rsqrt14_ps((__m256)a);
   if constexpr (W == 4) e = (Vector<W>)_mm_rsqrt14_ps((__m128)a);
 #else
-  for (int i = 0; i < W; i++) e[i] = 1.0f / __builtin_sqrtf(a[i]);
+  for (int i = 0; i < W; i++) e[i] = 2.0f / __builtin_sqrtf(a[i]);
   return e;
 #endif
-  return (-0.5f * e) * (a * e * e - 3.0f);
+  return e * (3.0f - a * e * e);
 }
 
-template <int W>
-static Vector<W> sweep(float *state, float *rows, long ny, long nx, long current, Vector<W> momentum,
-                       Vector<W> inverse) {
+template <int W, long current>
+static Vector<W> sweep(float *state, float *rows, long ny, long nx, Vector<W> momentum, Vector<W> inverse) {
   typedef Vector<W> V;
-  const long pixel = 5 * W, line = nx * pixel, previous = 2 - current;
-  const V one = V{} + 1.0f;
-  float *row_qx = rows, *row_qy = rows + nx * W, *row_v = rows + 2 * nx * W;
+  const long pixel = 5 * W, line = nx * pixel, previous = 2 - current, slot = 3 * W;
+  const V four = V{} + 4.0f, twice_inverse = 2.0f * inverse;
   V norm{}, v{}, left{};
   auto extrapolate = [&](const float *p, V &qx, V &qy) {
     V px = load<W>(p + current * W), py = load<W>(p + (current + 1) * W);
@@ -48,7 +46,7 @@ static Vector<W> sweep(float *state, float *rows, long ny, long nx, long current
   };
   auto project = [&](float *p, V px, V py) {
     V square = px * px + py * py;
-    V shrink = reciprocal_square_root<W>(square > one ? square : one);
+    V shrink = twice_reciprocal_square_root<W>(square > four ? square : four);
     store<W>(p + previous * W, px * shrink);
     store<W>(p + (previous + 1) * W, py * shrink);
   };
@@ -58,44 +56,44 @@ static Vector<W> sweep(float *state, float *rows, long ny, long nx, long current
     extrapolate(p, qx, qy);
     V d = qx - left + qy;
     norm = d * d + norm;
-    v = d - load<W>(p + 4 * W) * inverse;
-    store<W>(row_qx + x * W, qx);
-    store<W>(row_qy + x * W, qy);
-    store<W>(row_v + x * W, v);
+    v = d - load<W>(p + 4 * W) * twice_inverse;
+    store<W>(rows + x * slot, qx);
+    store<W>(rows + x * slot + W, qy);
+    store<W>(rows + x * slot + 2 * W, v);
     left = qx;
   }
-  store<W>(row_v + nx * W, v);
+  store<W>(rows + nx * slot + 2 * W, v);
   for (long y = 1; y < ny; y++) {
-    V above = load<W>(row_v);
+    V above = load<W>(rows + 2 * W);
     left = V{};
     for (long x = 0; x < nx; x++) {
       float *p = state + y * line + x * pixel;
       V qx, qy;
       extrapolate(p, qx, qy);
-      V qy_above = load<W>(row_qy + x * W);
+      V qy_above = load<W>(rows + x * slot + W);
       V d = (qx - left) + (qy - qy_above);
       norm = d * d + norm;
-      v = d - load<W>(p + 4 * W) * inverse;
-      V right = load<W>(row_v + (x + 1) * W);
-      V px = 0.125f * (right - above) + load<W>(row_qx + x * W);
+      v = d - load<W>(p + 4 * W) * twice_inverse;
+      V right = load<W>(rows + (x + 1) * slot + 2 * W);
+      V px = 0.125f * (right - above) + load<W>(rows + x * slot);
       V py = 0.125f * (v - above) + qy_above;
       project(p - line, px, py);
-      store<W>(row_qx + x * W, qx);
-      store<W>(row_qy + x * W, qy);
-      store<W>(row_v + x * W, v);
+      store<W>(rows + x * slot, qx);
+      store<W>(rows + x * slot + W, qy);
+      store<W>(rows + x * slot + 2 * W, v);
       left = qx;
       above = right;
     }
-    store<W>(row_v + nx * W, v);
+    store<W>(rows + nx * slot + 2 * W, v);
   }
-  V above = load<W>(row_v);
+  V above = load<W>(rows + 2 * W);
   for (long x = 0; x < nx; x++) {
-    V right = load<W>(row_v + (x + 1) * W);
-    V px = 0.125f * (right - above) + load<W>(row_qx + x * W);
+    V right = load<W>(rows + (x + 1) * slot + 2 * W);
+    V px = 0.125f * (right - above) + load<W>(rows + x * slot);
     project(state + (ny - 1) * line + x * pixel, px, V{});
     above = right;
   }
-  return norm;
+  return 0.25f * norm;
 }
 
 template <int W>
@@ -104,7 +102,8 @@ static void sweeps(float *state, float *rows, long ny, long nx, long count, floa
   typedef Vector<W> V;
   V last{};
   for (long i = 0; i < count; i++)
-    last = sweep<W>(state, rows, ny, nx, i % 2 ? 2 : 0, V{} + momentum, V{} + inverse);
+    last = i % 2 ? sweep<W, 2>(state, rows, ny, nx, V{} + momentum, V{} + inverse)
+                 : sweep<W, 0>(state, rows, ny, nx, V{} + momentum, V{} + inverse);
   store<W>(norm, last);
 }
 

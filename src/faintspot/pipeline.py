@@ -111,7 +111,7 @@ class SlopePipeline:
             None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
         )
         self._lanes = lanes_for(np.float32, width)
-        self._calibration_maps = self.calibration.maps(layout.frame_shape)
+        self._calibration = _packed_calibration(layout, self.calibration, self._lanes.width)
         self._table = _settings_table(layout, settings)
         zero = layout.offsets + _reference_positions(reference, len(layout))
         self._table[fused.ZERO_X], self._table[fused.ZERO_Y] = zero.T
@@ -124,7 +124,7 @@ class SlopePipeline:
 
     def fingerprint(self) -> bytes:
         """Return bytes that differ between pipelines that could give different slopes for the same frame."""
-        parts = (self.layout.corners, self._calibration_maps, self._table)
+        parts = (self.layout.corners, self._calibration, self._table)
         text = f"{self.layout.window} {self.settings.algorithm} {self.calibration.saturation_adu}"
         return b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + text.encode()
 
@@ -172,7 +172,7 @@ class SlopePipeline:
                 frames,
                 self.layout.corners,
                 *self.layout.window,
-                self._calibration_maps,
+                self._calibration,
                 saturation,
                 self._table,
                 algorithm,
@@ -195,6 +195,17 @@ def _kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
         frames = np.ascontiguousarray(array, dtype=dtype)
     return frames.reshape(-1, *array.shape[-2:])
+
+
+def _packed_calibration(layout: Layout, calibration: Calibration, width: int) -> NDArray[np.float32]:
+    """Dark and scale of every sub-aperture's pixels in the kernel's own order, to be read as one stream.
+
+    Shape (n_groups, pixels, 2, W); the last group repeats its last sub-aperture.
+    """
+    n_groups = -(-len(layout) // width)
+    windows = layout.images(calibration.maps(layout.frame_shape)).reshape(2, len(layout), layout.pixels)
+    lanes = windows[:, np.minimum(np.arange(n_groups * width), len(layout) - 1)]
+    return np.ascontiguousarray(lanes.reshape(2, n_groups, width, layout.pixels).transpose(1, 3, 0, 2))
 
 
 def _settings_table(layout: Layout, settings: Settings) -> NDArray[np.float32]:

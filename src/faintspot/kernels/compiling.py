@@ -18,6 +18,11 @@ def _kernels_stamp() -> tuple[tuple[float, int], ...]:
     return tuple((source.stat().st_mtime, source.stat().st_size) for source in sources)
 
 
+def inlined(function: Callable[..., Any]) -> Any:
+    """Make a function part of every compiled function that calls it, with constant arguments as constants."""
+    return njit(inline="always", error_model="numpy")(function)
+
+
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile with Numba: cached on disk, without the GIL, division by zero as in NumPy.
 

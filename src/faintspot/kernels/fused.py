@@ -11,7 +11,7 @@ from typing import Any
 from faintspot.flags import SubapertureFlag
 from faintspot.kernels import brightest, total_variation
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.gather import fill_bad_pixels, gather_calibrated, gather_image, scatter_image
+from faintspot.kernels.gather import calibrate, fill_bad_pixels, gather_image, gather_raw, scatter_image
 from faintspot.kernels.simd import width_of
 from faintspot.kernels.total_variation import denoise_group
 
@@ -67,8 +67,8 @@ def slopes_of_groups(
         Row and column of every window's first pixel.
     ny, nx : int
         Window.
-    calibration : (2, h, w) float32
-        Dark in ADU, and electrons per ADU (NaN in bad pixels).
+    calibration : (n_groups, pixels, 2, W) float32
+        Dark in ADU, and electrons per ADU (NaN in bad pixels); all lanes of a pixel together.
     saturation : float
         In ADU.
     settings : (SETTING_ROWS, n_subapertures) float32
@@ -81,56 +81,43 @@ def slopes_of_groups(
     """
     width = width_of(lanes)
     image, output, state, rows, numbers, counts, lane_counts = scratch
-    places, flags, pixel_counts = (
-        lane_counts[:width],
-        lane_counts[width : 2 * width],
-        lane_counts[2 * width :],
-    )
+    places, flags, bad_counts = lane_counts[:width], lane_counts[width : 2 * width], lane_counts[2 * width :]
+    centroid_numbers = numbers[_NUMBERS * width :]
     n = corners.shape[0]
-    height, line = frames.shape[1:]
     n_groups = (n + width - 1) // width
     for item in range(start, stop):
         f, first = item // n_groups, (item % n_groups) * width
         for lane in range(width):
             s = min(first + lane, n - 1)
-            places[lane] = corners[s, 0] * line + corners[s, 1]
-        gather_calibrated(
-            width,
-            frames,
-            f * height * line,
-            calibration,
-            height * line,
-            line,
-            places,
-            saturation,
-            ny,
-            nx,
-            image,
-            output,
-            pixel_counts,
+            places[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
+        gather_raw(lanes, frames, f, places, ny, nx, image, output)
+        group = item % n_groups
+        calibrate(
+            lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, centroid_numbers
         )
         for lane in range(width):
             s = min(first + lane, n - 1)
-            bad = pixel_counts[lane]
-            flags[lane] = SATURATED if pixel_counts[width + lane] > 0 else 0
+            bad = int(centroid_numbers[lane])
+            bad_counts[lane] = bad
+            flags[lane] = SATURATED if centroid_numbers[width + lane] > 0.0 else 0
             if bad > 0:
                 fill_bad_pixels(width, lane, ny, nx, image, output)
                 flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else BAD_PIXELS
             numbers[total_variation.STRENGTH * width + lane] = settings[STRENGTH, s]
             numbers[total_variation.TOLERANCE * width + lane] = settings[TOLERANCE, s]
             counts[total_variation.LIMIT * width + lane] = int(settings[LIMIT, s])
-            numbers[(_NUMBERS + brightest.RANK) * width + lane] = settings[RANK, s]
-            numbers[(_NUMBERS + brightest.SUBTRACT) * width + lane] = settings[SUBTRACT, s]
+            centroid_numbers[brightest.RANK * width + lane] = settings[RANK, s]
+            centroid_numbers[brightest.SUBTRACT * width + lane] = settings[SUBTRACT, s]
         denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
         if stages.shape[0] > 0:
             _store_stage(width, image, stages[CALIBRATED, f], first)
             _store_stage(width, output, stages[DENOISED, f], first)
-        _locate(lanes, output, ny, nx, numbers[_NUMBERS * width :])
+        _locate(lanes, output, ny, nx, centroid_numbers)
         if stages.shape[0] > 0:
             _store_stage(width, output, stages[BACKGROUND, f], first)
         for lane in range(min(width, n - first)):
             _store_slope(
-                width, ny, nx, lane, f, first + lane, settings, numbers, counts, flags, pixel_counts, slopes
+                width, ny, nx, lane, f, first + lane, settings, numbers, counts, flags, bad_counts, slopes
             )
 
 
@@ -160,7 +147,7 @@ def _store_slope(
     numbers: Any,
     counts: Any,
     flags: Any,
-    pixel_counts: Any,
+    bad_counts: Any,
     slopes: Any,
 ) -> None:
     """Write one sub-aperture's result; the reference position (slope 0) where it is invalid."""
@@ -184,7 +171,7 @@ def _store_slope(
     flux[f, s] = total
     flag[f, s] = bits
     iterations[f, s] = counts[total_variation.ITERATIONS * width + lane]
-    bad_pixels[f, s] = pixel_counts[lane]
+    bad_pixels[f, s] = bad_counts[lane]
 
 
 @compiled

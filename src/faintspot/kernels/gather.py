@@ -9,64 +9,74 @@ import numpy as np
 
 from faintspot.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.simd import get, put
+from faintspot.kernels.simd import absolute, get, load, load_converted, put, select, splat, store, width_of
 
 
 @compiled
-def gather_calibrated(
-    width: Any,
-    frames: Any,
-    frame_start: Any,
-    calibration: Any,
-    frame_pixels: Any,
-    line: Any,
-    corners: Any,
-    saturation: Any,
-    ny: Any,
-    nx: Any,
-    image: Any,
-    tile: Any,
-    counts: Any,
+def gather_raw(
+    lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, image: Any, tile: Any
 ) -> None:
-    """Copy W sub-apertures of a frame into the lanes, in electrons.
-
-    (raw - dark) * scale; a bad pixel has scale NaN. What is not finite or absurdly large becomes NaN.
+    """Copy W sub-apertures of a frame into the lanes, as they are.
 
     Parameters
     ----------
-    frame_start, line, corners : int, int, (W,) int64
-        Flat offsets: of the frame in `frames`, of one row from the next, of each sub-aperture in the frame.
-    calibration, frame_pixels : (2, h, w) array, int
-        Dark and scale, and the number of pixels of each.
-    saturation : float
+    frames : (n_frames, h, w) array
+    frame : int
+    corners : (W,) int64
+        Flat offset of each sub-aperture's first pixel in its frame.
     image : (ny * nx * W,) array
         Written.
     tile : array
         Scratch for nx * W numbers: one row of every sub-aperture, so that the frame is read and the image
         written in order.
-    counts : (2 * W,) int64
-        Bad and saturated pixels of every lane; written.
     """
-    limit, level, nan = np.float32(LARGEST_FLOAT32), np.float32(saturation), np.float32(math.nan)
-    for lane in range(2 * width):
-        counts[lane] = 0
+    width = width_of(lanes)
+    height, line = frames.shape[1:]
+    whole = nx - nx % width
     for y in range(ny):
         for lane in range(width):
-            start = get(corners, lane) + y * line
-            bad, saturated = 0, 0
-            for x in range(nx):
-                raw = np.float32(get(frames, frame_start + start + x))
-                dark, scale = get(calibration, start + x), get(calibration, frame_pixels + start + x)
-                value = (raw - dark) * scale
-                good = abs(value) <= limit
-                bad += 0 if good else 1
-                saturated += 1 if raw >= level else 0
-                put(tile, lane * nx + x, value if good else nan)
-            counts[lane] += bad
-            counts[width + lane] += saturated
+            source = frame * height * line + get(corners, lane) + y * line
+            to = lane * nx
+            for x in range(0, whole, width):
+                store(tile, to + x, load_converted(lanes, frames, source + x))
+            for x in range(whole, nx):
+                put(tile, to + x, np.float32(get(frames, source + x)))
         for x in range(nx):
             for lane in range(width):
                 put(image, (y * nx + x) * width + lane, get(tile, lane * nx + x))
+
+
+@compiled
+def calibrate(
+    lanes: Any, image: Any, pixels: Any, calibration: Any, place: Any, saturation: Any, numbers: Any
+) -> None:
+    """Turn a group's raw images into electrons, in place: (raw - dark) * scale.
+
+    What is not finite or absurdly large becomes NaN; a bad pixel has scale NaN.
+
+    Parameters
+    ----------
+    calibration : array
+        From element `place`: dark and scale of every pixel, W numbers each.
+    saturation : float
+    numbers : (2 * W,) array
+        Number of bad and of saturated pixels in every lane; written.
+    """
+    width = width_of(lanes)
+    limit, level = splat(lanes, LARGEST_FLOAT32), splat(lanes, saturation)
+    zero, one, nan = splat(lanes, 0.0), splat(lanes, 1.0), splat(lanes, math.nan)
+    bad = saturated = zero
+    for i in range(pixels):
+        raw = load(lanes, image, i * width)
+        dark = load(lanes, calibration, place + 2 * i * width)
+        scale = load(lanes, calibration, place + (2 * i + 1) * width)
+        value = (raw - dark) * scale
+        good = absolute(value) <= limit
+        bad = bad + select(good, zero, one)
+        saturated = saturated + select(raw >= level, one, zero)
+        store(image, i * width, select(good, value, nan))
+    store(numbers, 0, bad)
+    store(numbers, width, saturated)
 
 
 @compiled

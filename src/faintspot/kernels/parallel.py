@@ -37,10 +37,10 @@ def new_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
         aligned_zeros(pixels * width, lanes.dtype),
         aligned_zeros(pixels * width, lanes.dtype),
         aligned_zeros(total_variation.STATE_VECTORS * pixels * width, lanes.dtype),
-        aligned_zeros((pixels + 2 * nx + 1) * width, lanes.dtype),
+        aligned_zeros((pixels + 2 * nx + 3) * width, lanes.dtype),
         aligned_zeros((total_variation.LANE_ROWS + brightest.LANE_ROWS) * width, lanes.dtype),
         np.zeros(total_variation.COUNT_ROWS * width, np.int64),
-        np.zeros(4 * width, np.int64),
+        np.zeros(3 * width, np.int64),
     )
 
 

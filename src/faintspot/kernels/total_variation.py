@@ -1,7 +1,8 @@
 """Constrained total-variation denoising of a group of W sub-apertures, one in each SIMD lane.
 
 The state holds, for every pixel, five vectors side by side (one memory stream): two versions of the dual
-field p = (px, py), which take turns as the current and the previous one, and the normalised image g.
+field p = (px, py), which take turns as the current and the previous one, and the normalised image g. What is
+stored is 2 p, of length at most 2, since 2 / sqrt(a) is cheaper than 1 / sqrt(a).
 One iteration is one sweep over the rows. v = div q - g / lambda of row y is all that row y - 1 still lacks
 for its update, so three rolling rows of vectors in scratch replace every other intermediate image.
 
@@ -18,17 +19,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from faintspot.kernels.compiling import compiled
+from faintspot.kernels.compiling import compiled, inlined
 from faintspot.kernels.simd import (
     load,
     maximum,
     minimum,
     multiply_add,
-    reciprocal_square_root,
     select,
     splat,
     square_root,
     store,
+    twice_reciprocal_square_root,
     width_of,
 )
 
@@ -57,7 +58,7 @@ LIMIT, ITERATIONS, CONVERGED, INFEASIBLE, ACTIVE = 0, 1, 2, 3, 4
 COUNT_ROWS = 5
 
 
-@compiled
+@inlined
 def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any, momentum: Any) -> Any:
     """Extrapolate: q = p + momentum * (p - p_previous) at one pixel."""
     width = width_of(lanes)
@@ -68,67 +69,76 @@ def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any
     return qx, qy
 
 
-@compiled
-def _project(px: Any, py: Any, one: Any) -> Any:
-    """The nearest dual vector of length at most one."""
-    shrink = reciprocal_square_root(maximum(multiply_add(px, px, py * py), one))
+@inlined
+def _project(px: Any, py: Any, four: Any) -> Any:
+    """The nearest dual vector of length at most two."""
+    shrink = twice_reciprocal_square_root(maximum(multiply_add(px, px, py * py), four))
     return px * shrink, py * shrink
 
 
-@compiled
-def sweep_fgp(
-    lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, momentum: Any, inverse: Any
+@inlined
+def _sweep(
+    lanes: Any,
+    state: Any,
+    rows: Any,
+    ny: Any,
+    nx: Any,
+    current: Any,
+    previous: Any,
+    momentum: Any,
+    inverse: Any,
 ) -> Any:
-    """One accelerated projected-gradient iteration on every pixel; return ||div q||^2 per lane.
+    """One accelerated projected-gradient iteration on every pixel; return ||2 div q||^2 per lane.
 
-    The new p replaces the previous one. `inverse` is 1 / lambda; `rows` has room for 3 nx + 1 vectors.
+    The new p replaces the previous one. `inverse` is 1 / lambda; `rows` has room for 3 (nx + 1) vectors: qx,
+    qy, v of every pixel of the row above, side by side.
     """
     width = width_of(lanes)
-    previous = 2 - current
-    step, one, zero = splat(lanes, FGP_STEP), splat(lanes, 1.0), splat(lanes, 0.0)
-    minus_inverse = zero - inverse
-    pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
-    row_qx, row_qy, row_v = 0, nx * width, 2 * nx * width
+    step, four, zero = splat(lanes, FGP_STEP), splat(lanes, 4.0), splat(lanes, 0.0)
+    minus_inverse = splat(lanes, -2.0) * inverse
+    pixel, line, slot = STATE_VECTORS * width, nx * STATE_VECTORS * width, 3 * width
     norm = zero
-    q_left, v = zero, zero
+    q_left = zero
     for x in range(nx):
         place = x * pixel
         qx, qy = _extrapolate(lanes, state, place, current, previous, momentum)
         d = qx - q_left + qy
         norm = multiply_add(d, d, norm)
         v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
-        store(rows, row_qx + x * width, qx)
-        store(rows, row_qy + x * width, qy)
-        store(rows, row_v + x * width, v)
+        store(rows, x * slot, qx)
+        store(rows, x * slot + width, qy)
+        store(rows, x * slot + 2 * width, v)
         q_left = qx
-    store(rows, row_v + nx * width, v)  # no gradient across the right edge
+    # A copy of the last v beyond the right edge: no gradient across it.
+    store(rows, nx * slot + 2 * width, load(lanes, rows, nx * slot - width))
     for y in range(1, ny):
-        v_above = load(lanes, rows, row_v)
+        v_above = load(lanes, rows, 2 * width)
         q_left = zero
         for x in range(nx):
             place = y * line + x * pixel
+            above = place - line
             qx, qy = _extrapolate(lanes, state, place, current, previous, momentum)
-            qy_above = load(lanes, rows, row_qy + x * width)
+            qy_above = load(lanes, rows, x * slot + width)
             d = (qx - q_left) + (qy - qy_above)
             norm = multiply_add(d, d, norm)
             v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
-            v_right = load(lanes, rows, row_v + (x + 1) * width)
-            px = multiply_add(step, v_right - v_above, load(lanes, rows, row_qx + x * width))
+            v_right = load(lanes, rows, x * slot + slot + 2 * width)
+            px = multiply_add(step, v_right - v_above, load(lanes, rows, x * slot))
             py = multiply_add(step, v - v_above, qy_above)
-            px, py = _project(px, py, one)
-            store(state, place - line + previous * width, px)
-            store(state, place - line + (previous + 1) * width, py)
-            store(rows, row_qx + x * width, qx)
-            store(rows, row_qy + x * width, qy)
-            store(rows, row_v + x * width, v)
+            px, py = _project(px, py, four)
+            store(state, above + previous * width, px)
+            store(state, above + (previous + 1) * width, py)
+            store(rows, x * slot, qx)
+            store(rows, x * slot + width, qy)
+            store(rows, x * slot + 2 * width, v)
             q_left, v_above = qx, v_right
-        store(rows, row_v + nx * width, v)
+        store(rows, nx * slot + 2 * width, load(lanes, rows, nx * slot - width))
     last = (ny - 1) * line
-    v_above = load(lanes, rows, row_v)
+    v_above = load(lanes, rows, 2 * width)
     for x in range(nx):  # no gradient across the lower edge: py stays zero
-        v_right = load(lanes, rows, row_v + (x + 1) * width)
-        px = multiply_add(step, v_right - v_above, load(lanes, rows, row_qx + x * width))
-        px, py = _project(px, zero, one)
+        v_right = load(lanes, rows, x * slot + slot + 2 * width)
+        px = multiply_add(step, v_right - v_above, load(lanes, rows, x * slot))
+        px, py = _project(px, zero, four)
         store(state, last + x * pixel + previous * width, px)
         store(state, last + x * pixel + (previous + 1) * width, py)
         v_above = v_right
@@ -136,14 +146,31 @@ def sweep_fgp(
 
 
 @compiled
+def sweep_fgp(
+    lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, momentum: Any, inverse: Any
+) -> Any:
+    """One iteration of "fgp"; return ||div q||^2 per lane. See `_sweep`.
+
+    `current` (0 or 2) says where the current p is: a constant in each branch, so that all of a pixel's
+    vectors lie at fixed distances from one address.
+    """
+    if current == 0:
+        norm = _sweep(lanes, state, rows, ny, nx, 0, 2, momentum, inverse)
+    else:
+        norm = _sweep(lanes, state, rows, ny, nx, 2, 0, momentum, inverse)
+    return norm * splat(lanes, 0.25)
+
+
+@compiled
 def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any) -> Any:
-    """One iteration of Chambolle's fixed point on every pixel; return ||div p||^2 per lane.
+    """One iteration of "chambolle" on every pixel; return ||div p||^2 per lane.
 
     `rows` has room for ny * nx vectors: v of the whole image. Meant to be compared with, not to be fast.
     """
     width = width_of(lanes)
-    step, one, zero = splat(lanes, CHAMBOLLE_STEP), splat(lanes, 1.0), splat(lanes, 0.0)
-    minus_inverse = zero - inverse
+    step, half_step = splat(lanes, CHAMBOLLE_STEP), splat(lanes, 0.5 * CHAMBOLLE_STEP)
+    one, zero = splat(lanes, 1.0), splat(lanes, 0.0)
+    minus_inverse = splat(lanes, -2.0) * inverse
     pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
     norm = zero
     for y in range(ny):
@@ -160,19 +187,19 @@ def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current
             v = load(lanes, rows, here)
             gx = load(lanes, rows, here + (width if x < nx - 1 else 0)) - v
             gy = load(lanes, rows, here + (nx * width if y < ny - 1 else 0)) - v
-            shrink = one / multiply_add(step, square_root(multiply_add(gx, gx, gy * gy)), one)
+            shrink = one / multiply_add(half_step, square_root(multiply_add(gx, gx, gy * gy)), one)
             for axis, gradient in ((0, gx), (1, gy)):
                 old = load(lanes, state, place + (current + axis) * width)
                 new = multiply_add(step, gradient, old) * shrink
                 store(state, place + (2 - current + axis) * width, new)
-    return norm
+    return norm * splat(lanes, 0.25)
 
 
 @compiled
 def _divergence(
     lanes: Any, state: Any, place: Any, version: Any, y: Any, x: Any, line: Any, pixel: Any
 ) -> Any:
-    """Divergence of p at one pixel, of the version of p that starts `version` elements after the pixel."""
+    """2 div p at one pixel, of the version of p that starts `version` elements after the pixel."""
     width = width_of(lanes)
     d = load(lanes, state, place + version) + load(lanes, state, place + version + width)
     if x > 0:
@@ -186,10 +213,10 @@ def _divergence(
 def _measure_change(
     lanes: Any, state: Any, ny: Any, nx: Any, current: Any, inverse: Any, numbers: Any
 ) -> None:
-    """Sum ||div p - div p_previous||^2 and ||div p - g / lambda||^2 per lane, for the convergence test."""
+    """Sum ||div p - div p_previous||^2 and ||div p - g / lambda||^2 per lane, both times 4, for the test."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
-    minus_inverse = zero - inverse
+    minus_inverse = splat(lanes, -2.0) * inverse
     pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
     change, size = zero, zero
     for y in range(ny):
@@ -219,15 +246,15 @@ def _write_finished(
             norm = multiply_add(d, d, norm)
     finishing = load(lanes, numbers, FINISHING * width) > zero
     mean, scale = load(lanes, numbers, MEAN * width), load(lanes, numbers, SCALE * width)
-    multiplier = load(lanes, numbers, RADIUS * width) / square_root(norm)
-    multiplier = select(norm > zero, multiplier, zero)
+    half_multiplier = load(lanes, numbers, RADIUS * width) / square_root(norm)
+    half_multiplier = select(norm > zero, half_multiplier, zero)
     old = load(lanes, numbers, MULTIPLIER * width)
-    store(numbers, MULTIPLIER * width, select(finishing, multiplier * scale, old))
+    store(numbers, MULTIPLIER * width, select(finishing, (half_multiplier + half_multiplier) * scale, old))
     for y in range(ny):
         for x in range(nx):
             place = y * line + x * pixel
             d = _divergence(lanes, state, place, current * width, y, x, line, pixel)
-            u = load(lanes, state, place + IMAGE * width) - multiplier * d
+            u = load(lanes, state, place + IMAGE * width) - half_multiplier * d
             here = (y * nx + x) * width
             store(output, here, select(finishing, multiply_add(u, scale, mean), load(lanes, output, here)))
 
@@ -363,7 +390,7 @@ def denoise_group(
     image, output : (ny * nx * W,) arrays
         Input, kept as it is, and result: all lanes of a pixel side by side.
     state, rows : arrays
-        Scratch of STATE_VECTORS * ny * nx * W and (ny * nx + 2 * nx + 1) * W numbers.
+        Scratch of STATE_VECTORS * ny * nx * W and (ny * nx + 2 * nx + 3) * W numbers.
     numbers : (LANE_ROWS * W,) array
         STRENGTH and TOLERANCE are read, MULTIPLIER is written, the rest is scratch.
     counts : (COUNT_ROWS * W,) int64 array

@@ -111,14 +111,16 @@ class Calibration:
                     f"calibration.{name}: expected the frame's shape {frame_shape}, got {array.shape}"
                 )
         maps = np.empty((2, *frame_shape), np.float32)
-        maps[0] = self.dark
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
+            maps[0] = self.dark
         gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
         if self.flat is not None:
             usable = np.isfinite(self.flat) & (self.flat > 0)
             gain = np.divide(gain, self.flat, where=usable, out=np.full(frame_shape, np.nan))
         if self.bad_pixels is not None:
             gain[self._bad_mask(frame_shape)] = np.nan
-        maps[1] = gain
+        with np.errstate(over="ignore"):
+            maps[1] = gain
         return maps
 
     def saturation(self, dtype: np.dtype[Any]) -> float:
@@ -157,7 +159,10 @@ def _scalar_or_map(name: str, value: Any) -> Any:
 
 def _mask_or_list(value: Any) -> NDArray[Any]:
     """A mask of bool, or rows and columns as (n, 2) int64."""
-    array = np.array(value)
+    try:
+        array = np.array(value)
+    except ValueError:
+        raise InputError("calibration.bad_pixels: expected [row, column] in every row of the list") from None
     if array.dtype != np.bool_:
         if array.size == 0:
             array = np.empty((0, 2), np.int64)

@@ -91,7 +91,9 @@ def to_text(*items: Layout | Calibration | Settings) -> str:
         table = next(name for name, kind in TABLES.items() if isinstance(item, kind))
         values = _values(item)
         if table == "calibration":
-            values = {key: f"map of {value.shape}" if _is_map(value) else value for key, value in values.items()}
+            values = {
+                key: f"map of {value.shape}" if _is_map(value) else value for key, value in values.items()
+            }
         document[table] = _toml_table(values)
     return tomlkit.dumps(document)
 
@@ -159,7 +161,11 @@ def _grid(values: dict[str, Any]) -> Layout:
     for key in ("shape", "pixels"):
         if key not in grid:
             raise InputError(f"layout.grid.{key}: expected a value, found none")
-    return Layout.grid(**grid)
+    try:
+        return Layout.grid(**grid)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None
 
 
 def _known(prefix: str, name: str, known: Any, what: str) -> None:
@@ -229,7 +235,8 @@ def _toml_value(value: Any) -> Any:
             inline[str(index)] = item
         return inline
     if isinstance(value, np.ndarray):
-        rows = np.round(value, 6).tolist() if value.dtype.kind == "f" else value.tolist()
+        # Rows are positions in pixels: a millionth is enough, and stays readable.
+        rows = np.round(value, 6).tolist() if value.ndim == 2 else value.tolist()
         array = tomlkit.array()
         array.extend(rows)
         return array.multiline(value.ndim == 2)

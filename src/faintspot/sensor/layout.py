@@ -77,7 +77,7 @@ class Layout:
             put(self, "pitch_px", number_between("layout.pitch_px", self.pitch_px, 0.0, low_open=True))
         put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
         _check_inside(corners, self.window, self.frame_shape)
-        _check_overlap(corners, self.window)
+        _check_overlap(corners, self.window, self.frame_shape)
         for name, array in (("corners", corners), ("centres", centres.astype(np.float64)), ("cells", cells)):
             array = array.copy()
             array.flags.writeable = False
@@ -294,16 +294,15 @@ def _check_inside(corners: NDArray[np.int64], window: tuple[int, int], frame_sha
         )
 
 
-def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
-    from scipy.spatial import cKDTree
-
-    # Scaled by the window, two windows overlap when they are closer than 1 along both axes.
-    pairs = cKDTree(corners / np.array(window)).query_pairs(1.0 - 1e-9, p=np.inf, output_type="ndarray")
-    if len(pairs):
-        first, second = pairs[0]
-        raise InputError(
-            f"layout: sub-apertures {first} and {second} overlap; choose smaller windows than {window}"
-        )
+def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int], frame_shape: tuple[int, int]) -> None:
+    owner = np.full(frame_shape, -1)
+    for index, (row, column) in enumerate(corners):
+        part = owner[row : row + window[0], column : column + window[1]]
+        if part.max() >= 0:
+            raise InputError(
+                f"layout: sub-apertures {part.max()} and {index} overlap; use smaller windows than {window}"
+            )
+        part[:] = index
 
 
 def _shift_inside(centres: NDArray[np.float64], side: int, length: int) -> NDArray[np.float64]:

@@ -98,7 +98,7 @@ class Settings:
         if len(set(lengths.values())) > 1:
             sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise InputError(f"settings: expected arrays of one length, got {sizes}")
-        if self.noise_std is None and (self.denoise is True or _is_array(self.denoise)):
+        if _lacks_strength(self.noise_std, self.denoise):
             raise InputError("noise_std: expected a number (electrons), got none; or set denoise = false")
 
     def __eq__(self, other: object) -> bool:
@@ -192,11 +192,30 @@ def _same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
+def _lacks_strength(noise_std: Any, denoise: Any) -> bool:
+    """Whether some sub-aperture is to be denoised but has no strength."""
+    if _is_array(noise_std):
+        return False
+    places: set[int] = {-1}  # in a PerSubaperture, all that are not named
+    if _is_array(denoise):
+        places = set(range(len(denoise)))
+    for value in (noise_std, denoise):
+        if isinstance(value, PerSubaperture) and not _is_array(denoise):
+            places |= set(value.others)
+
+    def at(value: Any, place: int) -> Any:
+        return value[place] if _is_array(value) or isinstance(value, PerSubaperture) else value
+
+    return any(at(noise_std, place) is None and at(denoise, place) for place in places)
+
+
 def _indices(where: Any) -> NDArray[np.int64]:
     """Sub-aperture numbers from an int, a sequence of int or a boolean mask."""
     array = np.atleast_1d(np.asarray(where))
     if array.dtype == np.bool_:
         array = np.flatnonzero(array)
+    if array.size == 0:
+        return np.empty(0, np.int64)
     return numbers_between("where", array, 0, integer=True).astype(np.int64)
 
 
@@ -224,6 +243,8 @@ def _plain(value: Any) -> Any:
 def _checked(name: str, value: Any) -> Any:
     """Check one setting, whatever its form; scalars become plain Python values, sequences arrays."""
     if isinstance(value, PerSubaperture):
+        if None in value.others.values():
+            raise InputError(f"{name}: expected a value for each sub-aperture that is named, got none")
         default = _checked(name, value.default)
         others = {int(index): _checked(name, item) for index, item in value.others.items()}
         return PerSubaperture(default, MappingProxyType(others))
