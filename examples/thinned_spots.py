@@ -86,9 +86,7 @@ def main() -> None:
     bright = [stack.mean(axis=0) for stack in full]
     total = float(layout.images(bright[len(bright) // 2]).sum(axis=(1, 2)).mean())
     print(f"{len(layout)} sub-apertures of {layout.window}, {total:.0f} e- each, dark {dark:.1f} ADU")
-    print(
-        f"{'e-':>5} {'read':>5} {'mode':>11} {'no TV':>16} {'TV':>16} {'difference':>17} {'k':>3} {'k, TV':>5} strength"
-    )
+    print("   e-  read        mode            no TV               TV        difference   k  k, TV  strength")
     rng = np.random.default_rng(2015)
     for flux in FLUXES_E:
         thinned = [rng.binomial(np.rint(stack).astype(np.int64), flux / total) for stack in full]
@@ -107,11 +105,11 @@ def main() -> None:
                 ]
                 (without, r0), (with_tv, r1) = (best(c, layout, frames, bright) for c in (plain, tv))
                 n = np.sqrt(r0.size)
-                print(
-                    f"{flux:5d} {read_noise:5.1f} {mode:>11} {r0.mean():7.4f} ± {r0.std() / n:.4f} "
-                    f"{r1.mean():7.4f} ± {r1.std() / n:.4f} {(r0 - r1).mean():+8.4f} ± {(r0 - r1).std() / n:.4f} "
-                    f"{without.keep_brightest:3d} {with_tv.keep_brightest:5d} {with_tv.noise_std:.2f}"
+                numbers = "  ".join(f"{r.mean():7.4f} ± {r.std() / n:.4f}" for r in (r0, r1, r0 - r1))
+                chosen = (
+                    f"{without.keep_brightest:3d}    {with_tv.keep_brightest:3d}      {with_tv.noise_std:.2f}"
                 )
+                print(f"{flux:5d}  {read_noise:4.1f} {mode:>11}  {numbers} {chosen}")
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def image_stack(name: str, value: Any) -> NDArray[np.floating[Any]]:
     float32 and float16 become float32; everything else float64.
     """
     array = finite_array(name, value, minimum_dimensions=2)
-    dtype = np.float32 if array.dtype in (np.float32, np.float16) else np.float64
+    dtype = np.float32 if array.dtype.kind == "f" and array.dtype.itemsize <= 4 else np.float64
     limit = LARGEST_FLOAT32 if dtype == np.float32 else LARGEST_FLOAT64
     largest = float(np.max(np.abs(array)))
     if largest > limit:

@@ -11,7 +11,9 @@ class SubapertureFlag(IntFlag):
     NO_LIGHT = 1
     """Nothing usable is left after the background subtraction; the slope is that of the reference (0)."""
     TOO_MANY_BAD_PIXELS = 2
-    """More bad pixels than the settings allow; the slope is that of the reference (0)."""
+    """More bad pixels than the settings allow; the slope is that of the reference (0).
+
+    No further reason is given then."""
     BAD_PIXELS = 4
     """Some pixels were bad (masked, NaN or infinite) and were filled from their neighbours."""
     SATURATED = 8

@@ -124,7 +124,7 @@ class SlopePipeline:
 
     def fingerprint(self) -> bytes:
         """Return bytes that differ between pipelines that could give different slopes for the same frame."""
-        parts = (self.layout.corners, self._calibration, self._table)
+        parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape), self._table)
         text = f"{self.layout.window} {self.settings.algorithm} {self.calibration.saturation_adu}"
         return b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + text.encode()
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 import faintspot
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
-from faintspot.io.frames import FrameSource, open_frames
+from faintspot.io.frames import FrameSource, open_frames, read_array
+from faintspot.io.locations import split_location
 from faintspot.io.slopes import create_writer
 from faintspot.pipeline import SlopePipeline, Slopes
 from faintspot.sensor import configuration
@@ -54,7 +55,7 @@ def measure_recorded(
     output: str | Path,
     *,
     denoise: bool = True,
-    reference: NDArray[Any] | None = None,
+    reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
     block_frames: int | None = None,
@@ -75,8 +76,8 @@ def measure_recorded(
         .zarr, .fits, .npz or .csv.
     denoise : bool
         False switches the denoising off for all sub-apertures.
-    reference : array, optional
-        Reference positions, as for `SlopePipeline`.
+    reference : array or path, optional
+        Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key".
     key : str, optional
         Which array of the files to read, where they hold several.
     threads : int, optional
@@ -96,14 +97,23 @@ def measure_recorded(
     layout, settings, calibration = configuration.load_all(configuration_file)
     if not denoise:
         settings = settings.replace(denoise=False)
-    pipeline = SlopePipeline(layout, settings, calibration, reference, threads=threads)
+    positions = read_array(reference) if isinstance(reference, str | Path) else reference
+    try:
+        pipeline = SlopePipeline(layout, settings, calibration, positions, threads=threads)
+    except InputError as error:
+        about_reference = positions is not None and str(error).startswith("reference")
+        where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
+        raise InputError(f"{where}: {error}") from None
     with open_frames(frames, key=key) as source:
+        _check_output(output, frames)
         if source.shape != layout.frame_shape:
             raise InputError(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
         attributes = _attributes(pipeline, source, frames, configuration_file, key)
+        if positions is not None:
+            attributes["reference"] = np.asarray(positions).tolist()
         summary = Summary(source.n_frames, len(layout))
         size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
         with create_writer(
@@ -129,10 +139,22 @@ def measure_recorded(
     return summary
 
 
+def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
+    """Refuse to replace the frames by their slopes."""
+    if Path(output).resolve() in [split_location(path)[0].resolve() for path in frames]:
+        raise InputError(f"{output}: expected a name for the slopes, got a file of the frames")
+
+
 def slopes_as_variables(slopes: Slopes) -> dict[str, NDArray[Any]]:
     """Return the slopes of several frames as a file's variables."""
     names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
     return {name: getattr(slopes, name) for name in names}
+
+
+def _version(path: Path) -> str:
+    """What changes when somebody writes to a file of frames between two calls."""
+    status = path.stat()
+    return "" if path.is_dir() else f"{status.st_size} {status.st_mtime_ns}"
 
 
 def _attributes(
@@ -151,6 +173,7 @@ def _attributes(
         text,
         str(key),
         *paths,
+        *(_version(split_location(path)[0]) for path in frames),
         str((source.n_frames, source.shape, source.dtype)),
     ):
         state.update(part.encode() + b"\0")

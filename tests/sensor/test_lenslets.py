@@ -277,7 +277,8 @@ def test_telescope_frames(name: str, geometry: str, pitch_px: float, angle_deg: 
     assert grid.geometry == geometry
     assert grid.pitch_px == pytest.approx(pitch_px, rel=0.002)
     assert grid.angle_deg == pytest.approx(angle_deg, abs=0.2)
-    # Counts that this finder gave and that pictures of the windows bear out; a few dim ones at the pupil's edge may fall either way.
+    # Counts that this finder gave and pictures of the windows bear out; a few dim ones at the pupil's edge
+    # may fall either way.
     assert abs(len(grid.cells) - lit) <= 4
     if geometry == "square":
         assert grid.cells[:, 1].max() == 13

@@ -18,6 +18,10 @@ _COMMANDS = {
 }
 
 
+class _Interrupted(Exception):
+    """Ctrl-C, under a name that click does not print anything for."""
+
+
 class _LazyGroup(click.Group):
     """Imports a command's module only when it is used, so that --help answers at once."""
 
@@ -32,6 +36,13 @@ class _LazyGroup(click.Group):
         module = __import__(f"faintspot.cli.{name}", fromlist=["command"])
         return module.command  # type: ignore[no-any-return]
 
+    def invoke(self, context: click.Context) -> Any:
+        """Run a command."""
+        try:
+            return super().invoke(context)
+        except KeyboardInterrupt:
+            raise _Interrupted from None
+
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands without importing them."""
         with formatter.section("Commands"):
@@ -39,10 +50,13 @@ class _LazyGroup(click.Group):
 
 
 @click.group(
-    cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    cls=_LazyGroup,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="faintspot")
-def group() -> None:
+@click.pass_context
+def group(context: click.Context) -> None:
     """Wavefront slopes from faint Shack-Hartmann spots.
 
     Removes the noise of each sub-aperture image by total-variation minimisation, subtracts the background by
@@ -58,6 +72,8 @@ def group() -> None:
     Without:
       faintspot demo
     """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 def main(arguments: list[str] | None = None) -> Any:
@@ -65,13 +81,18 @@ def main(arguments: list[str] | None = None) -> Any:
     try:
         return group.main(args=arguments, prog_name="faintspot", standalone_mode=False)
     except click.ClickException as error:
-        error.show()
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "faintspot"
+        message = " ".join(error.format_message().split())
+        click.echo(f"faintspot: error: {message} (see {command} --help)", err=True)
         sys.exit(error.exit_code)
     except (InputError, MissingExtraError) as error:
         click.echo(f"faintspot: error: {' '.join(str(error).split())}", err=True)
         sys.exit(2)
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("faintspot: interrupted; the same command goes on where it stopped", err=True)
+    except (click.Abort, _Interrupted):
+        click.echo(
+            "faintspot: interrupted; run the same command again (slopes go on where they stopped)", err=True
+        )
         sys.exit(130)
     except MemoryError:
         click.echo("faintspot: error: not enough memory; try fewer frames at a time (--block)", err=True)

@@ -61,13 +61,18 @@ def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
     """Return the slope errors of both arms and the flux gain as a table."""
     gain = comparison.flux_gain(rng)
     magnitude_error = 2.5 / np.log(10) * gain.standard_error / gain.value
+    saved = (
+        f"denoising saves a factor {gain.value:.2f} ± {gain.standard_error:.2f} of light: "
+        f"{magnitudes(gain.value):.2f} ± {magnitude_error:.2f} mag"
+        if np.isfinite(gain.value)
+        else "no flux that was simulated gives the same error with denoising"
+    )
     table = Table(
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
         pad_edge=False,
         title=f"Slope error R (mean |error| per axis, px), {comparison.mode}",
-        caption=f"At {demonstration.SHOWN_FLUX_E:g} e-, denoising saves a factor {gain.value:.2f} ± "
-        f"{gain.standard_error:.2f} of light: {magnitudes(gain.value):.2f} ± {magnitude_error:.2f} mag",
+        caption=f"At {demonstration.SHOWN_FLUX_E:g} e-, {saved}",
     )
     for heading in ("e-", "R without", "R with TV", "difference", "k", "k, TV", "strength"):
         table.add_column(heading, justify="right", no_wrap=True)

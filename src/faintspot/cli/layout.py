@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,9 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.errors import InputError, MissingExtraError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
-from faintspot.io.frames import open_frames, read_array
+from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
@@ -19,26 +21,42 @@ from faintspot.sensor.layout import GEOMETRIES, Layout
 from faintspot.sensor.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
+_FIRST_FRAMES = 20  # measured for the settings
 
 
 @click.command(short_help="Find the sub-apertures in a frame and write a configuration.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
-@click.option("--output", "-o", default="faintspot.toml", show_default=True, help="Configuration to write.")
+@click.option(
+    "--output",
+    "-o",
+    metavar="TOML",
+    default="faintspot.toml",
+    show_default=True,
+    help="Configuration to write.",
+)
 @click.option(
     "--picture", metavar="PNG", help="Where to draw the frame and the grid. Default: beside the output."
 )
-@click.option("--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", show_default=True)
+@click.option(
+    "--geometry",
+    type=click.Choice(["auto", *GEOMETRIES]),
+    default="auto",
+    show_default=True,
+    help="How the lenslets are packed.",
+)
 @click.option("--pitch", type=float, metavar="PX", help="Distance of neighbouring lenslets, if you know it.")
 @click.option(
     "--pixels", type=int, metavar="N", help="Side of a window. Default: the largest without overlap."
 )
-@click.option("--dark", metavar="FILE", help="Dark frame, as FILE or FILE:ARRAY, or a number of ADU.")
+@click.option("--dark", metavar="FILE|ADU", help="Dark frame, as FILE or FILE:ARRAY, or a number of ADU.")
 @click.option(
-    "--gain", type=float, default=1.0, show_default=True, metavar="E/ADU", help="Electrons per ADU."
+    "--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: 1, frames in electrons."
 )
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option(
-    "--overwrite", is_flag=True, help="Replace the layout and settings of an existing configuration."
+    "--overwrite",
+    is_flag=True,
+    help="Replace the layout and settings of an existing configuration; its calibration stays.",
 )
 def command(
     frames: tuple[str, ...],
@@ -48,7 +66,7 @@ def command(
     pitch: float | None,
     pixels: int | None,
     dark: str | None,
-    gain: float,
+    gain: float | None,
     key: str | None,
     overwrite: bool,
 ) -> None:
@@ -70,44 +88,90 @@ def command(
     if target.exists() and not overwrite:
         raise InputError(f"{output}: exists already; --overwrite replaces its layout and settings")
     with open_frames(frames, key=key) as source:
-        block = source.block(0, min(_MOST_FRAMES, source.n_frames))
-    calibration = Calibration(dark=_dark(dark), gain_e_per_adu=gain)
-    layout = Layout.from_frame(block, geometry=geometry, pitch_px=pitch, pixels=pixels)
-    settings, noise, flux = _first_settings(layout, calibration, block)
+        calibration = _calibration(target, dark, gain)
+        mean = _mean_frame(source, calibration)
+        bad = np.isnan(mean)
+        try:
+            layout = Layout.from_frame(
+                np.where(bad, 0, mean), geometry=geometry, pitch_px=pitch, pixels=pixels, bad_pixels=bad
+            )
+        except InputError as error:
+            text = str(error).replace("pitch_px", "--pitch PX")
+            raise InputError(f"{source.description}: {text}") from None
+        first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
+    settings, noise, flux = _first_settings(layout, calibration, first)
+    drawn = _draw(np.where(bad, np.nanmedian(mean), mean), layout, picture, target)
     for item in (layout, settings, calibration):
         configuration.save(target, item)
-    drawing = picture or str(target.with_suffix(".png"))
-    from faintspot.report import layout_picture
+    for line in _describe(output, layout, settings, noise, flux):
+        click.echo(line)
+    if calibration.gain_e_per_adu == 1.0:
+        click.echo("  one electron per ADU assumed; give --gain if your camera has another")
+    click.echo(f"  {drawn}")
+    arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", "slopes.zarr"]
+    click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
-    layout_picture(np.nanmean(block, axis=0), layout, drawing)
+
+def _describe(output: str, layout: Layout, settings: Settings, noise: float, flux: float) -> list[str]:
+    """Say in a few lines what was found."""
     rows, columns = layout.cells.max(axis=0) + 1
     height, width = layout.window
-    click.echo(
+    lines = [
         f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
-        f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width}"
-    )
-    click.echo(
-        f"  background noise {noise:.2g} e-, median flux {flux:.4g} e-: noise_std {settings.noise_std}"
-    )
+        f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px",
+        f"  background noise {noise:.2g} e-, median flux {flux:.4g} e-: noise_std {settings.noise_std}",
+    ]
     moved = np.abs(np.median(layout.offsets, axis=0))
     if moved.max() > 1:
-        click.echo(
+        lines.append(
             f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px, so that those at the "
             "edge are whole; --pixels makes smaller windows"
         )
-    if gain == 1.0:
-        click.echo("  one electron per ADU assumed; give --gain if your camera has another")
-    click.echo(f"  picture: {drawing}")
-    click.echo(f"Next: faintspot slopes {' '.join(frames)} --config {output} -o slopes.zarr")
+    return lines
 
 
-def _dark(dark: str | None) -> Any:
-    if dark is None:
-        return 0.0
+def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.float64]:
+    """Mean of the first frames in electrons, of what is finite; NaN where nothing is."""
+    total, count = np.zeros(source.shape), np.zeros(source.shape, int)
+    for _, block in source.blocks(0, min(_MOST_FRAMES, source.n_frames), _FIRST_FRAMES):
+        finite = np.isfinite(block)
+        total += np.where(finite, block, 0).sum(axis=0, dtype=np.float64)
+        count += finite.sum(axis=0)
+    if not count.any():
+        raise InputError(f"{source.description}: expected a frame with spots, every pixel is NaN or infinite")
+    dark, electrons_per_adu = calibration.maps(source.shape)
+    mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
+    electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
+    return electrons
+
+
+def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
+    """Draw frame and windows and say where; without matplotlib only a picture that was asked for fails."""
+    from faintspot.report import layout_picture
+
+    path = picture or str(target.with_suffix(".png"))
     try:
-        return float(dark)
-    except ValueError:
-        return read_array(dark)
+        layout_picture(frame, layout, path)
+    except MissingExtraError as error:
+        if picture is not None:
+            raise
+        return f"no picture: {error}"
+    return f"picture: {path}"
+
+
+def _calibration(target: Path, dark: str | None, gain: float | None) -> Calibration:
+    """The calibration that the configuration has already, with what was given now."""
+    calibration: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
+    if gain is not None:
+        calibration = replace(calibration, gain_e_per_adu=gain)
+    if dark is None:
+        return calibration
+    try:
+        return replace(calibration, dark=float(dark))
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        return replace(calibration, dark=read_array(dark))
 
 
 def _first_settings(
@@ -115,7 +179,7 @@ def _first_settings(
 ) -> tuple[Settings, float, float]:
     """Settings to begin with, and the noise (e-) and flux (e-) that they rest on."""
     plain = SlopePipeline(layout, Settings(denoise=False), calibration)
-    stages = plain.explain(frames[: min(len(frames), 20)])
+    stages = plain.explain(frames)
     noise = pixel_noise(stages.calibrated)
     flux = float(np.median(stages.slopes.flux))
     strength = float(suggested_strength(noise, max(flux, 0.0), layout.pixels))

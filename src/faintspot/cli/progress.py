@@ -34,7 +34,11 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on standard error; yields a function to call with finished and total counts."""
+    """Show a bar on standard error; yields a function to call with finished and total counts.
+
+    A bar that never moved leaves no trace, so that an error before the first frame stands alone. Where
+    standard error is not a terminal, the bar is printed once, at its end.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -42,10 +46,19 @@ def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int
         _Rate(unit),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(what, total=None)
+    console = Console(stderr=True)
+    progress = Progress(*columns, console=console, transient=True)
+    task = progress.add_task(what, total=None)
 
-        def advance(finished: int, total: int) -> None:
-            progress.update(task, completed=finished, total=total)
+    def advance(finished: int, total: int) -> None:
+        progress.live.transient = False
+        progress.start()
+        progress.update(task, completed=finished, total=total)
 
+    try:
+        if console.is_interactive:
+            progress.start()
         yield advance
+    finally:
+        if progress.live.is_started:
+            progress.stop()

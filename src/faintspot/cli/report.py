@@ -6,6 +6,9 @@ from pathlib import Path
 
 import click
 
+from faintspot.errors import InputError
+from faintspot.io.locations import split_location
+
 
 @click.command(short_help="Make a web page of pictures and tables from slopes.")
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER_ARM]")
@@ -29,7 +32,16 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
     """
     from faintspot.report import report_of_stored, write_report
 
-    target = output or str(Path(slopes[0]).with_suffix(".html"))
-    html = report_of_stored([Path(path) for path in slopes], frames=[Path(path) for path in frames] or None)
+    paths = [Path(path) for path in slopes]
+    if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
+        raise InputError(f"{output}: expected a name for the page, got the slopes' own")
+    if output is not None and not Path(output).absolute().parent.is_dir():
+        raise InputError(
+            f"{output}: the folder {Path(output).parent} does not exist: create it or choose another"
+        )
+    for name in frames:
+        split_location(name)  # refuses what is not there
+    html = report_of_stored(paths, frames=[Path(path) for path in frames] or None)
+    target = output or str(paths[0].with_suffix(".html"))
     write_report(target, html)
     click.echo(f"{target}: open it in a browser")

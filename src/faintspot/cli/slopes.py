@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
 
 from faintspot.cli.progress import progress_bar
 from faintspot.flags import SubapertureFlag
-from faintspot.io.frames import read_array
 from faintspot.recorded import Summary, measure_recorded
 
 
 @click.command(short_help="Turn recorded frames into slopes.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
 @click.option(
-    "--config", "-c", default="faintspot.toml", show_default=True, help="Layout, settings, calibration."
+    "--config",
+    "-c",
+    metavar="TOML",
+    default="faintspot.toml",
+    show_default=True,
+    help="Layout, settings, calibration.",
 )
-@click.option("--output", "-o", default="slopes.zarr", show_default=True, help=".zarr, .fits, .npz or .csv.")
+@click.option(
+    "--output",
+    "-o",
+    metavar="FILE",
+    default="slopes.zarr",
+    show_default=True,
+    help="What to write, by its ending: .zarr, .fits, .fits.gz, .npz or .csv.",
+)
 @click.option("--no-denoise", is_flag=True, help="Switch the denoising off: the other arm of a comparison.")
 @click.option("--reference", metavar="FILE", help="Reference positions, (n, 2) px, as FILE or FILE:ARRAY.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
@@ -52,14 +64,13 @@ def command(
       faintspot slopes night1.fits -o plain.zarr --no-denoise
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
-    positions = None if reference is None else read_array(reference)
     with progress_bar("slopes") as advance:
         summary = measure_recorded(
             frames,
             config,
             output,
             denoise=not no_denoise,
-            reference=positions,
+            reference=reference,
             key=key,
             threads=threads,
             block_frames=block,
@@ -73,24 +84,40 @@ def command(
 def describe(summary: Summary, output: str) -> list[str]:
     """Say in a few lines what the run found and what to do next."""
     if summary.resumed_at == summary.n_frames:
-        return [f"{output}: complete already ({summary.n_frames} frames); --overwrite makes it anew"]
-    lines = [f"{output}: {summary.n_frames} frames, {summary.n_subapertures} sub-apertures"]
+        return [
+            f"{output}: complete already ({_count(summary.n_frames, 'frame')}); --overwrite makes it anew",
+            *_next_step(output),
+        ]
+    lines = [
+        f"{output}: {_count(summary.n_frames, 'frame')}, {_count(summary.n_subapertures, 'sub-aperture')}"
+    ]
     if summary.resumed_at:
-        lines[0] += f" (went on at frame {summary.resumed_at})"
+        lines.append(
+            f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
+        )
     texts = {
-        SubapertureFlag.NO_LIGHT: "slopes without light",
-        SubapertureFlag.TOO_MANY_BAD_PIXELS: "slopes with too many bad pixels",
-        SubapertureFlag.BAD_PIXELS: "slopes with a few bad pixels, filled from their neighbours",
-        SubapertureFlag.SATURATED: "slopes with saturated pixels",
-        SubapertureFlag.INFEASIBLE_STRENGTH: "slopes whose strength (noise_std) is above the image's own rms",
-        SubapertureFlag.NOT_CONVERGED: "slopes at the iteration limit (max_iterations)",
+        SubapertureFlag.NO_LIGHT: "without light",
+        SubapertureFlag.TOO_MANY_BAD_PIXELS: "with too many bad pixels",
+        SubapertureFlag.BAD_PIXELS: "with a few bad pixels, filled from their neighbours",
+        SubapertureFlag.SATURATED: "with saturated pixels",
+        SubapertureFlag.INFEASIBLE_STRENGTH: "whose strength (noise_std) is above the image's own rms",
+        SubapertureFlag.NOT_CONVERGED: "at the iteration limit (max_iterations)",
     }
     for flag, text in texts.items():
         count = summary.flag_counts.get(flag, 0)
         if count:
-            lines.append(f"  {count} {text} ({100 * count / summary.measured:.2g} %)")
+            lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
+    if not any(summary.flag_counts.values()):
+        lines.append("  every slope is valid, without any flag")
     if summary.bad_frames:
-        lines.append(f"  {summary.bad_frames} frames without any valid slope")
-    if Path(output).suffix != ".csv":
-        lines.append(f"Next: faintspot report {output}")
-    return lines
+        lines.append(f"  {_count(summary.bad_frames, 'frame')} without any valid slope")
+    return lines + _next_step(output)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _next_step(output: str) -> list[str]:
+    """What to type next; a .csv does not hold what a report needs."""
+    return [] if Path(output).suffix.lower() == ".csv" else [f"Next: faintspot report {shlex.quote(output)}"]

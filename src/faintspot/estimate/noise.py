@@ -46,14 +46,17 @@ def suggested_strength(
 
 
 def pixel_noise(images: ArrayLike) -> float:
-    """Estimate the standard deviation of the background's noise from images of spots.
+    """Estimate the standard deviation of the noise of pixels far from the spots.
 
-    The median absolute difference of neighbours along the rows of the images' outermost two rows, where
-    spots are faintest, as a normal distribution's standard deviation. Light there makes it too large.
+    Looks at the first and last row of every image, where spots are faintest. With several frames of the same
+    sub-apertures, the median absolute difference of a pixel in successive frames; with one, that of
+    neighbours in a row, which light from a spot's wings makes too large. Both as a normal distribution's
+    standard deviation.
 
     Parameters
     ----------
     images : (..., ny, nx) array
+        With four dimensions, the first one counts frames.
 
     Returns
     -------
@@ -69,5 +72,6 @@ def pixel_noise(images: ArrayLike) -> float:
     if stack.shape[-1] < 2:
         raise InputError(f"images: expected at least 2 columns, got shape {stack.shape}")
     edges = stack[..., [0, -1], :].astype(np.float64)
-    differences = np.diff(edges, axis=-1)
+    several_frames = edges.ndim == 4 and len(edges) > 1
+    differences = np.diff(edges, axis=0 if several_frames else -1)
     return float(_MAD_TO_STD * np.median(np.abs(differences - np.median(differences))) / np.sqrt(2.0))

@@ -148,7 +148,7 @@ def prepare_store(path: Path, run: Run, *, resume: bool, overwrite: bool) -> Non
 def read_store(path: Path) -> StoredSlopes:
     """Read the finished frames of a Zarr store of slopes."""
     if not is_store(path):
-        raise InputError(f"{path}: expected a Zarr store of slopes, this directory is none")
+        raise InputError(f"{path}: expected slopes, this directory is not a Zarr store")
     attributes = _stored_attributes(path)
     finished, complete = int(attributes.pop(_COUNTER)), bool(attributes.pop(_COMPLETE))
     coordinates = attributes.pop(_COORDINATES, "").split()

@@ -39,7 +39,7 @@ def find_zarr(path: Path, key: str | None) -> StoredArray:
         When zarr is not installed.
     """
     if not is_store(path):
-        raise InputError(f"{path}: expected a Zarr store, this directory is none")
+        raise InputError(f"{path}: expected a Zarr store or a file of frames, this directory is neither")
     try:
         node: Any = zarr.open(str(path), mode="r", path=key or "")
         if isinstance(node, zarr.Group):

@@ -156,15 +156,16 @@ def _store_slope(
     total = numbers[centroid + brightest.SUM * width]
     position_x, position_y = numbers[centroid + brightest.X * width], numbers[centroid + brightest.Y * width]
     bits = flags[lane]
-    if counts[total_variation.INFEASIBLE * width + lane]:
-        bits |= INFEASIBLE_STRENGTH
-    if not counts[total_variation.CONVERGED * width + lane]:
-        bits |= NOT_CONVERGED
     # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
     lit = total > settings[FLOOR, s] * numbers[centroid + brightest.LARGEST * width]
     inside = abs(position_x) <= 0.5 * nx and abs(position_y) <= 0.5 * ny
-    if not (lit and inside):
-        bits |= NO_LIGHT
+    if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
+        if counts[total_variation.INFEASIBLE * width + lane]:
+            bits |= INFEASIBLE_STRENGTH
+        if not counts[total_variation.CONVERGED * width + lane]:
+            bits |= NOT_CONVERGED
+        if not (lit and inside):
+            bits |= NO_LIGHT
     valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
     x[f, s] = position_x - settings[ZERO_X, s] if valid else 0.0
     y[f, s] = position_y - settings[ZERO_Y, s] if valid else 0.0

@@ -356,7 +356,7 @@ def _mark_finished(width: Any, iteration: Any, measured: Any, numbers: Any, coun
             continue
         tolerance = numbers[TOLERANCE * width + lane]
         bound = tolerance * tolerance * numbers[SIZE * width + lane]
-        converged = measured and numbers[CHANGE * width + lane] <= bound
+        converged = measured and tolerance > 0.0 and numbers[CHANGE * width + lane] <= bound
         if converged or iteration >= counts[LIMIT * width + lane]:
             counts[CONVERGED * width + lane] = 1 if converged else 0
             counts[ITERATIONS * width + lane] = iteration

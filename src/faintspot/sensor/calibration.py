@@ -113,13 +113,12 @@ class Calibration:
         maps = np.empty((2, *frame_shape), np.float32)
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
             maps[0] = self.dark
-        gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
-        if self.flat is not None:
-            usable = np.isfinite(self.flat) & (self.flat > 0)
-            gain = np.divide(gain, self.flat, where=usable, out=np.full(frame_shape, np.nan))
-        if self.bad_pixels is not None:
-            gain[self._bad_mask(frame_shape)] = np.nan
-        with np.errstate(over="ignore"):
+            gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
+            if self.flat is not None:
+                usable = np.isfinite(self.flat) & (self.flat > 0)
+                gain = np.divide(gain, self.flat, where=usable, out=np.full(frame_shape, np.nan))
+            if self.bad_pixels is not None:
+                gain[self._bad_mask(frame_shape)] = np.nan
             maps[1] = gain
         return maps
 

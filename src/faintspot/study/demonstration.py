@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.checks import number_between
 from faintspot.estimate.noise import suggested_strength
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
@@ -93,7 +94,13 @@ def compare(
     """Measure R with and without denoising at all fluxes, in both modes.
 
     Number of kept pixels and strength are chosen on the first half of the frames and scored on the other.
+
+    Raises
+    ------
+    InputError
+        For fewer than two frames.
     """
+    n_frames = int(number_between("n_frames", n_frames, 2, integer=True))
     layout = demonstration_layout()
     comparisons = [Comparison("best k", [], []), Comparison(f"fixed k = {FIXED_KEPT}", [], [])]
     for i, flux in enumerate(FLUXES_E):

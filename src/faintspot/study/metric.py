@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, numbers_between
+from faintspot.checks import finite_array, number_between, numbers_between
 from faintspot.errors import InputError
 
 _RESAMPLES = 500
@@ -60,26 +60,48 @@ def flux_gain(
     flux_e : (n,) array
         Increasing.
     errors_plain, errors_method : (n,) arrays
-        R at these fluxes; made monotonic first, as noise can make a curve rise.
+        R at these fluxes, above 0; made monotonic first, as noise can make a curve rise.
     at_flux_e : float
-        Flux of the plain method to compare with.
+        Flux of the plain method to compare with, within the range of `flux_e`.
 
     Returns
     -------
     float
         Flux ratio, above 1 where the method needs less light; NaN where the method's curve does not reach
         that error.
+
+    Raises
+    ------
+    InputError
+        For fluxes that do not increase, an error that is not above 0, or a flux out of range.
     """
     from scipy.interpolate import PchipInterpolator
+    from scipy.optimize import brentq
 
-    log_flux = np.log(numbers_between("flux_e", flux_e, 0.0, low_open=True))
-    plain, method = (np.minimum.accumulate(np.log(np.asarray(e))) for e in (errors_plain, errors_method))
+    flux = numbers_between("flux_e", flux_e, 0.0, low_open=True)
+    if flux.ndim != 1 or len(flux) < 2 or np.any(np.diff(flux) <= 0):
+        raise InputError(f"flux_e: expected at least two increasing numbers, got {flux.tolist()}")
+    at_flux_e = number_between("at_flux_e", at_flux_e, flux[0], flux[-1])
+    log_flux = np.log(flux)
+    plain = _falling_log("errors_plain", errors_plain, len(flux))
+    method = _falling_log("errors_method", errors_method, len(flux))
     wanted = float(PchipInterpolator(log_flux, plain)(np.log(at_flux_e)))
-    # The inverse needs strictly increasing abscissae; a step of 1e-12 is far below any error of R.
-    falling = -method + 1e-12 * np.arange(len(method))
-    if not falling[0] <= -wanted <= falling[-1]:
+    curve = PchipInterpolator(log_flux, method)
+    highest, lowest = curve(log_flux[[0, -1]])
+    if not lowest <= wanted <= highest:
         return float("nan")
-    return float(at_flux_e / np.exp(PchipInterpolator(falling, log_flux)(-wanted)))
+    # The curve itself is inverted: interpolating log flux against log R would give equal curves a gain.
+    found = brentq(lambda position: float(curve(position)) - wanted, log_flux[0], log_flux[-1])
+    return float(at_flux_e / np.exp(found))
+
+
+def _falling_log(name: str, errors: ArrayLike, n: int) -> NDArray[np.float64]:
+    """Logarithm of a curve of errors, made to fall: where it would not, by 1e-9, far below any error of R."""
+    array = numbers_between(name, errors, 0.0, low_open=True)
+    if array.shape != (n,):
+        raise InputError(f"{name}: expected shape ({n},), got {array.shape}")
+    falling: NDArray[np.float64] = np.minimum.accumulate(np.log(array)) - 1e-9 * np.arange(n)
+    return falling
 
 
 def flux_gain_with_error(
@@ -99,7 +121,22 @@ def flux_gain_with_error(
         what both share does not count.
     at_flux_e : float
     rng : numpy.random.Generator, optional
+
+    Returns
+    -------
+    Estimate
+        NaN, as `flux_gain`, where the error is not reached; resamples that do not reach it do not count.
+
+    Raises
+    ------
+    InputError
+        When the arrays do not have the same shape, and as `flux_gain`.
     """
+    if np.ndim(errors_plain) != 2 or np.shape(errors_plain) != np.shape(errors_method):
+        raise InputError(
+            f"errors_plain, errors_method: expected two arrays of one shape (n, m), got "
+            f"{np.shape(errors_plain)} and {np.shape(errors_method)}"
+        )
     rng = np.random.default_rng() if rng is None else rng
     value = flux_gain(flux_e, errors_plain.mean(axis=1), errors_method.mean(axis=1), at_flux_e)
     n, m = errors_plain.shape

@@ -1,0 +1,21 @@
+"""Fixtures for the tests of the commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.cli.cli_cases import CONFIGURATION, Commands
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Commands:
+    return Commands(capsys)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty working directory with a configuration."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
+    return tmp_path

@@ -1,0 +1,60 @@
+"""faintspot demo: it runs, again too, and what it leaves is what the other commands would make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.cli.cli_cases import Commands
+
+from faintspot import SlopePipeline
+from faintspot.cli.demo import comparison_table
+from faintspot.io import read_slopes
+from faintspot.sensor.settings import Settings
+from faintspot.study.demonstration import FLUXES_E, Arm, Comparison
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+FILES = {"frames.npy", "truth.npy", "tv.toml", "tv.npz", "no-tv.toml", "no-tv.npz", "report.html"}
+
+
+def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)
+    made = folder / "new" / "demo"
+    assert {path.name for path in made.iterdir()} == FILES
+    for text in ("best k", "fixed k = 40", "R without", "R with TV", "480", "of light", "report.html"):
+        assert text in first.out
+    assert max(map(len, first.out.splitlines())) <= 100
+    assert "40/40" in first.err
+    frames, truth = np.load(made / "frames.npy"), np.load(made / "truth.npy")
+    assert frames.shape == (40, 112, 112)
+    assert truth.shape == (40, 36, 2)
+    for arm in ("tv", "no-tv"):
+        stored = read_slopes(made / f"{arm}.npz").variables
+        np.testing.assert_array_equal(stored["x"], SlopePipeline.from_file(made / f"{arm}.toml")(frames).x)
+    assert (made / "report.html").stat().st_size > 100_000
+    # The page was made once, and takes longest: the second one only has to replace it.
+    monkeypatch.setattr("faintspot.report.slopes_report", lambda *arguments, **options: "second")
+    second = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)
+    assert second.out == first.out
+    assert {path.name for path in made.iterdir()} == FILES
+    np.testing.assert_array_equal(np.load(made / "frames.npy"), frames)
+    assert (made / "report.html").read_text(encoding="utf-8") == "second"
+
+
+def test_bad_options(folder: Path, run: Commands) -> None:
+    run.refused("demo", "--frames", 5, naming=("--frames", "5"))
+    run.refused("demo", "--seed", -1, naming=("--seed", "-1"))
+    run.refused("demo", "-o", "faintspot.toml", naming=("faintspot.toml", "folder"))
+    assert [path.name for path in folder.iterdir()] == ["faintspot.toml"]
+
+
+def test_a_gain_that_is_not_reached_is_said_in_words() -> None:
+    def arms(error: float) -> list[Arm]:
+        return [Arm(Settings(noise_std=1.0), np.full(20, error / flux)) for flux in FLUXES_E]
+
+    table = comparison_table(Comparison("best k", arms(1.0), arms(1e3)), np.random.default_rng(1))
+    assert "nan" not in str(table.caption)
+    assert "no flux" in str(table.caption)

@@ -1,0 +1,186 @@
+"""faintspot layout: from a frame to a configuration that faintspot slopes accepts, and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.cli.cli_cases import Commands
+from tests.shared_data import shared_file
+
+from faintspot import Calibration, Layout, Settings
+from faintspot.io import read_slopes
+from faintspot.simulate import Detector, sensor_frames
+
+pytest.importorskip("matplotlib")
+
+SHAPE = (150, 160)
+OFFSET_ADU = 100.0
+
+
+def lattice(geometry: str) -> NDArray[np.float64]:
+    """Return x, y of 7 x 7 spots, 20 px apart, within SHAPE."""
+    rows, columns = (axis.ravel() for axis in np.mgrid[:7, :7])
+    if geometry == "square":
+        return np.stack([18.3 + 20 * columns, 14.6 + 20 * rows], axis=1)
+    return np.stack([13.3 + 20 * columns + 10 * (rows % 2), 22.6 + 20 * np.sqrt(0.75) * rows], axis=1)
+
+
+def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
+    """Frames with spots of 2000 e- near the lattice points, 3 e- of read noise, an offset of 100 ADU."""
+    points = lattice(geometry)
+    corners = np.floor(points[:, ::-1]).astype(int) - 7
+    wanted = points - (corners[:, ::-1] + 7.5)
+    simulated, _ = sensor_frames(
+        corners,
+        (16, 16),
+        SHAPE,
+        n_frames,
+        flux_e=2000.0,
+        positions=np.tile(wanted, (n_frames, 1, 1)),
+        detector=Detector(3.0, offset_adu=OFFSET_ADU, bits=16),
+        rng=np.random.default_rng(1),
+    )
+    return np.asarray(simulated)
+
+
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw nothing, which takes most of a second, where the picture is not what is tested."""
+    monkeypatch.setattr("faintspot.report.layout_picture", lambda frame, layout, path: None)
+
+
+def is_png(path: Path) -> bool:
+    content = path.read_bytes()
+    return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
+
+
+@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
+    """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
+    np.save("a.npy", frames(geometry))
+    result = run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--pixels", 16)
+    assert result.err == ""
+    layout = Layout.load("new.toml")
+    assert layout.geometry == geometry
+    assert len(layout) == 49
+    assert layout.pitch_px == pytest.approx(20.0, abs=0.1)
+    distances = np.hypot(*(layout.centres[:, None] - lattice(geometry)[None]).transpose(2, 0, 1))
+    assert np.sort(distances.min(axis=1))[-1] < 0.2
+    assert is_png(folder / "new.png")
+    *_, picture, following = result.out.splitlines()
+    assert picture == "  picture: new.png"
+    assert following == "Next: faintspot slopes a.npy --config new.toml -o slopes.zarr"
+    run.ok(*following.removeprefix("Next: faintspot ").split())
+    stored = read_slopes("slopes.zarr")
+    assert stored.variables["valid"].all()
+    # Brightest pixels of 2000 e- at 3 e-: far below 0.2 px a slope.
+    assert np.abs(stored.variables["x"]).mean() < 0.2
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_first_settings_are_those_of_the_noise(folder: Path, run: Commands) -> None:
+    """Median differences of 3 x 49 x 32 pixels: within 10 %, photon noise at the window's edge included."""
+    np.save("a.npy", frames())
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain", "2", "--pixels", 16)
+    assert Settings.load("new.toml").noise_std == pytest.approx(2 * 3.0, rel=0.15)
+    assert Calibration.load("new.toml") == Calibration(dark=100.0, gain_e_per_adu=2.0)
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_dark_file(folder: Path, run: Commands) -> None:
+    dark = np.random.default_rng(2).uniform(50, 150, SHAPE)
+    np.save("a.npy", frames().astype(np.float32) - OFFSET_ADU + dark)
+    np.savez("d.npz", dark=dark, other=np.ones((3, 3)))
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "d.npz:dark", "--pixels", 16)
+    assert len(Layout.load("new.toml")) == 49
+    np.testing.assert_allclose(Calibration.load("new.toml").dark, dark)
+    run.ok("slopes", "a.npy", "-c", "new.toml")
+    arguments = ("layout", "a.npy", "-o", "other.toml", "--dark")
+    run.refused(*arguments, "nix.fits", naming=("nix.fits", "no such file"))
+    run.refused(*arguments, "nan", naming=("dark", "finite"))
+    run.refused(*arguments, "d.npz:other", naming=("dark", "(150, 160)", "(3, 3)"))
+    assert not (folder / "other.toml").exists()
+
+
+def test_options(folder: Path, run: Commands) -> None:
+    np.savez("a b.npz", night=frames(), day=frames())
+    result = run.ok(
+        *("layout", "a b.npz", "--key", "night", "-o", "new.toml", "--picture", "p.png"),
+        *("--pitch", "20.5", "--pixels", "12", "--geometry", "square"),
+    )
+    assert Layout.load("new.toml").window == (12, 12)
+    assert is_png(folder / "p.png")
+    assert not (folder / "new.png").exists()
+    assert "slopes 'a b.npz' --key night --config" in result.out
+    for option, value in (("--pixels", "3"), ("--pitch", "-1"), ("--gain", "0"), ("--gain", "nan")):
+        result = run.refused("layout", "a b.npz", "--key", "night", "-o", "o.toml", option, value)
+        assert option.removeprefix("--") in result.error
+    assert not (folder / "o.toml").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_exists_already_and_overwrite_keeps_the_calibration(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain", "2")
+    before = (folder / "new.toml").read_bytes()
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("new.toml", "exists already", "--overwrite"))
+    assert (folder / "new.toml").read_bytes() == before
+    run.ok("layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixels", "10", "--dark", "90")
+    assert Layout.load("new.toml").window == (10, 10)
+    assert Calibration.load("new.toml") == Calibration(dark=90.0, gain_e_per_adu=2.0)
+
+
+def test_pure_noise(folder: Path, run: Commands) -> None:
+    np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch"))
+    np.save("b.npy", np.full((3, 128, 128), np.nan))
+    run.refused("layout", "b.npy", "-o", "new.toml", naming=("b.npy", "every pixel is NaN"))
+    np.save("c.npy", np.ones((128, 128)))
+    run.refused("layout", "c.npy", "-o", "new.toml", naming=("c.npy",))
+    assert not list(folder.glob("new*"))
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_nan_pixels_and_frames_do_not_count(folder: Path, run: Commands) -> None:
+    cube = frames().astype(np.float32)
+    cube[0] = np.nan
+    cube[:, 30, 40] = np.inf
+    np.save("a.npy", cube)
+    assert run.ok("layout", "a.npy", "-o", "new.toml", "--pixels", 16).err == ""
+    assert len(Layout.load("new.toml")) == 49
+
+
+def test_places_that_cannot_be_written(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    run.refused("layout", "a.npy", "-o", "nix/new.toml", naming=("nix/new",))
+    run.refused("layout", "a.npy", "-o", "new.toml", "--picture", "nix/p.png", naming=("nix/p.png",))
+    assert not (folder / "new.toml").exists()
+    run.refused("layout", "nix.fits", "-o", "new.toml", naming=("nix.fits", "no such file"))
+
+
+@pytest.mark.parametrize(
+    ("name", "geometry", "shape", "lowest", "highest"),
+    [
+        ("data/ciao_bench_60x224x224.npz", "square", (8, 8), 64, 64),
+        ("data/auto_wfs_0037_ave.fits.gz", "square", (14, 14), 144, 152),
+        ("data/mmirs_wfs_0150.fits.gz", "square", (14, 14), 150, 158),
+        ("data/test_newf9.fits.gz", "hexagonal", None, 141, 149),
+    ],
+)
+def test_real_frames(
+    folder: Path, run: Commands, name: str, geometry: str, shape: Any, lowest: int, highest: int
+) -> None:
+    result = run.ok("layout", shared_file(name), "-o", "real.toml")
+    layout = Layout.load("real.toml")
+    assert layout.geometry == geometry
+    assert lowest <= len(layout) <= highest
+    if shape is not None:
+        assert np.all(np.abs(layout.cells.max(axis=0) + 1 - shape) <= (0 if len(layout) == 64 else 1))
+    assert is_png(folder / "real.png")
+    run.ok("slopes", shared_file(name), "-c", "real.toml", "-o", "s.npz")
+    assert read_slopes("s.npz").variables["valid"].mean() > 0.95
+    assert "Next: " in result.out

@@ -1,0 +1,104 @@
+"""The command line as a whole: help, version, what is unknown, and how quickly it answers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tests.cli.cli_cases import Commands, command_line
+
+import faintspot
+
+COMMANDS = ("demo", "layout", "report", "slopes")
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+@pytest.mark.parametrize("columns", ["40", "80", "200"])
+def test_help(run: Commands, command: str, columns: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    text = run.ok(*([command] if command else []), "--help").out
+    assert max(map(len, text.splitlines())) <= 100
+    assert all(character.isprintable() or character == "\n" for character in text)
+    assert text.count(f"  faintspot {command}".rstrip() + " ") >= 1
+    assert command == "" or "Example" in text
+    assert text == run.ok(*([command] if command else []), "-h").out
+
+
+def test_help_lists_every_command(run: Commands) -> None:
+    text = run.ok("--help").out
+    for command in COMMANDS:
+        assert f"\n  {command} " in text
+    assert run.ok().out == text
+
+
+def test_every_option_says_what_it_is_for(run: Commands) -> None:
+    for command in COMMANDS:
+        module = __import__(f"faintspot.cli.{command}", fromlist=["command"])
+        for parameter in module.command.params:
+            assert parameter.param_type_name == "argument" or parameter.help, parameter.name
+
+
+def test_version(run: Commands) -> None:
+    assert run.ok("--version").out == f"faintspot, version {faintspot.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "naming"),
+    [
+        (["nix"], ("nix", "faintspot --help")),
+        (["--nix"], ("--nix", "faintspot --help")),
+        (["layout", "a.fits", "--nix"], ("--nix", "faintspot layout --help")),
+        (["layout", "a.fits", "--geometry", "round"], ("--geometry", "round", "hexagonal")),
+        (["report"], ("SLOPES", "faintspot report --help")),
+    ],
+)
+def test_what_is_unknown(run: Commands, arguments: list[str], naming: tuple[str, ...]) -> None:
+    run.refused(*arguments, naming=naming)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (MemoryError(), 2, "faintspot: error: not enough memory"),
+        (KeyboardInterrupt(), 130, "faintspot: interrupted"),
+    ],
+)
+def test_what_ends_a_command(
+    folder: Path, run: Commands, error: BaseException, code: int, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import faintspot.cli.slopes as module
+
+    def fail(*arguments: object, **options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(module, "measure_recorded", fail)
+    result = run("slopes", "a.npy")
+    assert result.code == code
+    assert result.error.startswith(text)
+
+
+def test_module_runs() -> None:
+    process = command_line("--version")
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, f"faintspot, version {faintspot.__version__}\n", "")
+
+
+def test_errors_of_a_process_of_its_own(tmp_path: Path) -> None:
+    process = command_line("slopes", "nix.fits", cwd=tmp_path)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("faintspot: error: faintspot.toml: no such file; `faintspot layout")
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """Help answers at once because nothing slow is imported, which is tested rather than its time."""
+    code = (
+        "import sys; from faintspot.cli import main; main(['--help']);"
+        "print(sorted({'numba', 'scipy', 'astropy', 'zarr', 'matplotlib', 'jinja2'} & set(sys.modules)))"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.splitlines()[-1] == "[]"

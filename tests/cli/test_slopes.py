@@ -1,0 +1,186 @@
+"""faintspot slopes: every format in and out, equal to the pipeline, exact options, clean output."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.cli.cli_cases import LAYOUT, SETTINGS, Commands, assert_equal, expected, simulated
+
+from faintspot import SlopePipeline, SubapertureFlag
+from faintspot.io import read_slopes
+
+fits = pytest.importorskip("astropy.io.fits")
+zarr = pytest.importorskip("zarr")
+
+
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz", "a.npy", "a.npz", "a.zarr"])
+def test_formats_in(folder: Path, run: Commands, name: str) -> None:
+    frames = simulated()
+    if "fits" in name:
+        fits.PrimaryHDU(frames).writeto(folder / name)
+    elif name.endswith("zarr"):
+        zarr.create_array(str(folder / name), data=frames, chunks=(7, 32, 32))
+    else:
+        (np.save if name.endswith("npy") else np.savez)(folder / name, frames)
+    result = run.ok("slopes", name)
+    assert_equal(folder / "slopes.zarr", expected(frames))
+    assert result.out.splitlines()[0] == "slopes.zarr: 30 frames, 16 sub-apertures"
+    assert result.out.splitlines()[-1] == "Next: faintspot report slopes.zarr"
+
+
+@pytest.mark.parametrize("name", ["s.zarr", "s.fits", "s.fits.gz", "s.npz", "s.csv", "with space.npz"])
+def test_formats_out(folder: Path, run: Commands, name: str) -> None:
+    frames = simulated()
+    np.save("a.npy", frames)
+    result = run.ok("slopes", "a.npy", "-o", name)
+    assert_equal(folder / name, expected(frames))
+    last = result.out.splitlines()[-1]
+    quoted = f"'{name}'" if " " in name else name
+    assert last == f"Next: faintspot report {quoted}" or (name == "s.csv" and "Next" not in result.out)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(["a.npy", "faintspot.toml", name])
+
+
+def test_several_files_in_the_order_given(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    np.save("b.npy", frames[:7])
+    fits.PrimaryHDU(frames[7]).writeto(folder / "single.fits")
+    np.savez_compressed("a.npz", frames=frames[8:])
+    run.ok("slopes", "b.npy", "single.fits", "a.npz", "-o", "s.npz")
+    assert_equal(folder / "s.npz", expected(frames))
+
+
+def test_key(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    np.savez("a.npz", night=frames, dark=frames[:3])
+    run.refused("slopes", "a.npz", naming=("a.npz", "night, dark", "a.npz:NAME"))
+    run.refused("slopes", "a.npz", "--key", "day", naming=("a.npz", "'day'", "night, dark"))
+    run.ok("slopes", "a.npz", "--key", "night", "-o", "s.npz")
+    run.ok("slopes", "a.npz:night", "-o", "t.npz")
+    for name in ("s.npz", "t.npz"):
+        assert_equal(folder / name, expected(frames))
+
+
+def test_no_denoise_is_the_other_arm(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    np.save("a.npy", frames)
+    run.ok("slopes", "a.npy", "-o", "s.npz", "--no-denoise")
+    assert_equal(folder / "s.npz", SlopePipeline(LAYOUT, SETTINGS.replace(denoise=False))(frames))
+    assert read_slopes(folder / "s.npz").variables["iterations"].max() == 0
+
+
+def test_reference(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    reference = np.random.default_rng(4).normal(0, 0.3, (16, 2))
+    np.save("a.npy", frames)
+    np.savez("r.npz", positions=reference, other=reference[:3])
+    run.ok("slopes", "a.npy", "-o", "s.npz", "--reference", "r.npz:positions")
+    assert_equal(folder / "s.npz", expected(frames, reference=reference))
+    np.testing.assert_array_equal(read_slopes(folder / "s.npz").attributes["reference"], reference)
+    run.refused("slopes", "a.npy", "-o", "t.npz", "--reference", "r.npz:other", naming=("(16, 2)", "(3, 2)"))
+
+
+def test_threads_and_blocks_change_nothing(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    np.save("a.npy", frames)
+    for i, options in enumerate(("--block 1", "--block 7 --threads 1", "--threads 2")):
+        run.ok("slopes", "a.npy", "-o", f"{i}.npz", *options.split())
+        assert_equal(folder / f"{i}.npz", expected(frames))
+
+
+def test_the_bar_is_one_line_on_standard_error(folder: Path, run: Commands) -> None:
+    np.save("a.npy", simulated())
+    result = run.ok("slopes", "a.npy", "--block", 3)
+    assert "30/30" in result.error
+    assert "frames/s" in result.error
+    assert "frames/s" not in result.out
+    assert not any(character in result.out + result.err for character in "\r\x1b")
+
+
+def test_again_is_complete_already_and_overwrite_makes_it_anew(folder: Path, run: Commands) -> None:
+    np.save("a.npy", simulated())
+    run.ok("slopes", "a.npy")
+    again = run.ok("slopes", "a.npy")
+    assert "complete already (30 frames)" in again.out
+    assert again.err == ""
+    np.save("a.npy", simulated(seed=2))  # other frames under the old name are another run
+    run.refused("slopes", "a.npy", naming=("slopes.zarr", "another run", "--overwrite"))
+    run.ok("slopes", "a.npy", "--overwrite")
+    assert_equal(folder / "slopes.zarr", expected(simulated(seed=2)))
+
+
+def test_bad_frames_are_flagged_counted_and_leave_their_neighbours_alone(folder: Path, run: Commands) -> None:
+    frames = simulated().astype(np.float32)
+    good = expected(frames)
+    frames[3] = np.nan
+    frames[9, 4, 5] = np.inf
+    frames[14] = 0
+    frames[20] = 65535
+    np.save("a.npy", frames)
+    (folder / "faintspot.toml").write_text(
+        (folder / "faintspot.toml").read_text() + "[calibration]\nsaturation_adu = 60000\n"
+    )
+    result = run.ok("slopes", "a.npy", "-o", "s.npz", "--block", 5)
+    stored = read_slopes(folder / "s.npz").variables
+    others = np.setdiff1d(np.arange(30), [3, 9, 14, 20])
+    for name in ("x", "y", "flux", "valid", "flags", "iterations"):
+        np.testing.assert_array_equal(stored[name][others], getattr(good, name)[others], err_msg=name)
+        assert np.all(np.isfinite(stored[name]))
+    np.testing.assert_array_equal(stored["x"][9, 1:], good.x[9, 1:])
+    assert stored["flags"][9, 0] & SubapertureFlag.BAD_PIXELS
+    assert np.all(stored["flags"][3] & SubapertureFlag.TOO_MANY_BAD_PIXELS)
+    assert np.all(stored["flags"][[14, 20]] & SubapertureFlag.NO_LIGHT)
+    assert np.all(stored["flags"][20] & SubapertureFlag.SATURATED)
+    for index in (3, 14, 20):
+        assert not stored["valid"][index].any()
+        assert not stored["x"][index].any()
+    for line in (
+        "  16 slopes with too many bad pixels (3.33 %)",
+        "  1 slope with a few bad pixels, filled from their neighbours (0.208 %)",
+        "  17 slopes with saturated pixels (3.54 %)",  # an infinite pixel is above any level
+        "  3 frames without any valid slope",
+    ):
+        assert line in result.out.splitlines(), result.out
+
+
+def test_an_integer_frame_at_its_dtypes_limit_is_saturated(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    frames[5] = 65535
+    np.save("a.npy", frames)
+    result = run.ok("slopes", "a.npy", "-o", "s.npz")
+    assert "  16 slopes with saturated pixels (3.33 %)" in result.out.splitlines()
+    assert "  1 frame without any valid slope" in result.out.splitlines()
+
+
+def test_all_slopes_bad_is_a_hundred_per_cent(folder: Path, run: Commands) -> None:
+    np.save("a.npy", np.zeros((2, 32, 32), np.uint16))
+    assert "  32 slopes without light (100 %)" in run.ok("slopes", "a.npy").out.splitlines()
+
+
+def test_memory_is_bounded(folder: Path) -> None:
+    """A sparse cube of 1.07 GB within 800 MB, of which compiling the kernels may take 550."""
+    shape = (128, 2048, 2048)
+    with (folder / "large.npy").open("wb") as stream:
+        header = {"descr": "<u2", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.truncate(stream.tell() + 2 * 128 * 2048 * 2048)
+    text = (
+        (folder / "faintspot.toml").read_text().replace("pixels = 8", "pixels = 8\nframe_shape=[2048,2048]")
+    )
+    (folder / "faintspot.toml").write_text(text)
+    limit_bytes = 800_000_000
+    code = (
+        "import resource, sys; from faintspot.cli import main; main(sys.argv[1:]);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code, "slopes", "large.npy", "-o", "s.npz"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert 1024 * int(answer.stdout.splitlines()[-1]) < limit_bytes
+    assert "128 frames" in answer.stdout

@@ -1,0 +1,93 @@
+"""faintspot slopes, killed or interrupted in mid-run and started again: as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.cli.cli_cases import LAYOUT, Commands, assert_equal, command_line, simulated
+
+from faintspot import Settings, SlopePipeline, Slopes
+
+pytest.importorskip("zarr")
+
+N_FRAMES = 12_000  # three chunks of a store
+SETTINGS = Settings(noise_std=2.0, keep_brightest=10, tolerance=0.0, max_iterations=100)  # slow
+
+
+@pytest.fixture(scope="module")
+def frames() -> np.ndarray:
+    return np.tile(simulated(100), (N_FRAMES // 100, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(frames: np.ndarray) -> Slopes:
+    few = SlopePipeline(LAYOUT, SETTINGS)(frames[:100])
+    names = ("x", "y", "flux", "flags", "iterations", "bad_pixels")
+    return Slopes(*(np.tile(getattr(few, name), (N_FRAMES // 100, 1)) for name in names))
+
+
+def finished(output: Path) -> int:
+    """Return how many frames the unfinished output says it has."""
+    try:
+        if output.suffix == ".zarr":
+            return int(json.loads((output / "zarr.json").read_text())["attributes"]["finished_frames"])
+        return int((output.with_name(f".{output.name}.partial") / "finished").read_text())
+    except FileNotFoundError:
+        return 0
+
+
+def start_and_stop(output: Path, number: int) -> tuple[int, str]:
+    """Start the command, send it a signal when some of its frames are stored; exit code and errors."""
+    process = command_line(
+        "slopes", "a.npy", "-o", output.name, "--block", 50, "--threads", 1, cwd=output.parent
+    )
+    try:
+        end = time.monotonic() + 60
+        while not finished(output) and process.poll() is None and time.monotonic() < end:
+            time.sleep(0.002)
+        process.send_signal(number)
+        errors = process.communicate(timeout=60)[1]
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
+    return process.returncode, errors
+
+
+@pytest.fixture
+def prepared(folder: Path, frames: np.ndarray) -> Callable[[str], Path]:
+    np.save(folder / "a.npy", frames)
+    text = (folder / "faintspot.toml").read_text()
+    (folder / "faintspot.toml").write_text(text + "tolerance = 0.0\nmax_iterations = 100\n")
+    return lambda name: folder / name
+
+
+@pytest.mark.parametrize("name", ["s.zarr", "s.npz"])
+def test_killed(prepared: Callable[[str], Path], run: Commands, name: str, uninterrupted: Slopes) -> None:
+    output = prepared(name)
+    code, _ = start_and_stop(output, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    kept = finished(output)
+    assert 0 < kept < N_FRAMES
+    assert name == "s.zarr" or not output.exists()
+    result = run.ok("slopes", "a.npy", "-o", name)
+    assert f"went on at frame {kept} " in result.out
+    assert_equal(output, uninterrupted)
+
+
+def test_ctrl_c(prepared: Callable[[str], Path], run: Commands, uninterrupted: Slopes) -> None:
+    output = prepared("s.zarr")
+    code, errors = start_and_stop(output, signal.SIGINT)
+    assert code == 130
+    *bar, message = errors.splitlines()
+    assert message.startswith("faintspot: interrupted; run the same command again")
+    assert [f"/{N_FRAMES}" in line for line in bar] == [True]
+    assert 0 < finished(output) < N_FRAMES
+    run.ok("slopes", "a.npy", "-o", "s.zarr")
+    assert_equal(output, uninterrupted)

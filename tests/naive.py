@@ -1,0 +1,269 @@
+"""The slow, obvious oracle: every step of the pipeline in plain NumPy, float64, one image at a time.
+
+Written from the definitions, not from the kernels, so that a mistake in one does not hide in the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import faintspot as fs
+
+Floats = NDArray[np.float64]
+Flag = fs.SubapertureFlag
+
+
+# Total variation ------------------------------------------------------------------------------------
+
+
+def gradient(u: Floats) -> tuple[Floats, Floats]:
+    """Forward differences along x and y; zero across the far edges (Neumann)."""
+    gx, gy = np.zeros_like(u), np.zeros_like(u)
+    gx[:, :-1] = u[:, 1:] - u[:, :-1]
+    gy[:-1, :] = u[1:, :] - u[:-1, :]
+    return gx, gy
+
+
+def divergence(px: Floats, py: Floats) -> Floats:
+    """Minus the adjoint of `gradient`: sum(gradient(u) * p) == -sum(u * divergence(p)).
+
+    The last column of px and the last row of py meet a zero gradient and do not count.
+    """
+    d = np.zeros_like(px)
+    d[:, :-1] += px[:, :-1]
+    d[:, 1:] -= px[:, :-1]
+    d[:-1, :] += py[:-1, :]
+    d[1:, :] -= py[:-1, :]
+    return d
+
+
+def total_variation(u: Floats) -> float:
+    gx, gy = gradient(np.asarray(u, np.float64))
+    return float(np.sum(np.sqrt(gx**2 + gy**2)))
+
+
+@dataclass
+class Denoised:
+    image: Floats
+    iterations: int = 0
+    multiplier: float = 0.0
+    converged: bool = True
+    infeasible: bool = False
+    dual: tuple[Floats, Floats] | None = None
+    margin: float = np.inf
+    """How near a decision (feasible, converged) came to the other one: the smallest |left / right - 1|."""
+
+
+def tv_denoise(
+    g: ArrayLike,
+    noise_std: float,
+    algorithm: str = "fgp",
+    tolerance: float = 1e-2,
+    max_iterations: int = 200,
+) -> Denoised:
+    """Constrained TV of one image: minimise TV(u) subject to ||u - g||^2 = N noise_std^2."""
+    g = np.asarray(g, np.float64)
+    mean = g.mean()
+    scale = np.max(np.abs(g - mean))  # only against overflow and underflow of squares
+    if noise_std == 0.0:
+        return Denoised(g.copy())
+    if g.min() == g.max():
+        return Denoised(g.copy(), multiplier=np.inf, infeasible=True)
+    gc = (g - mean) / scale
+    strength = noise_std / scale
+    rms = np.sqrt(np.mean(gc**2))
+    margin = abs(strength / rms - 1.0)
+    if rms <= strength:
+        return Denoised(np.full_like(g, mean), multiplier=np.inf, infeasible=True, margin=margin)
+    radius = np.sqrt(g.size) * strength
+    multiplier = 0.4 * strength
+    zero = np.zeros_like(g)
+    p: tuple[Floats, Floats] = (zero, zero)
+    previous = p
+    age, momentum, converged = 1.0, 0.0, False
+    for iteration in range(1, max_iterations + 1):
+        if algorithm == "fgp":
+            q = (p[0] + momentum * (p[0] - previous[0]), p[1] + momentum * (p[1] - previous[1]))
+        else:
+            q = p
+        d = divergence(*q)
+        gx, gy = gradient(d - gc / multiplier)
+        if algorithm == "fgp":
+            new = (q[0] + gx / 8, q[1] + gy / 8)
+            shrink = np.maximum(1.0, np.hypot(*new))
+        else:
+            new = (q[0] + gx / 4, q[1] + gy / 4)
+            shrink = 1.0 + np.hypot(gx, gy) / 4
+        previous, p = p, (new[0] / shrink, new[1] / shrink)
+        next_age = (1.0 + np.sqrt(1.0 + 4.0 * age**2)) / 2
+        momentum, age = (age - 1.0) / next_age, next_age
+        if np.linalg.norm(d) > 0:
+            multiplier = radius / np.linalg.norm(d)
+        if iteration % 5 == 0:
+            d = divergence(*p)
+            change = np.linalg.norm(d - divergence(*previous))
+            bound = tolerance * np.linalg.norm(d - gc / multiplier)
+            if bound > 0:
+                margin = min(margin, abs(change / bound - 1.0))
+            if tolerance > 0 and change <= bound:
+                converged = True
+                break
+    d = divergence(*p)
+    multiplier = radius / np.linalg.norm(d)
+    image = mean + scale * (gc - multiplier * d)
+    return Denoised(image, iteration, multiplier * scale, converged, False, p, margin)
+
+
+# Background and centroid ----------------------------------------------------------------------------
+
+
+def brightest_pixels(g: ArrayLike, keep: int, rule: str = "subtract_next") -> NDArray[Any]:
+    """Keep the brightest pixels of one image, in its own dtype."""
+    g = np.asarray(g)
+    descending = np.sort(g.ravel())[::-1]
+    if rule == "subtract_next":
+        return np.asarray(np.maximum(g - descending[keep], g.dtype.type(0)))
+    kth = descending[keep - 1]
+    if rule == "threshold":
+        return np.asarray(np.where(g >= kth, g, g.dtype.type(0)))
+    return np.asarray(np.maximum(g - kth, g.dtype.type(0)))
+
+
+def centre_of_gravity(g: ArrayLike) -> tuple[float, float]:
+    g = np.asarray(g, np.float64)
+    ny, nx = g.shape
+    total = g.sum()
+    if not total > 0:
+        return 0.0, 0.0
+    x = np.sum(g * (np.arange(nx) - (nx - 1) / 2)) / total
+    y = np.sum(g * (np.arange(ny) - (ny - 1) / 2)[:, None]) / total
+    return float(x), float(y)
+
+
+# Sensor ---------------------------------------------------------------------------------------------
+
+
+def calibrate(frame: ArrayLike, calibration: fs.Calibration) -> Floats:
+    """From ADU to electrons; NaN where a pixel is bad."""
+    raw = np.asarray(frame).astype(np.float64)
+    electrons = np.full(raw.shape, np.nan)
+    for i, j in np.ndindex(raw.shape):
+        dark = calibration.dark[i, j] if np.ndim(calibration.dark) else calibration.dark
+        flat = 1.0 if calibration.flat is None else calibration.flat[i, j]
+        if not (np.isfinite(raw[i, j]) and np.isfinite(dark) and np.isfinite(flat) and flat > 0):
+            continue
+        value = (raw[i, j] - dark) * calibration.gain_e_per_adu / (calibration.em_gain * flat)
+        if abs(value) <= 1e30:
+            electrons[i, j] = value
+    bad = calibration.bad_pixels
+    if bad is not None and bad.dtype == bool:
+        electrons[bad] = np.nan
+    elif bad is not None:
+        for i, j in bad.tolist():
+            electrons[i, j] = np.nan
+    return electrons
+
+
+def fill_bad_pixels(image: Floats) -> Floats:
+    """NaN becomes the mean of the good ones of its 8 neighbours, else of all good pixels, else 0."""
+    filled = image.copy()
+    for i, j in np.argwhere(np.isnan(image)):
+        near = image[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+        near = near[~np.isnan(near)]
+        every = image[~np.isnan(image)]
+        filled[i, j] = near.mean() if near.size else every.mean() if every.size else 0.0
+    return filled
+
+
+@dataclass
+class Slope:
+    x: float
+    y: float
+    flux: float
+    flags: int
+    iterations: int
+    bad_pixels: int
+    denoised: Denoised
+
+
+def slopes(
+    frame: ArrayLike,
+    layout: fs.Layout,
+    settings: fs.Settings,
+    calibration: fs.Calibration | None = None,
+    reference: ArrayLike | None = None,
+) -> list[Slope]:
+    """The whole pipeline for one frame (h, w); reference is (n, 2)."""
+    calibration = fs.Calibration() if calibration is None else calibration
+    frame = np.asarray(frame)
+    electrons = calibrate(frame, calibration)
+    level = calibration.saturation_adu
+    if level is None and frame.dtype.kind in "iu":
+        level = float(np.iinfo(frame.dtype).max)
+    n, (ny, nx) = len(layout), layout.window
+    results = []
+    for s in range(n):
+        row, column = layout.corners[s]
+        window = (slice(row, row + ny), slice(column, column + nx))
+        value = {
+            name: settings.values(name, n, ny * nx)[s]
+            for name in (
+                "noise_std",
+                "tolerance",
+                "max_iterations",
+                "keep_brightest",
+                "rule",
+                "denoise",
+                "flux_floor",
+                "max_bad_fraction",
+            )
+        }
+        image = electrons[window]
+        bad = int(np.isnan(image).sum())
+        flags = 0
+        if level is not None and np.any(frame[window] >= level):
+            flags |= Flag.SATURATED
+        if bad > value["max_bad_fraction"] * ny * nx:
+            flags |= Flag.TOO_MANY_BAD_PIXELS
+        elif bad:
+            flags |= Flag.BAD_PIXELS
+        strength = float(value["noise_std"]) if value["denoise"] else 0.0
+        denoised = tv_denoise(
+            fill_bad_pixels(image),
+            strength,
+            settings.algorithm,
+            float(value["tolerance"]),
+            int(value["max_iterations"]),
+        )
+        if denoised.infeasible:
+            flags |= Flag.INFEASIBLE_STRENGTH
+        if not denoised.converged:
+            flags |= Flag.NOT_CONVERGED
+        results.append(_located(denoised, value, flags, bad, layout.centres[s], layout.corners[s]))
+        if reference is not None and results[-1].flags & (Flag.NO_LIGHT | Flag.TOO_MANY_BAD_PIXELS) == 0:
+            results[-1].x -= float(np.asarray(reference)[s, 0])
+            results[-1].y -= float(np.asarray(reference)[s, 1])
+    return results
+
+
+def _located(denoised: Denoised, value: Any, flags: int, bad: int, centre: Floats, corner: Any) -> Slope:
+    """Background, centroid and validity of one denoised sub-aperture; position from its centre."""
+    ny, nx = denoised.image.shape
+    spot = brightest_pixels(denoised.image, int(value["keep_brightest"]), str(value["rule"]))
+    flux = float(spot.sum())
+    x, y = centre_of_gravity(spot)
+    lit = flux > value["flux_floor"] * np.max(np.abs(denoised.image))
+    if not lit or abs(x) > nx / 2 or abs(y) > ny / 2:
+        flags |= Flag.NO_LIGHT
+    if flags & Flag.TOO_MANY_BAD_PIXELS:  # no other reason is given
+        flags &= Flag.TOO_MANY_BAD_PIXELS | Flag.SATURATED
+    if flags & (Flag.NO_LIGHT | Flag.TOO_MANY_BAD_PIXELS):
+        x = y = 0.0
+    else:
+        x += corner[1] + (nx - 1) / 2 - centre[0]
+        y += corner[0] + (ny - 1) / 2 - centre[1]
+    return Slope(x, y, flux, int(flags), denoised.iterations, bad, denoised)

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.estimate.image_cases import refused
+
+import faintspot as fs
+
+
+class TestMaps:
+    def test_default_is_electrons(self) -> None:
+        maps = fs.Calibration().maps((3, 4))
+        assert maps.dtype == np.float32
+        assert np.array_equal(maps, [np.zeros((3, 4)), np.ones((3, 4))])
+
+    def test_electrons_per_adu(self) -> None:
+        flat = np.linspace(0.5, 2.0, 12).reshape(3, 4)
+        dark = np.arange(12.0).reshape(3, 4)
+        calibration = fs.Calibration(dark, flat, gain_e_per_adu=20.0, em_gain=500.0)
+        maps = calibration.maps((3, 4))
+        assert np.array_equal(maps[0], dark)
+        assert np.allclose(maps[1], 20.0 / (500.0 * flat), rtol=1e-6)
+
+    def test_bad_pixels(self) -> None:
+        flat = np.ones((3, 4))
+        flat[0] = [0.0, -1.0, np.nan, np.inf]
+        dark = np.zeros((3, 4))
+        dark[1, 1] = np.nan
+        expected = np.zeros((3, 4), bool)
+        expected[0] = expected[1, 1] = True
+        assert np.array_equal(np.isnan(fs.Calibration(dark, flat).maps((3, 4)).sum(axis=0)), expected)
+        mask = np.zeros((3, 4), bool)
+        mask[2, 3] = mask[0, 1] = True
+        for bad in (mask, [[2, 3], [0, 1]], [[2, 3], [0, 1], [2, 3]], np.argwhere(mask)):
+            assert np.array_equal(np.isnan(fs.Calibration(bad_pixels=bad).maps((3, 4))[1]), mask)
+        assert not np.isnan(fs.Calibration(bad_pixels=[]).maps((3, 4))).any()
+
+    def test_square_and_two_column_masks(self) -> None:
+        mask = np.array([[True, False], [False, False], [True, False]])
+        assert np.array_equal(np.isnan(fs.Calibration(bad_pixels=mask).maps((3, 2))[1]), mask)
+
+    def test_beyond_float32(self) -> None:
+        dark, flat = np.zeros((2, 2)), np.ones((2, 2))
+        dark[0, 0], flat[0, 1], flat[1, 0] = 1e300, 1e-100, 5e-324
+        maps = fs.Calibration(dark, flat).maps((2, 2))
+        assert np.array_equal(np.isfinite(maps).all(axis=0), [[False, False], [False, True]])
+
+    def test_saturation(self) -> None:
+        assert fs.Calibration().saturation(np.dtype("u2")) == 65535
+        assert fs.Calibration().saturation(np.dtype(">i2")) == 32767
+        assert not np.inf >= fs.Calibration().saturation(np.dtype("f4"))
+        assert fs.Calibration(saturation_adu=4000).saturation(np.dtype("u2")) == 4000.0
+        assert fs.Calibration(saturation_adu=4000).saturation(np.dtype("f4")) == 4000.0
+
+
+def test_is_immutable_and_private() -> None:
+    dark, bad = np.zeros((3, 4)), np.zeros((3, 4), bool)
+    calibration = fs.Calibration(dark, bad_pixels=bad)
+    dark[0, 0], bad[0, 0] = 5.0, True
+    assert calibration.dark[0, 0] == 0.0
+    assert not calibration.bad_pixels[0, 0]
+    for array in (calibration.dark, calibration.bad_pixels):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 1
+
+
+def test_equality() -> None:
+    dark = np.full((3, 4), np.nan)
+    assert fs.Calibration(dark) == fs.Calibration(dark.copy())
+    assert fs.Calibration(dark) != fs.Calibration()
+    assert fs.Calibration() != fs.Calibration(flat=np.ones((3, 4)))
+    assert fs.Calibration(em_gain=2.0) != fs.Calibration()
+    assert fs.Calibration() != 1
+
+
+@pytest.mark.parametrize(
+    ("words", "arguments"),
+    [
+        ("dark", {"dark": np.zeros(3)}),
+        ("dark", {"dark": np.nan}),
+        ("dark", {"dark": "dark.fits"}),
+        ("dark", {"dark": np.zeros((2, 3, 4))}),
+        ("dark", {"dark": None}),
+        ("flat", {"flat": 1.0}),
+        ("flat", {"flat": np.ones((3, 4), complex)}),
+        ("gain_e_per_adu = 0", {"gain_e_per_adu": 0.0}),
+        ("gain_e_per_adu", {"gain_e_per_adu": np.nan}),
+        ("gain_e_per_adu", {"gain_e_per_adu": np.ones((3, 4))}),
+        ("em_gain = -1", {"em_gain": -1.0}),
+        ("em_gain", {"em_gain": "high"}),
+        ("saturation_adu = 0", {"saturation_adu": 0}),
+        ("bad_pixels", {"bad_pixels": [1, 2]}),
+        ("bad_pixels = -1", {"bad_pixels": [[-1, 0]]}),
+        ("bad_pixels = 0.5", {"bad_pixels": [[0.5, 0]]}),
+        ("bad_pixels", {"bad_pixels": [[1, 2, 3]]}),
+        ("bad_pixels", {"bad_pixels": "hot"}),
+        ("bad_pixels", {"bad_pixels": [[1, 2], [3]]}),
+        ("bad_pixels", {"bad_pixels": np.zeros(3, bool)}),
+        ("dark (3, 4), flat (4, 3)", {"dark": np.zeros((3, 4)), "flat": np.ones((4, 3))}),
+        ("bad_pixels (3, 3)", {"dark": np.zeros((3, 4)), "bad_pixels": np.zeros((3, 3), bool)}),
+    ],
+)
+def test_bad_values(words: str, arguments: dict[str, Any]) -> None:
+    with refused("calibration", words):
+        fs.Calibration(**arguments)
+
+
+def test_maps_of_another_frame() -> None:
+    with refused("calibration.flat", "(5, 5)", "(3, 4)"):
+        fs.Calibration(flat=np.ones((3, 4))).maps((5, 5))
+    with refused("calibration.bad_pixels", "(3, 0) is outside (3, 4)"):
+        fs.Calibration(bad_pixels=[[0, 0], [3, 0]]).maps((3, 4))

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.estimate.image_cases import refused
+
+import faintspot as fs
+
+
+class TestGrid:
+    @pytest.mark.parametrize(
+        ("shape", "outer", "inner", "count"),
+        [
+            ((7, 7), 3.5, 0.5, 36),
+            ((7, 7), 3.7, 1.2, 40),
+            ((7, 7), None, None, 49),
+            ((7, 7), 0.0, None, 1),
+            ((2, 3), None, None, 6),
+            ((40, 40), 20.0, 0.0, 1264),
+        ],
+    )
+    def test_number_of_lit_subapertures(self, shape: Any, outer: Any, inner: Any, count: int) -> None:
+        layout = fs.Layout.grid(shape, pixels=4, outer_radius=outer, inner_radius=inner)
+        distance = [np.hypot(i - (shape[0] - 1) / 2, j - (shape[1] - 1) / 2) for i, j in np.ndindex(shape)]
+        lit = [d for d in distance if (inner or 0) <= d <= (np.inf if outer is None else outer)]
+        assert len(layout) == len(lit)
+        assert len(layout) == count
+
+    def test_places(self) -> None:
+        layout = fs.Layout.grid((2, 3), pixels=(4, 6), pitch=(5, 8), origin=(1, 2))
+        assert layout.corners.tolist() == [[1, 2], [1, 10], [1, 18], [6, 2], [6, 10], [6, 18]]
+        assert layout.cells.tolist() == [[i, j] for i in range(2) for j in range(3)]
+        assert layout.centres[1].tolist() == [12.5, 2.5]
+        assert layout.frame_shape == (10, 24)
+        assert layout.window == (4, 6)
+        assert layout.pixels == 24
+        assert layout.pitch_px == 5.0
+        assert np.array_equal(layout.offsets, np.zeros((6, 2)))
+
+    @pytest.mark.parametrize(
+        ("words", "arguments"),
+        [
+            ("no sub-aperture is lit", {"outer_radius": 1.0, "inner_radius": 2.0}),
+            ("overlap", {"pitch": 3}),
+            ("leaves the frame of 10 x 28", {"frame_shape": (10, 28)}),
+            ("pixels = 3", {"pixels": 3}),
+            ("pixels = 65", {"pixels": 65}),
+            ("pixels = 4.5", {"pixels": 4.5}),
+            ("pixels", {"pixels": (4, 4, 4)}),
+            ("outer_radius = -1", {"outer_radius": -1.0}),
+            ("outer_radius", {"outer_radius": np.nan}),
+            ("origin = -1", {"origin": (-1, 0)}),
+            ("shape = 0", {"shape": (0, 4)}),
+            ("shape", {"shape": "square"}),
+            ("pitch = 0", {"pitch": 0}),
+        ],
+    )
+    def test_bad_arguments(self, words: str, arguments: dict[str, Any]) -> None:
+        with refused(words):
+            fs.Layout.grid(**{"shape": (7, 7), "pixels": 4, **arguments})
+
+
+class TestLayout:
+    def test_is_immutable_and_private(self) -> None:
+        corners = np.array([[0, 0], [0, 8]])
+        layout = fs.Layout((8, 16), (8, 8), corners)
+        corners[0, 0] = 5
+        assert layout.corners[0, 0] == 0
+        for array in (layout.corners, layout.centres, layout.cells):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0, 0] = 1
+        with pytest.raises(FrozenInstanceError):
+            layout.window = (4, 4)  # type: ignore[misc]
+
+    def test_equality(self) -> None:
+        grid = fs.Layout.grid((3, 3), pixels=8)
+        assert grid == fs.Layout.grid((3, 3), pixels=8)
+        assert grid != fs.Layout.grid((3, 3), pixels=8, origin=(0, 1))
+        assert grid != fs.Layout(grid.frame_shape, grid.window, grid.corners, grid.centres + 0.1)
+        assert grid != "grid"
+
+    def test_centres_off_the_windows(self) -> None:
+        layout = fs.Layout((8, 8), 4, [[0, 0], [4, 4]], [[2.0, 1.0], [5.5, 5.5]])  # type: ignore[arg-type]
+        assert layout.window == (4, 4)
+        assert layout.offsets.tolist() == [[0.5, -0.5], [0.0, 0.0]]
+
+    @pytest.mark.parametrize(
+        ("words", "arguments"),
+        [
+            ("sub-aperture 1 (rows 0 to 7, columns 9 to 16) leaves the frame", {"corners": [[0, 0], [0, 9]]}),
+            ("sub-aperture 0", {"corners": [[-1, 0], [0, 8]]}),
+            ("sub-apertures 0 and 1 overlap", {"corners": [[0, 0], [0, 7]]}),
+            ("sub-apertures 0 and 1 overlap", {"corners": [[0, 0], [0, 0]]}),
+            ("corners", {"corners": np.empty((0, 2))}),
+            ("corners", {"corners": [0, 0]}),
+            ("corners = 0.5", {"corners": [[0.5, 0]]}),
+            ("corners", {"corners": [[np.nan, 0]]}),
+            ("corners", {"corners": [[0, 0], [0]]}),
+            ("centres: expected 2 rows", {"centres": [[1.0, 1.0]]}),
+            ("centres", {"centres": [[1.0, np.inf], [1, 1]]}),
+            ("cells: expected 2 rows", {"cells": [[0, 0]]}),
+            ("cells", {"cells": [[0.5, 0], [0, 1]]}),
+            ("geometry = 'round': expected one of 'square', 'hexagonal'", {"geometry": "round"}),
+            ("pitch_px = 0", {"pitch_px": 0.0}),
+            ("pitch_px", {"pitch_px": "8"}),
+            ("angle_deg = 400", {"angle_deg": 400.0}),
+            ("window = 2", {"window": (2, 2)}),
+            ("frame_shape", {"frame_shape": (8, 16, 3)}),
+        ],
+    )
+    def test_bad_arguments(self, words: str, arguments: dict[str, Any]) -> None:
+        sound: dict[str, Any] = {"frame_shape": (8, 16), "window": (8, 8), "corners": [[0, 0], [0, 8]]}
+        with refused("layout", words):
+            fs.Layout(**{**sound, **arguments})
+
+    @given(st.integers(0, 2**32 - 1))
+    def test_overlap_is_what_two_windows_share(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        ny, nx = (int(n) for n in rng.integers(4, 9, 2))
+        corners = rng.integers(0, 24, (3, 2))
+        covered = np.zeros((40, 40), int)
+        for row, column in corners:
+            covered[row : row + ny, column : column + nx] += 1
+        if covered.max() > 1:
+            with refused("overlap"):
+                fs.Layout((40, 40), (ny, nx), corners)
+        else:
+            assert len(fs.Layout((40, 40), (ny, nx), corners)) == 3
+
+
+class TestImages:
+    def test_windows_of_a_frame(self) -> None:
+        layout = fs.Layout((9, 13), (4, 5), np.array([[1, 2], [5, 8]]))
+        frame = np.arange(9 * 13).reshape(9, 13)
+        assert np.array_equal(layout.images(frame), [frame[1:5, 2:7], frame[5:9, 8:13]])
+        cube = np.stack([frame, -frame])
+        assert layout.images(cube).shape == (2, 2, 4, 5)
+        assert np.array_equal(layout.images(cube)[1], -layout.images(frame))
+        assert layout.images(frame).dtype == frame.dtype
+
+    def test_wrong_shape(self) -> None:
+        with refused("frame", "(8, 8)", "(8, 9)"):
+            fs.Layout.grid((2, 2), pixels=4).images(np.zeros((8, 9)))

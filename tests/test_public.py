@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import faintspot
+
+HEAVY = ("numba", "llvmlite", "scipy", "astropy", "zarr", "matplotlib", "jinja2", "tomlkit", "rich", "click")
+
+
+@pytest.mark.parametrize("name", [name for name in faintspot.__all__ if name != "__version__"])
+def test_names_exist_and_are_documented(name: str) -> None:
+    item = getattr(faintspot, name)
+    assert inspect.getdoc(item)
+    assert name in dir(faintspot)
+    if not inspect.ismodule(item):
+        assert item.__name__ == name
+
+
+def test_public_methods_are_documented() -> None:
+    for name in faintspot.__all__:
+        item = getattr(faintspot, name)
+        if inspect.isclass(item) and not issubclass(item, int):
+            for method, function in vars(item).items():
+                if not method.startswith("_") and callable(function):
+                    assert inspect.getdoc(function), f"{name}.{method}"
+
+
+def test_version() -> None:
+    assert faintspot.__version__.count(".") == 2
+
+
+def test_unknown_name() -> None:
+    with pytest.raises(AttributeError, match="nothing_like_this"):
+        _ = faintspot.nothing_like_this
+
+
+def test_errors_are_the_usual_kinds() -> None:
+    assert issubclass(faintspot.InputError, ValueError)
+    assert issubclass(faintspot.MissingExtraError, ImportError)
+    message = str(faintspot.MissingExtraError("zarr", "io", "reading Zarr stores"))
+    assert message == "reading Zarr stores needs zarr: install it with pip install 'faintspot[io]'"
+
+
+def test_flags_are_different_bits() -> None:
+    values = [flag.value for flag in faintspot.SubapertureFlag]
+    assert len(set(values)) == len(values) == 6
+    assert all(value.bit_count() == 1 and value < 256 for value in values)
+
+
+def imported_by(statement: str) -> set[str]:
+    """Return the heavy packages that a fresh interpreter has loaded after a statement."""
+    code = f"import sys\n{statement}\nprint(*(name for name in {HEAVY!r} if name in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(result.stdout.split())
+
+
+def test_import_is_light() -> None:
+    assert imported_by("import faintspot") == set()
+
+
+def test_sensor_needs_no_kernels() -> None:
+    statement = "import faintspot\nfaintspot.Settings(noise_std=1.0)\nfaintspot.Calibration()"
+    assert imported_by(statement) == set()
