@@ -184,3 +184,18 @@ def test_real_frames(
     run.ok("slopes", shared_file(name), "-c", "real.toml", "-o", "s.npz")
     assert read_slopes("s.npz").variables["valid"].mean() > 0.95
     assert "Next: " in result.out
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> None:
+    array = frames()
+    array[:, 5, 70] = 4000
+    array[:, 80, 3] = 3000
+    np.save(folder / "frames.npy", array)
+    result = run("layout", "frames.npy", "-o", "new.toml", "--mask-hot-pixels")
+    assert result.code == 0
+    assert "2 hot pixels masked" in result.out
+    calibration = Calibration.load(folder / "new.toml")
+    assert calibration.bad_pixels.tolist() == [[5, 70], [80, 3]]
+    # The median of some hundred background pixels with 3 e- of noise and faint wings of the spots.
+    assert calibration.dark == pytest.approx(OFFSET_ADU, abs=1.5)

@@ -17,6 +17,7 @@ from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.layout import GEOMETRIES, Layout
 from faintspot.sensor.settings import Settings
 
@@ -52,6 +53,11 @@ _FIRST_FRAMES = 20  # measured for the settings
 @click.option(
     "--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: 1, frames in electrons."
 )
+@click.option(
+    "--mask-hot-pixels",
+    is_flag=True,
+    help="Enter isolated bright pixels as bad pixels. Not for spots sharper than Nyquist sampling.",
+)
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option(
     "--overwrite",
@@ -67,6 +73,7 @@ def command(
     pixels: int | None,
     dark: str | None,
     gain: float | None,
+    mask_hot_pixels: bool,
     key: str | None,
     overwrite: bool,
 ) -> None:
@@ -90,6 +97,8 @@ def command(
     with open_frames(frames, key=key) as source:
         calibration = _calibration(target, dark, gain)
         mean = _mean_frame(source, calibration)
+        hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
+        mean[tuple(hot.T)] = np.nan
         bad = np.isnan(mean)
         try:
             layout = Layout.from_frame(
@@ -99,11 +108,12 @@ def command(
             text = str(error).replace("pitch_px", "--pitch PX")
             raise InputError(f"{source.description}: {text}") from None
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
+    calibration, notes = _completed(calibration, layout, mean, hot)
     settings, noise, flux = _first_settings(layout, calibration, first)
     drawn = _draw(np.where(bad, np.nanmedian(mean), mean), layout, picture, target)
     for item in (layout, settings, calibration):
         configuration.save(target, item)
-    for line in _describe(output, layout, settings, noise, flux):
+    for line in [*_describe(output, layout, settings, noise, flux), *notes]:
         click.echo(line)
     if calibration.gain_e_per_adu == 1.0:
         click.echo("  one electron per ADU assumed; give --gain if your camera has another")
@@ -172,6 +182,30 @@ def _calibration(target: Path, dark: str | None, gain: float | None) -> Calibrat
         if isinstance(error, InputError):
             raise
         return replace(calibration, dark=read_array(dark))
+
+
+def _completed(
+    calibration: Calibration, layout: Layout, mean: NDArray[np.float64], hot: NDArray[np.int64]
+) -> tuple[Calibration, list[str]]:
+    """Add the frame's background as dark level where none is known, and hot pixels; say so."""
+    notes = []
+    edges = layout.images(mean)[:, [0, -1]]
+    level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
+    spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
+    if np.ndim(calibration.dark) == 0 and calibration.dark == 0.0 and level > spread > 0:
+        calibration = replace(calibration, dark=float(f"{level:.4g}"))
+        notes.append(
+            f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
+        )
+    if len(hot):
+        known = calibration.bad_pixels
+        if known is None:
+            known = np.empty((0, 2), int)
+        elif known.dtype == np.bool_:
+            known = np.argwhere(known)
+        calibration = replace(calibration, bad_pixels=np.unique(np.concatenate([known, hot]), axis=0))
+        notes.append(f"  {len(hot)} hot pixels masked")
+    return calibration, notes
 
 
 def _first_settings(

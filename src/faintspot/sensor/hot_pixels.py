@@ -1,0 +1,54 @@
+"""Hot pixels: single pixels that stand out from their surroundings as no spot does."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import number_between, real_array
+from faintspot.errors import InputError
+
+_MAD_TO_STD = 1.4826
+_SHARPNESS = 4.0  # excess over the spread of the neighbours; a Nyquist-sampled spot's peak has 2.7 at most
+
+
+def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.int64]:
+    """Find isolated bright pixels in a frame.
+
+    A pixel is hot when it exceeds the median of its 8 neighbours by more than `threshold` standard deviations
+    of the frame's noise and by more than 4 times the spread (largest minus smallest) of these neighbours. The
+    peaks of spots that are sampled at the Nyquist rate or better stay below that; those of sharper spots
+    do not.
+
+    Parameters
+    ----------
+    frame : (h, w) array
+        NaN marks pixels that are known to be bad; they are not reported.
+    threshold : float
+
+    Returns
+    -------
+    (n, 2) array of int
+        Row and column of each, as `faintspot.Calibration` takes them.
+
+    Raises
+    ------
+    InputError
+        When the frame is not a real two-dimensional array.
+    """
+    from scipy.ndimage import maximum_filter, median_filter, minimum_filter
+
+    image = real_array("frame", frame, minimum_dimensions=2).astype(np.float64)
+    if image.ndim != 2:
+        raise InputError(f"frame: expected shape (h, w), got {image.shape}")
+    level = number_between("threshold", threshold, 0.0, low_open=True)
+    known = ~np.isfinite(image)
+    image[known] = np.median(image[~known]) if not known.all() else 0.0
+    ring = np.ones((3, 3), bool)
+    ring[1, 1] = False
+    excess = image - median_filter(image, footprint=ring, mode="mirror")
+    noise = _MAD_TO_STD * np.median(np.abs(excess - np.median(excess)))
+    spread = maximum_filter(image, footprint=ring, mode="mirror") - minimum_filter(
+        image, footprint=ring, mode="mirror"
+    )
+    return np.argwhere((excess > level * noise) & (excess > _SHARPNESS * spread) & ~known)
