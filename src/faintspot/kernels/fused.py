@@ -90,7 +90,7 @@ def slopes_of_groups(
         for lane in range(width):
             s = min(first + lane, n - 1)
             places[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
-        gather_raw(lanes, frames, f, places, ny, nx, image, output)
+        gather_raw(lanes, frames, f, places, ny, nx, image)
         group = item % n_groups
         calibrate(
             lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, centroid_numbers

@@ -5,17 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from faintspot.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.simd import absolute, get, load, load_converted, put, select, splat, store, width_of
+from faintspot.kernels.simd import absolute, copy_transposed, get, load, put, select, splat, store, width_of
 
 
 @compiled
-def gather_raw(
-    lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, image: Any, tile: Any
-) -> None:
+def gather_raw(lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, image: Any) -> None:
     """Copy W sub-apertures of a frame into the lanes, as they are.
 
     Parameters
@@ -26,24 +22,17 @@ def gather_raw(
         Flat offset of each sub-aperture's first pixel in its frame.
     image : (ny * nx * W,) array
         Written.
-    tile : array
-        Scratch for nx * W numbers: one row of every sub-aperture, so that the frame is read and the image
-        written in order.
     """
     width = width_of(lanes)
     height, line = frames.shape[1:]
     whole = nx - nx % width
     for y in range(ny):
-        for lane in range(width):
-            source = frame * height * line + get(corners, lane) + y * line
-            to = lane * nx
-            for x in range(0, whole, width):
-                store(tile, to + x, load_converted(lanes, frames, source + x))
-            for x in range(whole, nx):
-                put(tile, to + x, np.float32(get(frames, source + x)))
-        for x in range(nx):
+        start, to = (frame * height + y) * line, y * nx * width
+        for x in range(0, whole, width):
+            copy_transposed(lanes, frames, corners, start + x, image, to + x * width)
+        for x in range(whole, nx):
             for lane in range(width):
-                put(image, (y * nx + x) * width + lane, get(tile, lane * nx + x))
+                put(image, to + x * width + lane, get(frames, get(corners, lane) + start + x))
 
 
 @compiled

@@ -134,20 +134,55 @@ def _element_pointer(
 
 
 @intrinsic
-def load_converted(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
-    """Load W consecutive elements of a contiguous array of unsigned integers or of the lanes' own type."""
-    vector = Vector(lanes.scalar, lanes.width)
-    kind = array.dtype
+def copy_transposed(
+    typing_context: Any, lanes: Any, source: Any, starts: Any, shift: Any, target: Any, to: Any
+) -> Any:
+    """Copy W x W numbers: element j of row i of the source becomes element i of row j of the target.
 
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[2], sig.args[2], types.intp)
-        data = context.make_array(sig.args[1])(context, builder, args[1]).data
-        source = ir.VectorType(context.get_data_type(kind), lanes.width)
-        pointer = builder.bitcast(builder.gep(data, [place]), source.as_pointer())
+    Row i of the source starts at element starts[i] + shift; rows of the target follow each other from element
+    `to`. The source holds unsigned integers or numbers of the lanes' own type.
+    """
+    vector = Vector(lanes.scalar, lanes.width)
+    kind = source.dtype
+
+    def row(context: Any, builder: Any, data: Any, place: Any) -> Any:
+        packed = ir.VectorType(context.get_data_type(kind), lanes.width)
+        pointer = builder.bitcast(builder.gep(data, [place]), packed.as_pointer())
         values = builder.load(pointer, align=kind.bitwidth // 8)
         return values if kind == lanes.scalar else builder.uitofp(values, _llvm_vector(vector))
 
-    return vector(lanes, array, offset), emit
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data, first = (context.make_array(sig.args[k])(context, builder, args[k]).data for k in (1, 2))
+        offset = context.cast(builder, args[3], sig.args[3], types.intp)
+        rows = []
+        for lane in range(lanes.width):
+            start = builder.load(builder.gep(first, [ir.IntType(64)(lane)]))
+            rows.append(row(context, builder, data, builder.add(start, offset)))
+        place = context.cast(builder, args[5], sig.args[5], types.intp)
+        pointer = _element_pointer(context, builder, sig.args[4], args[4], place, vector)
+        for lane, values in enumerate(_transposed(builder, rows)):
+            builder.store(
+                values, builder.gep(pointer, [ir.IntType(64)(lane)]), align=lanes.scalar.bitwidth // 8
+            )
+        return context.get_dummy_value()
+
+    return types.void(lanes, source, starts, shift, target, to), emit
+
+
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Transpose W vectors of W numbers: exchange blocks of 1, 2, 4 ... off the diagonal."""
+    width, size = len(rows), 1
+    while size < width:
+        lower = [lane if not lane & size else width + lane - size for lane in range(width)]
+        upper = [lane + size if not lane & size else width + lane for lane in range(width)]
+        masks = [ir.Constant(ir.VectorType(ir.IntType(32), width), mask) for mask in (lower, upper)]
+        rows = list(rows)
+        for i in range(width):
+            if not i & size:
+                a, b = rows[i], rows[i + size]
+                rows[i], rows[i + size] = (builder.shuffle_vector(a, b, mask) for mask in masks)
+        size *= 2
+    return rows
 
 
 @intrinsic
