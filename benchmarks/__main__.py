@@ -10,7 +10,7 @@ import click
 
 from benchmarks import measuring
 
-NAMES = ("rivals", "roofline", "startup", "breakdown")
+NAMES = ("rivals", "roofline", "startup", "breakdown", "study")
 
 
 @click.command()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from faintspot import simulate as simulate
+    from faintspot import study as study
     from faintspot.errors import InputError as InputError
     from faintspot.errors import MissingExtraError as MissingExtraError
     from faintspot.estimate.brightest import brightest_pixels as brightest_pixels
@@ -38,6 +39,7 @@ _HOMES = {
     "brightest_pixels": "faintspot.estimate.brightest",
     "centre_of_gravity": "faintspot.estimate.centroid",
     "simulate": "faintspot.simulate",
+    "study": "faintspot.study",
     "tv_denoise": "faintspot.estimate.total_variation",
 }
 

@@ -13,8 +13,9 @@ from faintspot.errors import InputError, MissingExtraError
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
-    "report": "Make a web page of pictures and tables from slopes.",
+    "report": "Make a web page of pictures and tables from slopes or a study.",
     "slopes": "Turn recorded frames into slopes.",
+    "study": "Measure how large the slope error is, by Monte-Carlo simulation.",
 }
 
 
@@ -71,6 +72,7 @@ def group(context: click.Context) -> None:
     \b
     Without:
       faintspot demo
+      faintspot study paper --quick
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
@@ -91,7 +93,9 @@ def main(arguments: list[str] | None = None) -> Any:
         sys.exit(2)
     except (click.Abort, _Interrupted):
         click.echo(
-            "faintspot: interrupted; run the same command again (slopes go on where they stopped)", err=True
+            "faintspot: interrupted; run the same command again (slopes and studies go on where they "
+            "stopped)",
+            err=True,
         )
         sys.exit(130)
     except MemoryError:

@@ -8,9 +8,10 @@ import click
 
 from faintspot.errors import InputError
 from faintspot.io.locations import split_location
+from faintspot.study.recognise import study_attributes
 
 
-@click.command(short_help="Make a web page of pictures and tables from slopes.")
+@click.command(short_help="Make a web page of pictures and tables from slopes or a study.")
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER_ARM]")
 @click.option(
     "--output", "-o", metavar="HTML", help="Page to write. Default: the first file's name with .html."
@@ -19,18 +20,21 @@ from faintspot.io.locations import split_location
     "--frames", multiple=True, metavar="FILE", help="The frames, if they are no longer where they were."
 )
 def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]) -> None:
-    """Make a web page of pictures and tables from slopes.
+    """Make a web page of pictures and tables from slopes or a study.
 
     SLOPES is what `faintspot slopes` wrote; with a second one of the same frames (say, without denoising) the
     page compares the two. It holds the frame raw, calibrated, denoised and after the background subtraction,
     flux and validity maps, slope arrows, iterations and slope jitter, in one file without any links outside.
 
+    The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
+
     \b
     Examples:
       faintspot report slopes.zarr
       faintspot report slopes.zarr plain.zarr -o comparison.html
+      faintspot report paper.zarr
     """
-    from faintspot.report import report_of_stored, write_report
+    from faintspot.report import report_of_stored, report_of_study, write_report
 
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
@@ -41,7 +45,10 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
         )
     for name in frames:
         split_location(name)  # refuses what is not there
-    html = report_of_stored(paths, frames=[Path(path) for path in frames] or None)
+    if len(paths) == 1 and study_attributes(paths[0]) is not None:
+        html = report_of_study(paths[0])
+    else:
+        html = report_of_stored(paths, frames=[Path(path) for path in frames] or None)
     target = output or str(paths[0].with_suffix(".html"))
     write_report(target, html)
     click.echo(f"{target}: open it in a browser")

@@ -1,0 +1,147 @@
+"""faintspot study: Monte-Carlo studies of the slope error."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from faintspot.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    import xarray
+
+    from faintspot.study.specification import StudySpecification
+
+
+def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that say where and how a study runs."""
+    for option in (
+        click.option("--overwrite", is_flag=True, help="Replace the store of another study."),
+        click.option(
+            "--workers",
+            type=click.IntRange(0),
+            metavar="N",
+            help="Processes on this machine. Default: all processors. 0: this process, without Dask.",
+        ),
+        click.option(
+            "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use instead: tcp://HOST:PORT."
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+@click.group(name="study", short_help="Measure how large the slope error is.")
+def command() -> None:
+    """Measure how large the slope error is, by Monte-Carlo simulation.
+
+    Spots at random known positions, photon and read noise; the error of the centre of gravity with and
+    without denoising, and of other methods, on the same images; the settings of each chosen on one half of
+    the images and scored on the other.
+
+    \b
+    Examples:
+      faintspot study run my-study.toml -o my-study.zarr
+      faintspot study paper --quick
+    """
+
+
+@command.command(short_help="Run a study of your own.")
+@click.argument("specification", metavar="TOML")
+@click.option(
+    "--output", "-o", metavar="ZARR", help="Where results go. Default: the TOML file's name with .zarr."
+)
+@_run_options
+def run(
+    specification: str, output: str | None, scheduler: str | None, workers: int | None, overwrite: bool
+) -> None:
+    """Run a study of your own.
+
+    TOML lists what is varied (flux, read noise, spot size and shape, elongation, sub-aperture size, range of
+    positions, background, EM gain), which methods are compared and what they may choose from; docs/study.md
+    has examples. Each finished cell of the sweep is stored; interrupted or killed and started again, the
+    command goes on where it stopped. The store opens with faintspot.study.open_study or xarray.open_zarr.
+
+    \b
+    Examples:
+      faintspot study run my-study.toml -o my-study.zarr
+      faintspot study run my-study.toml --scheduler tcp://head-node:8786
+    """
+    from faintspot.study.specification import StudySpecification
+
+    described = StudySpecification.from_file(specification)
+    target = output or str(Path(specification).with_suffix(".zarr"))
+    _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    click.echo(f"Next: faintspot report {shlex.quote(target)}")
+
+
+@command.command(short_help="Repeat the study of Basden et al. 2015.")
+@click.option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
+@click.option(
+    "--figure", "figures", multiple=True, metavar="NAME", help="Only what this figure needs: fig2 to fig7."
+)
+@click.option(
+    "--output",
+    "-o",
+    metavar="ZARR",
+    help="Where results go; the report beside it. Default: paper.zarr, or paper-quick.zarr and the like.",
+)
+@_run_options
+def paper(
+    quick: bool,
+    figures: tuple[str, ...],
+    output: str | None,
+    scheduler: str | None,
+    workers: int | None,
+    overwrite: bool,
+) -> None:
+    """Repeat the study of Basden et al. 2015 (arXiv:1503.06043).
+
+    Every figure of the paper and a verdict on every claim, with error bars, in one report page beside the
+    store of results. Interrupted or killed and started again, the command goes on where it stopped.
+
+    \b
+    Examples:
+      faintspot study paper --quick
+      faintspot study paper -o paper.zarr
+      faintspot study paper --figure fig4 --figure fig6
+    """
+    from faintspot.study import paper as study_of_paper
+
+    described = study_of_paper.specification(quick, figures or None)
+    target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
+    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    page = Path(target).with_suffix(".html")
+    study_of_paper.report(results, page)
+    click.echo(f"{page}: open it in a browser")
+
+
+def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:
+    """Run a study with a progress bar."""
+    from faintspot.study.running import run as run_study
+
+    realisations, measured = described.realisations, 0
+
+    def advance_by_cells(finished: int, total: int) -> None:
+        nonlocal measured
+        measured = finished
+        advance(finished * realisations, total * realisations)
+
+    with progress_bar("study", "realisations") as advance:
+        results = run_study(
+            described,
+            target,
+            progress=advance_by_cells,
+            announce=lambda text: click.echo(text, err=True),
+            **options,
+        )
+    cells = f"{results.sizes['cell']} cells of {realisations} realisations"
+    if measured:
+        click.echo(f"{target}: {cells}, {measured} of them in this run")
+    else:
+        click.echo(f"{target}: complete already ({cells}); --overwrite makes it anew")
+    return results

@@ -1,0 +1,96 @@
+"""What a figure of a study is, and its numbers as a table."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from faintspot.study.claims import BEST_MODE
+from faintspot.study.sweep import PARAMETERS
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class StudyFigure:
+    """A figure, what it is in words, and its numbers."""
+
+    name: str
+    title: str
+    caption: str
+    figure: Figure
+    header: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+    def csv(self) -> str:
+        """Return the numbers as CSV text."""
+        return csv_text(self.header, self.rows)
+
+
+def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a table as CSV text."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def mode_in_words(mode: str) -> str:
+    """Return "best k" or "fixed k = 40"."""
+    return "best k" if mode == BEST_MODE else f"fixed k = {mode.removeprefix('fixed')}"
+
+
+def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the physical parameters of cells."""
+    columns = {name: dataset[name].values for name in PARAMETERS}
+    return [{name: column[cell].item() for name, column in columns.items()} for cell in cells]
+
+
+def parameter_in_words(name: str, value: Any) -> str:
+    """Return a cell's parameter with its unit."""
+    words = {
+        "flux_e": "{:g} e- signal",
+        "read_noise_e": "{:g} e- read noise",
+        "profile": "{} spots",
+        "size": "size {:g}",
+        "elongation": "elongated {:g} times",
+        "pixels": "{0:g} × {0:g} px",
+        "position_range_px": "positions within ±{:g} px",
+        "background_e": "background {:g} e-/px",
+        "em_gain": "EM gain {:g}",
+    }
+    if (name, value) in {("elongation", 1.0), ("background_e", 0.0), ("em_gain", 1.0)}:
+        return {"elongation": "round", "background_e": "no background", "em_gain": "no EM gain"}[name]
+    return words[name].format(value)
+
+
+def numbers_of(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
+    """Return a table of all arms and modes of cells."""
+    header = [
+        *PARAMETERS,
+        "mode",
+        "arm",
+        "R_px",
+        "R_se_px",
+        "chosen_k",
+        "chosen_candidate",
+        "invalid_fraction",
+    ]
+    names = ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction")
+    arrays = [dataset[name].transpose("cell", "mode", "arm").values for name in names]
+    rows = []
+    for cell, parameters in zip(cells, parameters_of(dataset, cells), strict=True):
+        for m, mode in enumerate(dataset["mode"].values):
+            for a, arm in enumerate(dataset["arm"].values):
+                values = [float(array[cell, m, a]) for array in arrays]
+                if np.isfinite(values[0]):
+                    rows.append([*parameters.values(), str(mode), str(arm), *(f"{v:.6g}" for v in values)])
+    return header, rows

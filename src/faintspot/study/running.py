@@ -1,0 +1,181 @@
+"""Running a study: its cells are spread over processes with Dask, their results gathered as they finish."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.kernels.parallel import available_cpus
+from faintspot.study.cell import measure_cell
+from faintspot.study.specification import StudySpecification
+from faintspot.study.store import MemoryResults, StoredResults
+from faintspot.study.sweep import Cell
+
+if TYPE_CHECKING:
+    import xarray
+
+_CONNECT_TIMEOUT_S = 10
+_SETTINGS = {
+    "distributed.scheduler.allowed-failures": 10,  # workers that may die on one cell
+    # Workers keep freed memory for the next block, up to these sizes in bytes; Dask's own setting makes the
+    # system clear it anew for every array, which takes a quarter of the time.
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
+}
+
+
+def run(
+    specification: StudySpecification,
+    store: str | Path | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    workers: int | None = None,
+    overwrite: bool = False,
+    announce: Callable[[str], None] | None = None,
+) -> xarray.Dataset:
+    """Run a study, or what is left of it.
+
+    Results depend on the specification alone: not on the number of workers, the order in which cells finish,
+    or interruptions.
+
+    Parameters
+    ----------
+    specification : StudySpecification
+    store : path, optional
+        Zarr store to write every cell to as it finishes, and to go on with when it is there. Without one,
+        results are in memory only.
+    scheduler : str, optional
+        Address of a running Dask scheduler, such as "tcp://host:8786", whose workers have the same version
+        of faintspot. Without one, a cluster of processes is started on this machine for the time of the run;
+        a script must then call this function under ``if __name__ == "__main__":``.
+    progress : callable, optional
+        Called with the number of cells measured in this run and the number to measure.
+    workers : int, optional
+        Processes of the cluster on this machine; all processors by default. 0 works in this process,
+        without Dask.
+    overwrite : bool
+        Replace the store, if it is one of a study.
+    announce : callable, optional
+        Called with a line of text that says where the work is done.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions cell, arm, mode, k, arm2; see `faintspot.study.store.VARIABLES`.
+
+    Raises
+    ------
+    InputError
+        When the store belongs to another study or cannot be written, or the scheduler is not to be reached.
+    MissingExtraError
+        When Dask is needed and not installed.
+    """
+    if not isinstance(specification, StudySpecification):
+        raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
+    if workers is not None:
+        workers = int(number_between("workers", workers, 0, 10_000, integer=True))
+    results: MemoryResults | StoredResults
+    if store is None:
+        results = MemoryResults(specification)
+    else:
+        results = StoredResults(Path(store), specification, overwrite=overwrite)
+    cells = {i: cell for i, cell in enumerate(specification.cells()) if not results.done()[i]}
+    if cells:
+        finished = _finished_cells(specification, cells, scheduler, workers, announce or (lambda text: None))
+        for count, (index, measured) in enumerate(finished, start=1):
+            results.write(index, measured)
+            if progress is not None:
+                progress(count, len(cells))
+    return results.dataset()
+
+
+def _finished_cells(
+    specification: StudySpecification,
+    cells: dict[int, Cell],
+    scheduler: str | None,
+    workers: int | None,
+    announce: Callable[[str], None],
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield index and results of every cell as it finishes."""
+    if workers == 0 and scheduler is None:
+        for index, cell in cells.items():
+            yield index, measure_cell(cell, specification)
+        return
+    distributed = _dask_distributed()
+    with _client(scheduler, workers, len(cells)) as client:
+        announce(f"Dask scheduler {client.scheduler.address}{_dashboard(client)}")
+        futures = {
+            client.submit(
+                _measure_on_worker, cell, specification, specification.fingerprint, pure=False
+            ): index
+            for index, cell in cells.items()
+        }
+        try:
+            for future in distributed.as_completed(list(futures)):
+                yield futures.pop(future), future.result()
+        except distributed.KilledWorker as error:
+            raise InputError(f"workers died repeatedly, perhaps of lack of memory: {error}") from None
+        finally:
+            client.cancel(list(futures))
+
+
+def _dask_distributed() -> Any:
+    """Return the module, of which only a part is typed."""
+    try:
+        return importlib.import_module("distributed")
+    except ImportError:
+        raise MissingExtraError("dask[distributed]", "study", "Running on several processes") from None
+
+
+def _measure_on_worker(cell: Cell, specification: StudySpecification, fingerprint: str) -> dict[str, Any]:
+    """Measure a cell where the code is the same as where the study was started."""
+    if specification.fingerprint != fingerprint:
+        raise InputError("a worker has another version of faintspot: install the same on all")
+    return measure_cell(cell, specification)
+
+
+@contextmanager
+def _client(scheduler: str | None, workers: int | None, n_cells: int) -> Iterator[Any]:
+    """Connect to a running scheduler, or start a cluster of this machine's processes."""
+    import dask
+
+    distributed = _dask_distributed()
+    if scheduler is not None:
+        try:
+            client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"scheduler = {scheduler!r}: cannot be reached, expected an address such as "
+                f"tcp://host:8786 ({' '.join(str(error).split())})"
+            ) from None
+        with client:
+            yield client
+        return
+    options: dict[str, Any] = {
+        "n_workers": min(available_cpus() if workers is None else workers, n_cells),
+        "threads_per_worker": 1,
+        "processes": True,
+        "memory_limit": None,
+        "dashboard_address": "localhost:0",
+        "silence_logs": logging.CRITICAL,
+    }
+    with (
+        dask.config.set(_SETTINGS),
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
+
+
+def _dashboard(client: Any) -> str:
+    """Return where the dashboard is; without Bokeh, which draws it, Dask links to a missing page."""
+    link = client.dashboard_link
+    return f", dashboard {link}" if link and importlib.util.find_spec("bokeh") else ""

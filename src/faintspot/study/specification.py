@@ -1,0 +1,254 @@
+"""What a study measures: its sweeps, the arms that are compared, and what each arm may choose from."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from faintspot import __version__
+from faintspot.checks import number_between, one_of
+from faintspot.errors import InputError
+from faintspot.study.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
+
+__all__ = ["ARMS", "PROFILES", "StudySpecification", "Sweep"]
+
+ARMS = ("plain", "tv", "threshold", "gaussian", "median", "thresholded")
+BEST = "best"
+_CANDIDATES = {"tv": "strengths", "gaussian": "widths", "thresholded": "thresholds"}
+_CANDIDATE_RANGES = {
+    "strengths": Range("1", 0.0, 10.0, low_open=True),
+    "widths": Range("px", 0.0, 10.0, low_open=True),
+    "thresholds": Range("1", 0.0, 100.0),
+}
+_RANGE_KEYS = ("from", "to", "points", "spacing")
+_FORMAT = 1  # of the results: raised when the same specification gives other numbers or another layout
+
+
+@dataclass(frozen=True)
+class StudySpecification:
+    """A Monte-Carlo study of the slope error.
+
+    Parameters
+    ----------
+    name : str
+    sweeps : sequence of Sweep
+        A cell that is in several sweeps is measured once.
+    seed : int
+        From 0. Every cell's own seed comes from this one and its coordinates.
+    realisations : int
+        Simulated images of each cell, at least 20. Settings are chosen on the first half of them and scored
+        on the second.
+    arms : sequence of str
+        What is compared, of "plain", "tv", "threshold", "gaussian", "median", "thresholded".
+    strengths : sequence of float
+        Strengths of "tv" to choose from, as fractions of the noise of a mean pixel.
+    widths : sequence of float
+        Widths (standard deviations, px) of "gaussian" to choose from.
+    thresholds : sequence of float
+        Thresholds of "thresholded" to choose from, in units of the noise of a mean pixel.
+    fixed_k : sequence of int
+        Numbers of kept pixels of the modes in which all arms keep the same number.
+
+    Raises
+    ------
+    InputError
+        For a value out of its range, an empty list, an unknown arm, two sweeps of one name, a `fixed_k`
+        that no window of the study has enough pixels for.
+    """
+
+    name: str
+    sweeps: Sequence[Sweep]
+    seed: int = 1
+    realisations: int = 10_000
+    arms: Sequence[str] = ARMS
+    strengths: Sequence[float] = (0.3, 0.5, 0.7, 0.85, 1.0)
+    widths: Sequence[float] = (0.4, 0.6, 0.8, 1.0, 1.3)
+    thresholds: Sequence[float] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+    fixed_k: Sequence[int] = (20, 40, 60)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"name: expected a text, got {self.name!r}")
+        self._set("seed", int(number_between("seed", self.seed, 0, 2**63 - 1, integer=True)))
+        number = number_between("realisations", self.realisations, 20, 10_000_000, integer=True)
+        self._set("realisations", int(number))
+        self._set("sweeps", _checked_sweeps(self.sweeps))
+        self._set("arms", tuple(one_of("arms", arm, ARMS) for arm in _checked_list("arms", self.arms)))
+        for name, bounds in _CANDIDATE_RANGES.items():
+            items = _checked_list(name, getattr(self, name))
+            self._set(name, tuple(checked_numbers(name, items, bounds)))
+        self._set("fixed_k", self._checked_fixed_k())
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _checked_fixed_k(self) -> tuple[int, ...]:
+        if not len(self.fixed_k):
+            return ()
+        largest = max(cell.pixels for cell in self.cells()) ** 2
+        kept = checked_numbers("fixed_k", self.fixed_k, Range("px", 1, 1e9), integer=True)
+        for k in kept:
+            if k >= largest:
+                raise InputError(
+                    f"fixed_k = {k}: expected less than the {largest} pixels of the largest window"
+                )
+        return tuple(dict.fromkeys(kept))
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of the modes: "best", then "fixed20" and so on."""
+        return (BEST, *(f"fixed{k}" for k in self.fixed_k))
+
+    def candidates(self, arm: str) -> tuple[float, ...]:
+        """Return what an arm chooses from; one NaN for an arm that has nothing but k to choose."""
+        return tuple(getattr(self, _CANDIDATES[arm])) if arm in _CANDIDATES else (float("nan"),)
+
+    def cells(self) -> list[Cell]:
+        """Return all cells, each once, in the order of the sweeps."""
+        return list(dict.fromkeys(cell for sweep in self.sweeps for cell in sweep.cells()))
+
+    @property
+    def largest_k(self) -> int:
+        """The largest number of pixels that can be kept in any window."""
+        return max(cell.pixels for cell in self.cells()) ** 2 - 1
+
+    @property
+    def fingerprint(self) -> str:
+        """A text that differs whenever the results could."""
+        text = f"{_FORMAT}\n{__version__}\n{self.to_text()}"
+        return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+    def to_text(self) -> str:
+        """Return the specification as TOML with every value written out."""
+        document = tomlkit.document()
+        for field in fields(self):
+            if field.name != "sweeps":
+                value = getattr(self, field.name)
+                document[field.name] = list(value) if isinstance(value, tuple) else value
+        sweeps = tomlkit.table()
+        for sweep in self.sweeps:
+            sweeps[sweep.name] = {name: list(getattr(sweep, name)) for name in PARAMETERS}
+        document["sweeps"] = sweeps
+        return tomlkit.dumps(document)
+
+    @classmethod
+    def from_text(cls, text: str, where: str = "specification") -> StudySpecification:
+        """Read a specification from TOML text; `where` names it in messages.
+
+        Raises
+        ------
+        InputError
+            When it is not TOML, has an unknown key, lacks one or has a bad value.
+        """
+        try:
+            document: dict[str, Any] = tomlkit.parse(text).unwrap()
+        except TOMLKitError as error:
+            raise InputError(f"{where}: not a TOML file: {str(error).splitlines()[0]}") from None
+        try:
+            return _build(document)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> StudySpecification:
+        """Read a specification from a TOML file; its name is the file's where it gives none.
+
+        Raises
+        ------
+        InputError
+            As `from_text`, and when the file cannot be read.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{path}: not a TOML file: it is not UTF-8 text") from None
+        return cls.from_text(text, str(path))
+
+
+def _checked_list(name: str, given: Any) -> list[Any]:
+    """Return a list without repeated items, or raise InputError when it is none or empty."""
+    if isinstance(given, str) or np.ndim(given) != 1:
+        raise InputError(f"{name}: expected a list, got {given!r}")
+    if not len(given):
+        raise InputError(f"{name}: expected at least one value, got an empty list")
+    return list(dict.fromkeys(given))
+
+
+def _checked_sweeps(given: Any) -> tuple[Sweep, ...]:
+    sweeps = tuple(given) if isinstance(given, Iterable) else ()
+    if not sweeps or not all(isinstance(sweep, Sweep) for sweep in sweeps):
+        raise InputError(f"sweeps: expected at least one sweep, got {given!r}")
+    names = [sweep.name for sweep in sweeps]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"sweeps: expected different names, got {name!r} {names.count(name)} times")
+    return sweeps
+
+
+# Reading -----------------------------------------------------------------------------------------------
+
+
+def _build(document: dict[str, Any]) -> StudySpecification:
+    known = [field.name for field in fields(StudySpecification)]
+    for key in document:
+        _check_known("", key, known)
+    for key in ("name", "sweeps"):
+        if key not in document:
+            raise InputError(f"{key}: expected a value, found none")
+    tables = document["sweeps"]
+    if not isinstance(tables, dict) or not tables:
+        raise InputError("sweeps: expected at least one table, such as [sweeps.signal]")
+    sweeps = [_sweep(name, table) for name, table in tables.items()]
+    return StudySpecification(**{**document, "sweeps": sweeps})
+
+
+def _sweep(name: str, table: Any) -> Sweep:
+    if not isinstance(table, dict):
+        raise InputError(f"sweeps.{name}: expected a table, got {table!r}")
+    for key in table:
+        _check_known(f"sweeps.{name}.", key, PARAMETERS)
+    values = {
+        key: _spread(f"sweeps.{name}.{key}", key, value) if isinstance(value, dict) else value
+        for key, value in table.items()
+    }
+    return Sweep(name, **values)
+
+
+def _spread(where: str, parameter: str, table: dict[str, Any]) -> list[float]:
+    """Return the numbers of { from = 10, to = 1000, points = 9, spacing = "log" }."""
+    for key in table:
+        _check_known(f"{where}.", key, _RANGE_KEYS)
+    for key in ("from", "to", "points"):
+        if key not in table:
+            raise InputError(f"{where}.{key}: expected a value, found none")
+    if parameter not in RANGES:
+        raise InputError(f"{where}: expected a text or a list of texts, got a range")
+    spacing = one_of(f"{where}.spacing", table.get("spacing", "linear"), ("linear", "log"))
+    low, high = (number_between(f"{where}.{key}", table[key]) for key in ("from", "to"))
+    if low >= high:
+        raise InputError(f"{where}: expected from below to, got the empty range {low:g} to {high:g}")
+    if spacing == "log" and low <= 0:
+        raise InputError(f"{where}.from = {low:g}: expected a number above 0 for a logarithmic spacing")
+    points = int(number_between(f"{where}.points", table["points"], 2, 10_000, integer=True))
+    numbers = (np.geomspace if spacing == "log" else np.linspace)(low, high, points)
+    return [float(f"{number:.4g}") for number in numbers]
+
+
+def _check_known(prefix: str, key: str, known: Sequence[str]) -> None:
+    if key not in known:
+        close = difflib.get_close_matches(key, known, 1)
+        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
+        raise InputError(f"{prefix}{key}: unknown key; {hint}")

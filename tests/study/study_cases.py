@@ -1,0 +1,90 @@
+"""Small synthetic studies with known curves, in the form that a run of a study has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray
+
+ARMS = ("plain", "tv", "threshold", "gaussian", "median", "thresholded")
+MODES = ("best", "fixed20", "fixed40", "fixed60")
+DEFAULTS: dict[str, Any] = {
+    "flux_e": 100.0,
+    "read_noise_e": 0.1,
+    "profile": "diffraction",
+    "size": 1.0,
+    "elongation": 1.0,
+    "pixels": 16,
+    "position_range_px": 1.0,
+    "background_e": 0.0,
+    "em_gain": 1.0,
+}
+Cell = dict[str, Any]
+FLUXES_E = (10.0, 30.0, 80.0, 300.0, 1000.0)
+
+
+def cells(*, fluxes: Sequence[float] = FLUXES_E, **parameters: Any) -> list[Cell]:
+    return [{**DEFAULTS, **parameters, "flux_e": flux} for flux in fluxes]
+
+
+def power_law(gain: Callable[[Cell, str, str], float]) -> Callable[[Cell, str, str], float]:
+    """R as if an arm had `gain(cell, arm, mode)` times the light."""
+
+    def error(cell: Cell, arm: str, mode: str) -> float:
+        flux = cell["flux_e"] * gain(cell, arm, mode)
+        return float(0.9 * cell["size"] * np.sqrt(1 / flux + (3 * cell["read_noise_e"] / flux) ** 2))
+
+    return error
+
+
+def dataset(
+    every: list[Cell],
+    error: Callable[[Cell, str, str], float],
+    *,
+    relative_se: float = 0.003,
+    correlation: float = 0.6,
+    rise_with_k: Callable[[str], float] = lambda arm: 0.5 if arm == "plain" else 0.1,
+    unfinished: Sequence[int] = (),
+) -> xarray.Dataset:
+    """Return the dataset of a study whose scored errors are exactly those of `error`."""
+    n, k = len(every), np.arange(1, max(cell["pixels"] for cell in every) ** 2)
+    values = np.array([[[error(cell, arm, mode) for mode in MODES] for arm in ARMS] for cell in every])
+    se = relative_se * values
+    matrix = np.full((len(ARMS), len(ARMS)), correlation) + (1 - correlation) * np.eye(len(ARMS))
+    covariance = np.einsum("cam,cbm,ab->cmab", se, se, matrix)
+    rise = np.array([[1 + rise_with_k(arm) * np.log(k / 10) ** 2 / 3 for arm in ARMS]])
+    at_k = values[:, :, :1] * rise
+    beyond = np.array([cell["pixels"] ** 2 - 1 for cell in every])[:, None, None] < k
+    at_k = np.where(beyond, np.nan, at_k)
+    at_k[:, ARMS.index("thresholded")] = np.nan
+    done = np.ones(n, dtype=bool)
+    done[list(unfinished)] = False
+    choice = np.broadcast_to(0.5, values.shape).copy()
+    data = {
+        "error": (("cell", "arm", "mode"), values),
+        "error_se": (("cell", "arm", "mode"), se),
+        "error_covariance": (("cell", "mode", "arm", "arm2"), covariance),
+        "chosen_k": (("cell", "arm", "mode"), np.full(values.shape, 12.0)),
+        "chosen_candidate": (("cell", "arm", "mode"), choice),
+        "error_at_k": (("cell", "arm", "k"), at_k),
+        "error_at_k_se": (("cell", "arm", "k"), relative_se * at_k),
+        "invalid_fraction": (("cell", "arm", "mode"), np.zeros(values.shape)),
+    }
+    for name, (dims, array) in data.items():
+        array = array.astype(float)
+        array[~done] = np.nan
+        data[name] = (dims, array)
+    coordinates = {name: ("cell", np.array([cell[name] for cell in every])) for name in DEFAULTS}
+    return xarray.Dataset(
+        {**data, "done": ("cell", done)},
+        coords={**coordinates, "arm": list(ARMS), "mode": list(MODES), "arm2": list(ARMS), "k": k},
+        attrs={
+            "specification": 'name = "synthetic"\n',
+            "seed": 1,
+            "n": 2000,
+            "fingerprint": "0",
+            "faintspot_version": "0",
+        },
+    )

@@ -1,0 +1,112 @@
+"""The store of a study: whole cells or none, and nobody else's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.study.study_runs import N_CELLS, SPECIFICATION, assert_identical
+
+from faintspot import InputError
+from faintspot.study import StudySpecification, measure_cell, open_study
+
+pytest.importorskip("zarr")
+xarray = pytest.importorskip("xarray")
+
+from faintspot.study.store import VARIABLES, MemoryResults, StoredResults, new_dataset  # noqa: E402
+
+OTHER = replace(SPECIFICATION, seed=2)
+
+
+def test_schema() -> None:
+    dataset = new_dataset(SPECIFICATION)
+    assert dict(dataset.sizes) == {"cell": N_CELLS, "arm": 6, "arm2": 6, "mode": 3, "k": 63}
+    assert set(dataset.data_vars) == {*VARIABLES, "done"}
+    assert dataset["error_covariance"].dims == ("cell", "mode", "arm", "arm2")
+    assert dataset["error_at_k"].dims == ("cell", "arm", "k")
+    for name in VARIABLES:
+        assert dataset[name].attrs["units"]
+        assert np.isnan(dataset[name]).all()
+    assert not dataset["done"].any()
+    assert dataset["flux_e"].attrs["units"] == "electron"
+    assert dataset["pixels"].dtype.kind == "i"
+    assert list(dataset["mode"].values) == ["best", "fixed10", "fixed40"]
+    assert StudySpecification.from_text(dataset.attrs["specification"]) == SPECIFICATION
+    assert (dataset.attrs["seed"], dataset.attrs["n"]) == (1, 200)
+
+
+def test_store_is_memory(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    stored, memory = StoredResults(path, SPECIFICATION), MemoryResults(SPECIFICATION)
+    assert_identical(stored.dataset(), memory.dataset())
+    for index in (2, 0):
+        results = measure_cell(SPECIFICATION.cells()[index], SPECIFICATION)
+        stored.write(index, results)
+        memory.write(index, results)
+    assert_identical(stored.dataset(), memory.dataset())
+    assert np.flatnonzero(stored.done()).tolist() == [0, 2]
+    # One chunk a cell and variable.
+    assert sorted(p.name for p in (path / "error" / "c").iterdir()) == ["0", "2"]
+    again = StoredResults(path, SPECIFICATION)
+    np.testing.assert_array_equal(again.done(), memory.done())
+    # A window of 6 x 6 pixels has no more than 35 k.
+    small = memory.dataset().isel(cell=0)
+    assert int(small["pixels"]) == 6
+    assert np.isfinite(small["error_at_k"].sel(arm="plain", k=slice(1, 35))).all()
+    assert np.isnan(small["error_at_k"].sel(k=slice(36, None))).all()
+    opened = xarray.open_zarr(path, consolidated=False)
+    np.testing.assert_array_equal(opened["error"], memory.dataset()["error"])
+
+
+def test_a_cell_half_written_is_not_done(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    store = StoredResults(path, SPECIFICATION)
+    results = measure_cell(SPECIFICATION.cells()[0], SPECIFICATION)
+    store.write(0, {"error": results["error"]})
+    (path / "done" / "c" / "0").unlink()  # as if killed before
+    (path / "error" / "c" / "0" / "0" / "0").write_bytes(b"")
+    (path / "error" / "c" / "0" / "0" / "0.abc.partial").write_bytes(b"half")
+    again = StoredResults(path, SPECIFICATION)
+    assert not again.done().any()
+    assert not list(path.rglob("*.partial"))
+    again.write(0, results)
+    np.testing.assert_array_equal(open_study(path)["error"][0], results["error"])
+
+
+def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    StoredResults(path, SPECIFICATION)
+    with pytest.raises(InputError, match=r"s\.zarr: belongs to another study \('small'"):
+        StoredResults(path, OTHER)
+    StoredResults(path, OTHER, overwrite=True)
+    assert open_study(path).attrs["fingerprint"] == OTHER.fingerprint
+    file = tmp_path / "file"
+    file.write_text("mine")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for taken in (file, folder):
+        with pytest.raises(InputError, match="is not the store of a study"):
+            StoredResults(taken, SPECIFICATION, overwrite=True)
+    assert file.read_text() == "mine"
+    with pytest.raises(InputError, match="does not exist"):
+        StoredResults(tmp_path / "no" / "s.zarr", SPECIFICATION)
+    for wrong, found in ((folder, "something else"), (tmp_path / "nothing", "nothing")):
+        with pytest.raises(InputError, match=f"found {found}"):
+            open_study(wrong)
+
+
+def test_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    StoredResults(path, SPECIFICATION).write(0, measure_cell(SPECIFICATION.cells()[0], SPECIFICATION))
+    (path / "error" / "c" / "0" / "0" / "0").write_bytes(b"rubbish")
+    with pytest.raises(InputError, match="damaged") as raised:
+        open_study(path)
+    assert "\n" not in str(raised.value)
+    metadata = json.loads((path / "done" / "zarr.json").read_text())
+    metadata["shape"] = "many"
+    (path / "done" / "zarr.json").write_text(json.dumps(metadata))
+    with pytest.raises(InputError, match="damaged"):
+        StoredResults(path, SPECIFICATION)
