@@ -39,8 +39,8 @@ class TestPage:
     def test_is_complete_and_in_order(self) -> None:
         html = study_report(of(paper.specification(quick=True)))
         sections = re.findall(r'<section id="([^"]+)"', html)
-        assert sections[:3] == ["verdicts", "guidance", "baselines"]
-        assert sections[3:10] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
+        assert sections[:4] == ["verdicts", "guidance", "baselines", "gains"]
+        assert sections[4:11] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
         assert sections[-2:] == ["cases", "specification"]
         assert html.count('<tr><th scope="row">') >= 8
         assert "not finished" not in html

@@ -18,6 +18,7 @@ from faintspot.study.baselines import ARM_NAMES, against_tv
 from faintspot.study.claims import fixed_mode, verdicts
 from faintspot.study.figure_data import StudyFigure, csv_text, mode_in_words
 from faintspot.study.figures import baselines_figure, kept_pixels_figure, sweep_figure
+from faintspot.study.gains import gains_by_mode
 from faintspot.study.guidance import guidance
 from faintspot.study.specification import StudySpecification
 from faintspot.study.sweep import PARAMETERS
@@ -207,6 +208,8 @@ def _page(dataset: xarray.Dataset, pictures: list[_Picture]) -> str:
         cases_csv=_csv_uri(_cases_csv(judged)),
         guidance=guidance(dataset),
         baselines=_baselines_rows(dataset),
+        gain_modes=[mode_in_words(str(mode)) for mode in dataset["mode"].values],
+        gains=_gains_rows(dataset),
         pictures=pictures,
         specification=str(attributes["specification"]).strip(),
         version=attributes.get("faintspot_version", ""),
@@ -284,6 +287,17 @@ def _baselines_rows(dataset: xarray.Dataset) -> list[list[str]]:
         ]
         for mode in modes
         for row in against_tv(dataset, mode)
+    ]
+
+
+def _gains_rows(dataset: xarray.Dataset) -> list[list[str]]:
+    modes = [str(mode) for mode in dataset["mode"].values]
+    return [
+        [
+            configuration.in_words(),
+            *("–" if (gain := gains.get(mode)) is None else gain.in_words() for mode in modes),
+        ]
+        for configuration, gains in gains_by_mode(dataset).items()
     ]
 
 
