@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rival_numpy import momenta
-from faintspot.kernels.total_variation import FGP_STEP, FIRST_MULTIPLIER
+from faintspot.kernels.sweeps import FGP_STEP
+from faintspot.kernels.total_variation import FIRST_MULTIPLIER
 
 # Must be in the environment before JAX is first imported.
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"

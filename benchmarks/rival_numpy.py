@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.kernels.total_variation import FGP_STEP, FIRST_MULTIPLIER
+from faintspot.kernels.sweeps import FGP_STEP
+from faintspot.kernels.total_variation import FIRST_MULTIPLIER
 
 Floats = NDArray[np.float32]
 

@@ -40,7 +40,7 @@ import numpy as np
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, median_ratio, pinned
 from benchmarks.sweeps import SIDE, Group, numba_sweeps
 from faintspot.kernels.host import aligned_zeros
-from faintspot.kernels.total_variation import STATE_VECTORS
+from faintspot.kernels.sweeps import STATE_VECTORS
 
 WIDTHS = (16, 8, 4)
 TARGET = 0.75

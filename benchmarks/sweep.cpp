@@ -1,4 +1,4 @@
-// The sweep of faintspot.kernels.total_variation.sweep_fgp in C++: same layout, same arithmetic, GCC's vector
+// The sweep of faintspot.kernels.sweeps.sweep_fgp in C++: same layout, same arithmetic, GCC's vector
 // extensions. `state` holds five vectors a pixel (2 px, 2 py of both versions, g), `rows` qx, qy, v of the row above.
 
 #include <cstddef>

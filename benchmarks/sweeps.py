@@ -14,14 +14,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from faintspot.kernels import total_variation
+from faintspot.kernels import sweeps as kernel
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import new_scratch
 from faintspot.kernels.simd import splat, store
 
 SIDE = 16
 MOMENTUM, INVERSE = 0.5, 0.3  # of an ordinary iteration; their values do not change the work
-_sweep = total_variation.sweep_fgp
+_sweep = kernel.sweep_fgp
 
 Sweeps = Callable[[int], None]
 
@@ -47,9 +47,9 @@ class Group:
         self.width, self.side = width, side
         self.lanes = lanes_for(np.float32, width)
         _, _, self.state, self.rows, _, _, _ = new_scratch(self.lanes, side, side)
-        pixels = self.state.reshape(side * side, total_variation.STATE_VECTORS, width)
+        pixels = self.state.reshape(side * side, kernel.STATE_VECTORS, width)
         generator = np.random.default_rng(1)
-        pixels[:, total_variation.IMAGE] = generator.standard_normal((side * side, width), np.float32)
+        pixels[:, kernel.IMAGE] = generator.standard_normal((side * side, width), np.float32)
         self.norm: NDArray[np.float32] = np.zeros(width, np.float32)
 
     def numba(self, count: int) -> None:

@@ -12,8 +12,7 @@ from faintspot.errors import InputError
 from faintspot.kernels.fused import subtract_stack
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
-
-RULES = ("subtract_next", "threshold", "subtract_kth")
+from faintspot.sensor.settings import RULES
 
 
 def most_kept(pixels: int, rule: str) -> int:

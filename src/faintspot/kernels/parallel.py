@@ -14,6 +14,7 @@ import numpy as np
 from faintspot.kernels import brightest, total_variation
 from faintspot.kernels.host import aligned_zeros
 from faintspot.kernels.simd import Lanes
+from faintspot.kernels.sweeps import STATE_VECTORS
 
 _FEWEST_GROUPS = 16  # a thread with less to do costs more than it saves
 _local = threading.local()
@@ -36,7 +37,7 @@ def new_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
     return (
         aligned_zeros(pixels * width, lanes.dtype),
         aligned_zeros(pixels * width, lanes.dtype),
-        aligned_zeros(total_variation.STATE_VECTORS * pixels * width, lanes.dtype),
+        aligned_zeros(STATE_VECTORS * pixels * width, lanes.dtype),
         aligned_zeros((pixels + 2 * nx + 3) * width, lanes.dtype),
         aligned_zeros((total_variation.LANE_ROWS + brightest.LANE_ROWS) * width, lanes.dtype),
         np.zeros(total_variation.COUNT_ROWS * width, np.int64),
