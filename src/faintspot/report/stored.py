@@ -129,9 +129,6 @@ def _rebuild(store: _Store) -> None:
         tables: dict[str, Any] = tomlkit.parse(store.text).unwrap()
     except TOMLKitError as error:
         raise InputError(f"not TOML: {str(error).splitlines()[0]}") from None
-    places = store.stored.coordinates
-    if _is_map(tables.get("layout", {}).get("centres")) and {"centre_x", "centre_y"} <= set(places):
-        tables["layout"]["centres"] = np.stack([places["centre_x"], places["centre_y"]], axis=1).tolist()
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "configuration"
         copy.write_text(tomlkit.dumps(tables), encoding="utf-8")
