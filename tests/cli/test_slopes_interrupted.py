@@ -18,7 +18,8 @@ from faintspot import Settings, SlopePipeline, Slopes
 pytest.importorskip("zarr")
 
 N_FRAMES = 12_000  # three chunks of a store
-SETTINGS = Settings(noise_std=2.0, keep_brightest=10, tolerance=0.0, max_iterations=100)  # slow
+ITERATIONS = 800  # so that a run takes some seconds, and no signal comes after its end
+SETTINGS = Settings(noise_std=2.0, keep_brightest=10, tolerance=0.0, max_iterations=ITERATIONS)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def start_and_stop(output: Path, number: int) -> tuple[int, str]:
 def prepared(folder: Path, frames: np.ndarray) -> Callable[[str], Path]:
     np.save(folder / "a.npy", frames)
     text = (folder / "faintspot.toml").read_text()
-    (folder / "faintspot.toml").write_text(text + "tolerance = 0.0\nmax_iterations = 100\n")
+    (folder / "faintspot.toml").write_text(text + f"tolerance = 0.0\nmax_iterations = {ITERATIONS}\n")
     return lambda name: folder / name
 
 

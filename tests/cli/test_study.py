@@ -23,7 +23,7 @@ flux_e = [30, 100]
 """
 SLOW = """
 name = "slow"
-realisations = 300
+realisations = 1500
 arms = ["plain", "tv"]
 
 [sweeps.flux]
