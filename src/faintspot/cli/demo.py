@@ -12,6 +12,7 @@ from rich.table import Table
 
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
+from faintspot.io.slopes import read_slopes
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 from faintspot.sensor import configuration
@@ -106,14 +107,12 @@ def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.ran
         config = folder / f"{stem}.toml"
         for item in (layout, chosen.settings, demonstration.CALIBRATION):
             configuration.save(config, item)
+        output = folder / f"{stem}.npz"
         with progress_bar(f"slopes, {name}") as advance:
-            measure_recorded(
-                [folder / "frames.npy"], config, folder / f"{stem}.npz", overwrite=True, progress=advance
-            )
-        pipeline = SlopePipeline.from_file(config)
-        slopes = pipeline(frames)
-        arms.append(Arm(name, slopes.x, slopes.y, slopes.flux, slopes.flags, slopes.iterations))
-        stages[name] = pipeline.explain(frames[0])
+            measure_recorded([folder / "frames.npy"], config, output, overwrite=True, progress=advance)
+        stored = read_slopes(output).variables
+        arms.append(Arm(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations"))))
+        stages[name] = SlopePipeline.from_file(config).explain(frames[0])
     facts = {
         "Source": "simulated, with known truth",
         "Light": f"{demonstration.SHOWN_FLUX_E:g} e- per sub-aperture and frame",

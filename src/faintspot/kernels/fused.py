@@ -34,8 +34,6 @@ SETTING_ROWS = 9
 CALIBRATED, DENOISED, BACKGROUND = range(3)
 STAGE_ROWS = 3
 
-_NUMBERS = total_variation.LANE_ROWS  # the centroid's numbers follow the denoiser's in one table
-
 
 @compiled
 def slopes_of_groups(
@@ -82,7 +80,8 @@ def slopes_of_groups(
     width = width_of(lanes)
     image, output, state, rows, numbers, counts, lane_counts = scratch
     places, flags, bad_counts = lane_counts[:width], lane_counts[width : 2 * width], lane_counts[2 * width :]
-    centroid_numbers = numbers[_NUMBERS * width :]
+    # The centroid's numbers follow the denoiser's in one table.
+    centroid_numbers = numbers[total_variation.LANE_ROWS * width :]
     n = corners.shape[0]
     n_groups = (n + width - 1) // width
     for item in range(start, stop):
@@ -117,7 +116,18 @@ def slopes_of_groups(
             _store_stage(width, output, stages[BACKGROUND, f], first)
         for lane in range(min(width, n - first)):
             _store_slope(
-                width, ny, nx, lane, f, first + lane, settings, numbers, counts, flags, bad_counts, slopes
+                width,
+                ny,
+                nx,
+                lane,
+                f,
+                first + lane,
+                settings,
+                centroid_numbers,
+                counts,
+                flags,
+                bad_counts,
+                slopes,
             )
 
 
@@ -152,12 +162,11 @@ def _store_slope(
 ) -> None:
     """Write one sub-aperture's result; the reference position (slope 0) where it is invalid."""
     x, y, flux, flag, iterations, bad_pixels = slopes
-    centroid = _NUMBERS * width + lane
-    total = numbers[centroid + brightest.SUM * width]
-    position_x, position_y = numbers[centroid + brightest.X * width], numbers[centroid + brightest.Y * width]
+    total = numbers[brightest.SUM * width + lane]
+    position_x, position_y = numbers[brightest.X * width + lane], numbers[brightest.Y * width + lane]
     bits = flags[lane]
     # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
-    lit = total > settings[FLOOR, s] * numbers[centroid + brightest.LARGEST * width]
+    lit = total > settings[FLOOR, s] * numbers[brightest.LARGEST * width + lane]
     inside = abs(position_x) <= 0.5 * nx and abs(position_y) <= 0.5 * ny
     if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
         if counts[total_variation.INFEASIBLE * width + lane]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.report.page import slopes_report as slopes_report
@@ -26,10 +27,4 @@ _HOMES = {
 __all__ = ["Arm", "layout_picture", "report_of_stored", "report_of_study", "slopes_report", "write_report"]
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name from its home at first use."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'faintspot.report' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOMES[name]), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy_attributes(__name__, _HOMES)

@@ -9,10 +9,11 @@ from scipy.ndimage import gaussian_filter
 from faintspot.estimate.centroid import centre_of_gravity
 from faintspot.estimate.total_variation import tv_denoise
 from faintspot.kernels import scoring
+from faintspot.sensor.settings import Settings
 from faintspot.study.sweep import Cell
 
-FLUX_FLOOR = 1e-4
-"""No light: the sum that is left is not above this fraction of the image's largest pixel, as in Settings."""
+FLUX_FLOOR: float = Settings.flux_floor
+"""No light: the sum that is left is not above this fraction of the image's largest pixel."""
 
 Images = NDArray[np.float32]
 

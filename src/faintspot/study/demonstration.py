@@ -45,7 +45,7 @@ class Arm:
     @property
     def slope_error(self) -> Estimate:
         """R with its standard error, px."""
-        return Estimate(float(self.errors.mean()), float(self.errors.std() / np.sqrt(self.errors.size)))
+        return Estimate.of_mean(self.errors)
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ class Comparison:
 
     def difference(self, i: int) -> Estimate:
         """R without minus R with denoising at flux i, with its paired standard error."""
-        difference = self.plain[i].errors - self.denoised[i].errors
-        return Estimate(float(difference.mean()), float(difference.std() / np.sqrt(difference.size)))
+        return Estimate.of_mean(self.plain[i].errors - self.denoised[i].errors)
 
     def flux_gain(self, rng: np.random.Generator) -> Estimate:
         """Flux gain of denoising at SHOWN_FLUX_E."""

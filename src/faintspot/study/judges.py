@@ -123,16 +123,19 @@ def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Gen
             if any(change is None for change in changes):
                 continue
             (tv, tv_error), (plain, plain_error) = (change for change in changes if change is not None)
-            finding = (
-                f"R at {large_key.pixels} px / R at {small_key.pixels} px: {np.exp(tv):.3f} ± "
-                f"{np.exp(tv) * tv_error:.3f} with TV, {np.exp(plain):.3f} ± "
-                f"{np.exp(plain) * plain_error:.3f} without"
-            )
+            both = _in_both((tv, tv_error), (plain, plain_error))
+            finding = f"R at {large_key.pixels} px / R at {small_key.pixels} px: {both}"
             within = abs(tv) - _SIGMAS * tv_error <= np.log1p(EQUAL)
             less = abs(plain) - abs(tv) > _SIGMAS * np.hypot(tv_error, plain_error)
             where = f"{flux:g} e-, {_words_without(large_key, 'pixels')}"
             cases.append(Case(where, finding, judged(bool(within), bool(less))))
     return cases
+
+
+def _in_both(tv: tuple[float, float], plain: tuple[float, float]) -> str:
+    """Say two ratios of R from their logarithms and the standard errors of these."""
+    with_tv, without = (f"{np.exp(log):.3f} ± {np.exp(log) * error:.3f}" for log, error in (tv, plain))
+    return f"{with_tv} with TV, {without} without"
 
 
 def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
@@ -147,11 +150,8 @@ def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Gene
                 if any(item is None for item in found):
                     continue
                 (plain, plain_error), (tv, tv_error) = (item for item in found if item is not None)
-                finding = (
-                    f"largest R / smallest R for k = {KEPT_RANGE[0]} to {KEPT_RANGE[1]}: {np.exp(tv):.3f} ± "
-                    f"{np.exp(tv) * tv_error:.3f} with TV, {np.exp(plain):.3f} ± "
-                    f"{np.exp(plain) * plain_error:.3f} without"
-                )
+                both = _in_both((tv, tv_error), (plain, plain_error))
+                finding = f"largest R / smallest R for k = {KEPT_RANGE[0]} to {KEPT_RANGE[1]}: {both}"
                 cases.append(
                     Case(
                         f"{label}; {panel.title}", finding, _less(plain - tv, np.hypot(tv_error, plain_error))

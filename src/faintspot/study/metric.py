@@ -21,6 +21,11 @@ class Estimate:
     value: float
     standard_error: float
 
+    @classmethod
+    def of_mean(cls, samples: NDArray[np.float64]) -> Estimate:
+        """Return the mean of independent samples with its standard error."""
+        return cls(float(samples.mean()), float(samples.std() / np.sqrt(samples.size)))
+
 
 def absolute_errors(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
     """Return (|dx| + |dy|) / 2 of every slope: the terms whose mean is R.
@@ -45,7 +50,7 @@ def absolute_errors(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> NDArray[np.
 def slope_error(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> Estimate:
     """Return R = mean of |estimate - truth| per axis, x and y averaged (Basden et al. 2015), in px."""
     errors = absolute_errors(x, y, truth)
-    return Estimate(float(errors.mean()), float(errors.std() / np.sqrt(errors.size)))
+    return Estimate.of_mean(errors)
 
 
 def flux_gain(
