@@ -12,6 +12,7 @@ from faintspot.errors import InputError
 from faintspot.simulate.detector import Detector
 from faintspot.simulate.generators import spawn
 from faintspot.simulate.spots import image_shape, per_spot, spots
+from faintspot.simulate.turbulence import LARGEST_D_OVER_R0, speckled_images
 
 _BLOCK_PIXELS = 1 << 21  # pixels simulated at a time: bounds the memory of the double-precision means
 
@@ -27,6 +28,7 @@ def subapertures(
     angle_deg: ArrayLike = 0.0,
     position_range_px: float = 1.0,
     positions: ArrayLike | None = None,
+    d_over_r0: float = 0.0,
     detector: Detector | None = None,
     rng: np.random.Generator | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -44,18 +46,23 @@ def subapertures(
         Rows and columns (ny, nx) of each image, px.
     flux_e : float or array_like, shape (n,)
         Electrons that a spot in the middle of its image leaves within it. Farther out more light is lost,
-        as behind a field stop.
+        as behind a field stop; turbulence, which spreads the light, loses more too.
     profile, size, elongation, angle_deg
         The spot's shape, see `faintspot.simulate.spots`.
     position_range_px : float
         True positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
         True x and y in px, instead of random ones.
+    d_over_r0 : float
+        Side of the square sub-aperture in units of the Fried parameter, 0 to 10: each spot is speckled by
+        Kolmogorov turbulence whose own mean gradient is taken off, so that the mean gradient of its phase
+        is the true position. 0: no turbulence, and the draws of positions and noise are those without this
+        option. More needs profile "diffraction" and elongation 1.
     detector : Detector, optional
         Default: 0.1 e- read noise and nothing else.
     rng : numpy.random.Generator, optional
-        Where positions and noise come from, each from a generator of its own: the same seed gives the same
-        positions whatever the detector.
+        Where positions, noise and turbulence come from, each from a generator of its own: the same seed
+        gives the same positions whatever the detector and the turbulence.
 
     Returns
     -------
@@ -71,32 +78,37 @@ def subapertures(
     """
     n = int(number_between("n", n, 1, integer=True))
     ny, nx = image_shape("shape", shape)
+    turbulence = number_between("d_over_r0", d_over_r0, 0.0, LARGEST_D_OVER_R0)
     position_rng, noise_rng = spawn(rng, 2)
+    # Spawned only when needed: what a generator gives to later calls does not change without turbulence.
+    phase_rng = spawn(rng, 1)[0] if turbulence else None
     truth = _true_positions(positions, position_range_px, (n, 2), position_rng)
     camera = _camera(detector)
-    flux, sizes, elongations, angles = (
-        per_spot(name, value, n)
-        for name, value in (
-            ("flux_e", flux_e),
-            ("size", size),
-            ("elongation", elongation),
-            ("angle_deg", angle_deg),
-        )
-    )
-    flux = _whole_flux(flux, (ny, nx), profile, sizes, elongations, angles)
+    spot = {
+        "size": per_spot("size", size, n),
+        "elongation": per_spot("elongation", elongation, n),
+        "angle_deg": per_spot("angle_deg", angle_deg, n),
+    }
+    flux = per_spot("flux_e", flux_e, n)
+    spot["flux_e"] = _whole_flux(flux, (ny, nx), profile, *spot.values())
+    if turbulence and (profile != "diffraction" or np.any(spot["elongation"] != 1)):
+        raise InputError(f"d_over_r0 = {turbulence:g}: expected profile 'diffraction' and elongation 1")
     images = np.empty((n, ny, nx), dtype=np.float32)
     block = max(1, _BLOCK_PIXELS // (ny * nx))
     for start in range(0, n, block):
         part = slice(start, start + block)
-        mean_e = spots(
-            truth[part],
-            shape=(ny, nx),
-            flux_e=flux[part],
-            profile=profile,
-            size=sizes[part],
-            elongation=elongations[part],
-            angle_deg=angles[part],
-        )
+        shapes = {name: value[part] for name, value in spot.items()}
+        if phase_rng is None:
+            mean_e = spots(truth[part], shape=(ny, nx), profile=profile, **shapes)
+        else:
+            mean_e, _ = speckled_images(
+                truth[part],
+                d_over_r0=turbulence,
+                shape=(ny, nx),
+                size=shapes["size"],
+                flux_e=shapes["flux_e"],
+                rng=phase_rng,
+            )
         images[part] = camera.to_electrons(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
     return images, truth
 
