@@ -20,6 +20,7 @@ def suggested_strength(
 
     The full photon noise, flux / pixels, would smooth the spot itself; a quarter of it was found best in
     Monte-Carlo studies at 0.1 e- of read noise. At 1 e- and more and low flux, 0.85 of the result is better.
+    Where the spot's size is known, `faintspot.estimate.automatic.automatic_strength` is nearer the best.
 
     Parameters
     ----------
