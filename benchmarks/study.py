@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, best, interleaved, median_ratio, pinned
-from faintspot.study.cell import mean_errors, measure_cell, realisations
+from faintspot.study.cell import measure_cell, realisations
 from faintspot.study.specification import StudySpecification
 from faintspot.study.sweep import Sweep
+from faintspot.study.tuning import mean_errors
 
 STRENGTHS = (0.3, 0.5, 0.7, 0.85, 1.0)
 SPECIFICATION = StudySpecification("benchmark", [Sweep("a", flux_e=60, read_noise_e=1)], realisations=2000)

@@ -149,5 +149,6 @@ def test_summary_counts_flags() -> None:
     assert summary.bad_frames == 1
     assert summary.measured == 480
     assert set(slopes_as_variables(expected(frames))) == {
-        *("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
+        *("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels"),
+        *("standard_error_x", "standard_error_y"),
     }

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from faintspot import estimators as estimators
     from faintspot import simulate as simulate
     from faintspot import study as study
     from faintspot.errors import InputError as InputError
     from faintspot.errors import MissingExtraError as MissingExtraError
+    from faintspot.estimate.bounds import cramer_rao as cramer_rao
+    from faintspot.estimate.bounds import photon_efficiency as photon_efficiency
     from faintspot.estimate.brightest import brightest_pixels as brightest_pixels
     from faintspot.estimate.centroid import centre_of_gravity as centre_of_gravity
     from faintspot.estimate.total_variation import Denoised as Denoised
@@ -19,9 +22,16 @@ if TYPE_CHECKING:
     from faintspot.pipeline import SlopePipeline as SlopePipeline
     from faintspot.pipeline import Slopes as Slopes
     from faintspot.pipeline import Stages as Stages
+    from faintspot.planner import tune as tune
     from faintspot.sensor.calibration import Calibration as Calibration
     from faintspot.sensor.layout import Layout as Layout
+    from faintspot.sensor.photon_transfer import measure_detector as measure_detector
+    from faintspot.sensor.psf import PSF as PSF
+    from faintspot.sensor.score import TrainedScore as TrainedScore
     from faintspot.sensor.settings import Settings as Settings
+    from faintspot.training import RunningPSF as RunningPSF
+    from faintspot.training import learn_psf as learn_psf
+    from faintspot.training import train_estimator as train_estimator
 
 __version__ = "0.1.0"
 
@@ -32,15 +42,25 @@ _HOMES = {
     "InputError": "faintspot.errors",
     "Layout": "faintspot.sensor.layout",
     "MissingExtraError": "faintspot.errors",
+    "PSF": "faintspot.sensor.psf",
+    "RunningPSF": "faintspot.training",
     "Settings": "faintspot.sensor.settings",
     "SlopePipeline": "faintspot.pipeline",
     "Slopes": "faintspot.pipeline",
     "Stages": "faintspot.pipeline",
     "SubapertureFlag": "faintspot.flags",
+    "TrainedScore": "faintspot.sensor.score",
     "brightest_pixels": "faintspot.estimate.brightest",
     "centre_of_gravity": "faintspot.estimate.centroid",
+    "cramer_rao": "faintspot.estimate.bounds",
+    "estimators": "faintspot.estimators",
+    "learn_psf": "faintspot.training",
+    "measure_detector": "faintspot.sensor.photon_transfer",
+    "photon_efficiency": "faintspot.estimate.bounds",
     "simulate": "faintspot.simulate",
     "study": "faintspot.study",
+    "train_estimator": "faintspot.training",
+    "tune": "faintspot.planner",
     "tv_denoise": "faintspot.estimate.total_variation",
 }
 

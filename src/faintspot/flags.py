@@ -22,6 +22,8 @@ class SubapertureFlag(IntFlag):
     """The strength is at or above the image's own rms: the denoised image is constant."""
     NOT_CONVERGED = 32
     """The iteration limit came before the tolerance was reached."""
+    OUTLIER_LIKELY = 64
+    """The spot is so faint that more than about 1 % of such slopes are those of noise, not of the spot."""
 
 
 INVALID = SubapertureFlag.NO_LIGHT | SubapertureFlag.TOO_MANY_BAD_PIXELS

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, real_array
 from faintspot.errors import InputError
-from faintspot.estimate.brightest import most_kept, threshold_rank
-from faintspot.estimate.total_variation import ALGORITHMS
 from faintspot.flags import INVALID
-from faintspot.kernels import fused
+from faintspot.kernels import fused, located
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
+from faintspot.preparation import METHODS, Preparation, packed_calibration
 from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
 from faintspot.sensor.settings import Settings
+
+_RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,9 @@ class Slopes:
     """Iterations that the denoising took."""
     bad_pixels: NDArray[np.int32]
     """Number of pixels that were masked, NaN or infinite."""
+    standard_error_x: NDArray[np.float32]
+    """Standard error of x, px; infinite where invalid, and where the read noise is not known."""
+    standard_error_y: NDArray[np.float32]
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -76,6 +83,10 @@ class SlopePipeline:
     reference : array or Slopes, optional
         Reference positions, px from each sub-aperture's centre, subtracted from every position: (n, 2) x and
         y, or (2 n,) all x then all y, or the slopes of one frame. Default 0.
+    psf : PSF, optional
+        Needed by the estimators "matched", "ml" and "map"; tells "weighted" and "auto" the spots' width.
+    score : TrainedScore, optional
+        Needed by the estimator "trained".
     width : int, optional
         SIMD width in float32 numbers: 4, 8 or 16. Default: what the machine has.
     threads : int, optional
@@ -101,6 +112,8 @@ class SlopePipeline:
         calibration: Calibration | None = None,
         reference: ArrayLike | Slopes | None = None,
         *,
+        psf: PSF | None = None,
+        score: TrainedScore | None = None,
         width: int | None = None,
         threads: int | None = None,
     ) -> None:
@@ -111,39 +124,57 @@ class SlopePipeline:
             None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
         )
         self._lanes = lanes_for(np.float32, width)
-        self._calibration = _packed_calibration(layout, self.calibration, self._lanes.width)
-        self._table = _settings_table(layout, settings)
+        self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         zero = layout.offsets + _reference_positions(reference, len(layout))
-        self._table[fused.ZERO_X], self._table[fused.ZERO_Y] = zero.T
+        self._preparation = Preparation(
+            layout, settings, self.calibration, psf, score, zero, self._lanes.width
+        )
+        self._identity = _identity(zero, psf, score)
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
         """Make the pipeline that a configuration file (faintspot.toml) describes."""
-        layout, settings, calibration = configuration.load_all(path)
-        return cls(layout, settings, calibration, **options)
+        layout, settings, calibration, psf, score = configuration.load_all(path)
+        return cls(layout, settings, calibration, psf=psf, score=score, **options)
 
     def fingerprint(self) -> bytes:
         """Return bytes that differ between pipelines that could give different slopes for the same frame."""
-        parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape), self._table)
-        text = f"{self.layout.window} {self.settings.algorithm} {self.calibration.saturation_adu}"
-        return b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + text.encode()
+        parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape))
+        calibration = self.calibration
+        text = (
+            f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_e} "
+            f"{calibration.background_e} {calibration.em_gain} {configuration.to_text(self.settings)}"
+        )
+        return (
+            b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()
+        )
 
-    def __call__(self, frame: ArrayLike) -> Slopes:
+    def __call__(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Slopes:
         """Measure the slopes of a frame (h, w) or of frames (n, h, w), in ADU.
 
         NaN and infinite pixels count as bad pixels; a sub-aperture that cannot be measured is flagged.
 
+        Parameters
+        ----------
+        frame : array
+        prior : array or Slopes, optional
+            Predicted slopes, px, for "map" (the mean of its prior) and "trained" (where it begins): as
+            `reference`, or one such array for every frame. Default 0.
+
         Raises
         ------
         InputError
-            For a frame that is not real or not of the layout's shape.
+            For a frame that is not real or not of the layout's shape, or a prior of the wrong shape.
         """
-        return self._run(self._checked(frame), explain=False)[0]
+        return self._run(self._checked(frame), prior, explain=False)[0]
 
-    def explain(self, frame: ArrayLike) -> Stages:
-        """Return the sub-aperture images after every step, for pictures and for finding faults."""
+    def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
+        """Return the sub-aperture images after every step, for pictures and for finding faults.
+
+        Estimators that work on the calibrated image itself leave it as it is in every step.
+        """
         array = self._checked(frame)
-        slopes, stages = self._run(array, explain=True)
+        slopes, stages = self._run(array, prior, explain=True)
         calibrated, denoised, background = stages.reshape(3, *slopes.x.shape, *self.layout.window)
         return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
 
@@ -156,26 +187,34 @@ class SlopePipeline:
             )
         return array
 
-    def _run(self, array: NDArray[Any], explain: bool) -> tuple[Slopes, NDArray[np.float32]]:
+    def _run(
+        self, array: NDArray[Any], prior: ArrayLike | Slopes | None, explain: bool
+    ) -> tuple[Slopes, NDArray[np.float32]]:
         """Compute the slopes, and the stages where asked for."""
         frames = _kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
-        dtypes = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32)
-        results = tuple(np.empty((n_frames, n), dtype) for dtype in dtypes)
+        results = tuple(np.empty((n_frames, n), dtype) for dtype in _RESULT_TYPES)
         stages = np.empty((fused.STAGE_ROWS if explain else 0, n_frames, n, self.layout.pixels), np.float32)
+        source = (frames, self.layout.corners, *self.layout.window, self._calibration)
         saturation = self.calibration.saturation(array.dtype)
-        algorithm = ALGORITHMS[self.settings.algorithm]
+        plan = self._preparation
+        variants = self._variants(source, saturation)
+        tables, constants, shape = plan.arguments()
+        if plan.estimator in METHODS:
+            kernel: Any = located.locate_groups
+            predicted = plan.no_prior if prior is None else _prior_slopes(prior, n_frames, n)
+            arguments: tuple[Any, ...] = (predicted, *constants)
+        else:
+            kernel, arguments = fused.slopes_of_groups, constants
 
         def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
-            fused.slopes_of_groups(
+            kernel(
                 self._lanes,
-                frames,
-                self.layout.corners,
-                *self.layout.window,
-                self._calibration,
+                *source,
                 saturation,
-                self._table,
-                algorithm,
+                tables,
+                variants,
+                *arguments,
                 start,
                 stop,
                 scratch,
@@ -184,9 +223,23 @@ class SlopePipeline:
             )
 
         n_groups = n_frames * -(-n // self._lanes.width)
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, shape)
         shaped: Any = (result.reshape(*array.shape[:-2], n) for result in results)
         return Slopes(*shaped), stages
+
+    def _variants(self, source: tuple[Any, ...], saturation: float) -> NDArray[np.int64]:
+        """Which table of settings every frame is measured with, by its light where that matters."""
+        n_frames, n = len(source[0]), len(self.layout)
+        if not self._preparation.needs_light:
+            return np.zeros(n_frames, np.int64)
+        light = np.empty((n_frames, n), np.float32)
+
+        def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
+            fused.light_of_groups(self._lanes, *source, saturation, start, stop, scratch, light)
+
+        n_groups = n_frames * -(-n // self._lanes.width)
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)
+        return self._preparation.variants(light.mean(axis=1, dtype=np.float64))
 
 
 def _kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
@@ -195,44 +248,6 @@ def _kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
         frames = np.ascontiguousarray(array, dtype=dtype)
     return frames.reshape(-1, *array.shape[-2:])
-
-
-def _packed_calibration(layout: Layout, calibration: Calibration, width: int) -> NDArray[np.float32]:
-    """Dark and scale of every sub-aperture's pixels in the kernel's own order, to be read as one stream.
-
-    Shape (n_groups, pixels, 2, W); the last group repeats its last sub-aperture.
-    """
-    n_groups = -(-len(layout) // width)
-    windows = layout.images(calibration.maps(layout.frame_shape)).reshape(2, len(layout), layout.pixels)
-    lanes = windows[:, np.minimum(np.arange(n_groups * width), len(layout) - 1)]
-    return np.ascontiguousarray(lanes.reshape(2, n_groups, width, layout.pixels).transpose(1, 3, 0, 2))
-
-
-def _settings_table(layout: Layout, settings: Settings) -> NDArray[np.float32]:
-    """Settings of every sub-aperture as the kernel reads them."""
-    n, pixels = len(layout), layout.pixels
-
-    def each(name: str) -> NDArray[Any]:
-        return settings.values(name, n, pixels)
-
-    table = np.zeros((fused.SETTING_ROWS, n), np.float32)
-    table[fused.STRENGTH] = np.where(each("denoise"), each("noise_std"), 0.0)
-    table[fused.TOLERANCE] = each("tolerance")
-    table[fused.LIMIT] = each("max_iterations")
-    table[fused.FLOOR] = each("flux_floor")
-    table[fused.MOST_BAD] = np.floor(each("max_bad_fraction") * pixels)
-    keep, rules = each("keep_brightest"), each("rule")
-    for rule in np.unique(rules):
-        selected = rules == rule
-        limit = most_kept(pixels, rule)
-        if keep[selected].max() > limit:
-            raise InputError(
-                f"settings.keep_brightest = {keep[selected].max()}: expected at most {limit} "
-                f"with rule {str(rule)!r} in windows of {layout.window[0]} x {layout.window[1]} pixels"
-            )
-        table[fused.RANK, selected] = threshold_rank(keep[selected], rule)
-        table[fused.SUBTRACT, selected] = rule != "threshold"
-    return table
 
 
 def _reference_positions(reference: ArrayLike | Slopes | None, n: int) -> NDArray[np.float64]:
@@ -245,3 +260,27 @@ def _reference_positions(reference: ArrayLike | Slopes | None, n: int) -> NDArra
     if array.shape != (n, 2):
         raise InputError(f"reference: expected shape ({n}, 2) or ({2 * n},), got {array.shape}")
     return array.astype(np.float64)
+
+
+def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, n: int) -> NDArray[np.float32]:
+    """Predicted slopes as the kernel reads them: (1 or n_frames, 2, n)."""
+    array = finite_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
+    if array.shape in ((n, 2), (n_frames, n, 2)):
+        array = np.moveaxis(array, -1, -2)
+    elif array.shape not in ((2 * n,), (n_frames, 2 * n)):
+        raise InputError(
+            f"prior: expected shape ({n}, 2) or ({2 * n},), or as many for each of the {n_frames} frames, "
+            f"got {array.shape}"
+        )
+    return np.ascontiguousarray(array.reshape(-1, 2, n), np.float32)
+
+
+def _identity(zero: NDArray[np.float64], psf: PSF | None, score: TrainedScore | None) -> bytes:
+    """A digest of what slopes depend on beside layout, settings and calibration."""
+    digest = hashlib.sha256(zero.tobytes())
+    for part in (psf, score):
+        for field in fields(part) if part is not None else ():
+            value = getattr(part, field.name)
+            whole = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(f"{type(part).__name__}.{field.name}".encode() + whole)
+    return digest.digest()

@@ -17,6 +17,7 @@ from faintspot.flags import SubapertureFlag
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.io.locations import split_location
 from faintspot.io.slopes import create_writer
+from faintspot.io.slopes_format import VARIABLES
 from faintspot.pipeline import SlopePipeline, Slopes
 from faintspot.sensor import configuration
 
@@ -94,12 +95,14 @@ def measure_recorded(
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
-    layout, settings, calibration = configuration.load_all(configuration_file)
+    layout, settings, calibration, psf, score = configuration.load_all(configuration_file)
     if not denoise:
         settings = settings.replace(denoise=False)
     positions = read_array(reference) if isinstance(reference, str | Path) else reference
     try:
-        pipeline = SlopePipeline(layout, settings, calibration, positions, threads=threads)
+        pipeline = SlopePipeline(
+            layout, settings, calibration, positions, psf=psf, score=score, threads=threads
+        )
     except InputError as error:
         about_reference = positions is not None and str(error).startswith("reference")
         where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
@@ -147,8 +150,7 @@ def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
 
 def slopes_as_variables(slopes: Slopes) -> dict[str, NDArray[Any]]:
     """Return the slopes of several frames as a file's variables."""
-    names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
-    return {name: getattr(slopes, name) for name in names}
+    return {name: getattr(slopes, name) for name in VARIABLES}
 
 
 def _version(path: Path) -> str:

@@ -199,3 +199,16 @@ def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> 
     assert calibration.bad_pixels.tolist() == [[5, 70], [80, 3]]
     # The median of some hundred background pixels with 3 e- of noise and faint wings of the spots.
     assert calibration.dark == pytest.approx(OFFSET_ADU, abs=1.5)
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_settings_without_a_layout_are_kept(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = Settings(estimator="weighted", spot_fwhm_px=2.5)
+    settings.save("tuned.toml")
+    np.save("spots.npy", frames())
+    assert "settings that tuned.toml has are kept" in run.ok("layout", "spots.npy", "-o", "tuned.toml").out
+    assert Settings.load("tuned.toml") == settings
+    assert "exists already" in run.refused("layout", "spots.npy", "-o", "tuned.toml").error

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ def frames() -> np.ndarray:
 @pytest.fixture(scope="module")
 def uninterrupted(frames: np.ndarray) -> Slopes:
     few = SlopePipeline(LAYOUT, SETTINGS)(frames[:100])
-    names = ("x", "y", "flux", "flags", "iterations", "bad_pixels")
+    names = [field.name for field in fields(Slopes)]
     return Slopes(*(np.tile(getattr(few, name), (N_FRAMES // 100, 1)) for name in names))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.cli.cli_cases import Commands, command_line
 
-from faintspot.study import StudySpecification, open_study, run
+from faintspot.study import StudySpecification, Sweep, estimators, open_study, run
 
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")
@@ -29,6 +29,17 @@ arms = ["plain", "tv"]
 [sweeps.flux]
 flux_e = { from = 10, to = 1000, points = 30, spacing = "log" }
 """
+
+
+def test_estimators(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = Sweep("a", flux_e=[50, 200], pixels=8)
+    small = StudySpecification("estimators", [sweep], realisations=100, arms=["plain", "ml"], fixed_k=[])
+    monkeypatch.setattr(estimators, "specification", lambda quick: small)
+    out = run.ok("study", "estimators", "--quick", "--table", "t.md", "--workers", 0).out
+    assert "estimators-quick.html: open it in a browser" in out
+    assert "t.md: tables" in out
+    assert "`faintspot study estimators --quick --table t.md`" in Path("t.md").read_text(encoding="utf-8")
+    assert "What was found" in Path("estimators-quick.html").read_text(encoding="utf-8")
 
 
 def test_run(folder: Path, run: Commands) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,11 +17,13 @@ FLOOR = 1e-4
 RULES = {"subtract_next": scoring.SUBTRACT_NEXT, "threshold": scoring.THRESHOLD}
 
 
-def every_k(images: NDArray[np.float32], rule: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def every_k(
+    images: NDArray[np.float32], rule: str, reach: float = math.inf
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     n, side, _ = images.shape
     positions, valid = np.full((n, side**2 - 1, 2), np.nan), np.zeros((n, side**2 - 1), bool)
     flat = images.reshape(n, -1)
-    scoring.positions_of_every_k(flat, side, RULES[rule], FLOOR, 0, n, positions, valid)
+    scoring.positions_of_every_k(flat, side, RULES[rule], FLOOR, reach, 0, n, positions, valid)
     return positions, valid
 
 
@@ -65,14 +69,25 @@ def test_equal_to_float32_rounding_on_spots(rule: str) -> None:
     np.testing.assert_allclose(positions, expected, rtol=0, atol=1e-4)
 
 
-def test_errors_are_those_of_the_positions() -> None:
+@pytest.mark.parametrize("reach", [math.inf, 0.5])
+def test_errors_are_those_of_the_positions(reach: float) -> None:
     images, truth = fs.simulate.subapertures(50, shape=(8, 8), flux_e=50.0, rng=np.random.default_rng(6))
     flat = images.reshape(50, -1)
     errors, valid = np.empty((50, 63), np.float32), np.empty((50, 63), bool)
-    scoring.errors_of_every_k(flat, 8, scoring.SUBTRACT_NEXT, FLOOR, truth, 0, 50, errors, valid)
-    positions, also_valid = every_k(images, "subtract_next")
+    scoring.errors_of_every_k(flat, 8, scoring.SUBTRACT_NEXT, FLOOR, reach, truth, 0, 50, errors, valid)
+    positions, also_valid = every_k(images, "subtract_next", reach)
     np.testing.assert_array_equal(valid, also_valid)
     np.testing.assert_allclose(errors, np.abs(positions - truth[:, None]).mean(axis=2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_positions_stay_within_reach(rule: str) -> None:
+    images, _ = fs.simulate.subapertures(50, shape=(8, 8), flux_e=10.0, rng=np.random.default_rng(7))
+    free, valid = every_k(images, rule)
+    held, also_valid = every_k(images, rule, 0.4)
+    assert np.abs(free).max() > 1.0
+    np.testing.assert_array_equal(held, np.clip(free, -0.4, 0.4))
+    np.testing.assert_array_equal(valid, also_valid)
 
 
 def test_flat_and_extreme_images() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from tests.report.report_cases import SETTINGS, Page, sensor, simulated
 from faintspot.errors import InputError
 from faintspot.io import create_writer
 from faintspot.pipeline import SlopePipeline
-from faintspot.recorded import measure_recorded
+from faintspot.recorded import measure_recorded, slopes_as_variables
 from faintspot.report import report_of_stored
 from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
@@ -29,6 +31,7 @@ def store(
     settings: Settings = SETTINGS,
     calibration: Calibration | None = None,
     n_frames: int = 5,
+    errors: Mapping[str, Any] = MappingProxyType({}),
     **changes: Any,
 ) -> Path:
     """Simulate frames beside the output, measure them and write the slopes; an attribute None is left out."""
@@ -43,7 +46,6 @@ def store(
         "sources": [str(source)],
         "faintspot_version": "0.1.0",
     } | changes
-    names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
     with create_writer(
         path,
         n_frames=n_frames,
@@ -51,7 +53,7 @@ def store(
         attributes={name: value for name, value in attributes.items() if value is not None},
         coordinates={"centre_x": layout.centres[:, 0], "centre_y": layout.centres[:, 1]},
     ) as writer:
-        writer.append(0, {name: getattr(slopes, name) for name in names})
+        writer.append(0, {**slopes_as_variables(slopes), **errors})
     return path
 
 
@@ -71,6 +73,19 @@ def test_two_stores_are_two_arms(tmp_path: Path) -> None:
     assert "Settings of 'TV'" in page.text
     assert "Settings of 'no TV'" in page.text
     assert "no denoising; 10 brightest of 64 pixels" in page.text
+
+
+def test_standard_errors_are_shown_where_they_are_known(tmp_path: Path) -> None:
+    x, y = np.full((2, 5, 9), np.inf)
+    unknown = store(tmp_path / "a.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
+    assert "Median standard error" not in Page(report_of_stored([unknown])).text
+    x[0], y[0] = 0.07, 0.01  # rms 0.05
+    x[1] = 0.2
+    known = store(tmp_path / "b.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
+    assert "Median standard error 0.05 px per axis" in Page(report_of_stored([known])).text
+    page = Page(report_of_stored([unknown, known]))
+    assert "Median standard error of 'b.npz' 0.05 px" in page.text
+    assert "Median standard error of 'a.npz'" not in page.text
 
 
 def test_two_stores_of_the_same_kind_are_named_by_their_files(tmp_path: Path) -> None:

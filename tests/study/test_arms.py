@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter
 
 import faintspot as fs
-from faintspot.study.arms import error_table, median_of_nine
+from faintspot.study.arms import error_table, median_of_nine, position_table
 from faintspot.study.sweep import Cell
 
 CELL = Cell(100.0, 1.0, "diffraction", 1.0, 1.0, 10, 1.0, 0.0, 1.0)
@@ -71,6 +73,22 @@ def test_without_light_the_position_is_the_centre(arm: str, candidate: float) ->
     table, valid = error_table(arm, candidate, CELL, noise, truth)
     assert not valid.any()
     np.testing.assert_allclose(table, 0.375, rtol=1e-6)
+
+
+@pytest.mark.parametrize("arm", ["plain", "thresholded"])
+@pytest.mark.parametrize("search_range_px", [math.inf, 0.3])
+def test_errors_are_those_of_the_positions(
+    simulated: tuple[NDArray[np.float32], NDArray[np.float64]], arm: str, search_range_px: float
+) -> None:
+    images, truth = simulated
+    positions, valid = position_table(arm, 1.0, CELL, images, search_range_px)
+    table, also_valid = error_table(arm, 1.0, CELL, images, truth, search_range_px)
+    assert np.abs(positions).max() <= np.float32(
+        search_range_px
+    )  # of which "thresholded" has only single precision
+    found = np.abs(positions - truth[:, None]).mean(axis=2).astype(np.float32)
+    np.testing.assert_array_equal(found, table)
+    np.testing.assert_array_equal(valid, also_valid)
 
 
 def test_median_is_exact() -> None:

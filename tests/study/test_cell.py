@@ -11,7 +11,8 @@ from tests.shared_data import shared_file
 
 from faintspot.study import Cell, StudySpecification, Sweep, measure_cell
 from faintspot.study.arms import error_table
-from faintspot.study.cell import mean_errors, realisations
+from faintspot.study.cell import realisations
+from faintspot.study.tuning import mean_errors
 
 SMALL = StudySpecification("small", [Sweep("a", flux_e=60, pixels=8)], realisations=400, fixed_k=(10, 40))
 NAN = float("nan")

@@ -35,8 +35,9 @@ def test_toml() -> None:
     specification = StudySpecification.from_text(TEXT)
     assert (specification.name, specification.seed, specification.realisations) == ("mine", 7, 400)
     assert specification.modes == ("best", "fixed10")
-    assert specification.candidates("tv") == (0.5, 1.0)
-    assert np.isnan(specification.candidates("plain")).all()
+    first = specification.cells()[0]
+    assert specification.candidates("tv", first) == (0.5, 1.0)
+    assert np.isnan(specification.candidates("plain", first)).all()
     signal, size = specification.sweeps
     assert signal.flux_e == (10.0, 100.0, 1000.0)
     assert signal.read_noise_e == (0.1, 3.0)
@@ -69,7 +70,12 @@ def test_fingerprint_changes_with_everything() -> None:
         "strengths": [0.5],
         "widths": [0.5],
         "thresholds": [1],
+        "weight_widths": [1],
+        "blurs": [1],
+        "model_errors": [1],
         "fixed_k": [],
+        "corrected": True,
+        "search_range_px": 3,
         "sweeps": [Sweep("one", flux_e=[1, 2])],
     }
     others = [replace(base, **{name: value}).fingerprint for name, value in changes.items()]
@@ -86,6 +92,36 @@ def test_seeds_depend_on_study_and_coordinates_alone() -> None:
         assert tuple(cell.seed(2).generate_state(4)) != states[cell]
 
 
+def test_seeds_of_cells_without_turbulence_never_change() -> None:
+    """Those of the first version, so that studies are repeated to the last digit."""
+    plain, speckled = Sweep("a", d_over_r0=[0.0, 1.0]).cells()
+    assert plain.seed(1).generate_state(2).tolist() == SEED_OF_DEFAULT_CELL
+    assert speckled.seed(1).generate_state(2).tolist() != SEED_OF_DEFAULT_CELL
+
+
+def test_search_range_is_the_same_for_all_arms() -> None:
+    sweep = Sweep("a", position_range_px=[1, 4])
+    near, far = sweep.cells()
+    old = StudySpecification("x", [sweep])
+    assert old.search_range_of(far) == np.inf
+    new = replace(old, arms=["plain", "ml"])
+    assert (new.search_range_of(near), new.search_range_of(far)) == (1.0, 4.0)
+    assert replace(new, search_range_px=2).search_range_of(far) == 2.0
+
+
+def test_modes_and_candidates_of_estimators() -> None:
+    sweep = Sweep("a", pixels=[4, 16], d_over_r0=[0, 2])
+    specification = StudySpecification("x", [sweep], fixed_k=[20], corrected=True, blurs=[0.0, 1.0])
+    assert specification.modes == ("best", "fixed20", "corrected")
+    still, speckled, still_large, _ = sweep.cells()
+    assert specification.kept_pixels(still) == {"best": None, "corrected": None}
+    assert specification.kept_pixels(still_large) == {"best": None, "fixed20": 20, "corrected": None}
+    assert specification.candidates("ml", still) == ((0.0, 0.0),)
+    assert specification.candidates("matched", speckled) == ((0.0, 0.0), (1.0, 0.0))
+    assert len(specification.candidates("map", speckled)) == 2 * len(specification.model_errors)
+    assert len(specification.candidates("weighted", still)) > 1
+
+
 def test_noise_of_a_mean_pixel() -> None:
     plain = Cell(256.0, 3.0, "diffraction", 1.0, 1.0, 16, 1.0, 2.0, 1.0)
     assert plain.pixel_noise_e == pytest.approx(np.sqrt(9.0 + 1.0 + 2.0))
@@ -93,6 +129,7 @@ def test_noise_of_a_mean_pixel() -> None:
     assert multiplied.pixel_noise_e == pytest.approx(np.sqrt(9.0 + 2.0 * 3.0))
 
 
+SEED_OF_DEFAULT_CELL = [205420210, 2240507304]
 SWEEP = "\n[sweeps.a]\nflux_e = 100\n"
 BAD = {
     "name = 1" + SWEEP: ("name", "text"),
@@ -122,6 +159,10 @@ BAD = {
     'name = "x"\n[sweeps.a]\nflux_e = { from = 10, to = 100 }': ("flux_e.points", "none"),
     'name = "x"\n[sweeps.a]\nflux_e = { from = 10, to = 100, point = 3 }': ("did you mean points",),
     'name = "x"\n[sweeps.a]\nread_noise_e = { from = 0, to = 1, points = 3, spacing = "log" }': ("from = 0",),
+    'name = "x"\n[sweeps.a]\nd_over_r0 = 2\nelongation = [1, 2]': ("d_over_r0 = 2", "elongation 1"),
+    'name = "x"\n[sweeps.a]\nd_over_r0 = 2\nprofile = "gaussian"': ("d_over_r0 = 2", "'diffraction'"),
+    'name = "x"\nsearch_range_px = 0' + SWEEP: ("search_range_px = 0", "above 0"),
+    'name = "x"\ncorrected = 1' + SWEEP: ("corrected = 1", "true or false"),
     'name = "x': ("not a TOML file",),
 }
 

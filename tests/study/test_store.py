@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,9 @@ def test_schema() -> None:
     dataset = new_dataset(SPECIFICATION)
     assert dict(dataset.sizes) == {"cell": N_CELLS, "arm": 6, "arm2": 6, "mode": 3, "k": 63}
     assert set(dataset.data_vars) == {*VARIABLES, "done"}
+    assert dataset["gain"].dims == ("cell", "arm", "mode")
+    assert dataset["stated_over_actual"].dims == ("cell", "arm")
+    assert dataset["bound"].dims == ("cell",)
     assert dataset["error_covariance"].dims == ("cell", "mode", "arm", "arm2")
     assert dataset["error_at_k"].dims == ("cell", "arm", "k")
     for name in VARIABLES:
@@ -96,6 +100,14 @@ def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
     for wrong, found in ((folder, "something else"), (tmp_path / "nothing", "nothing")):
         with pytest.raises(InputError, match=f"found {found}"):
             open_study(wrong)
+
+
+def test_of_another_version(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    StoredResults(path, SPECIFICATION)
+    shutil.rmtree(path / "gain")
+    with pytest.raises(InputError, match="has no gain: measured by another version"):
+        open_study(path)
 
 
 def test_damaged(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
@@ -16,6 +17,7 @@ _COMMANDS = {
     "report": "Make a web page of pictures and tables from slopes or a study.",
     "slopes": "Turn recorded frames into slopes.",
     "study": "Measure how large the slope error is, by Monte-Carlo simulation.",
+    "tune": "Say which estimator and settings suit a camera and a star.",
 }
 
 
@@ -71,6 +73,7 @@ def group(context: click.Context) -> None:
 
     \b
     Without:
+      faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
       faintspot demo
       faintspot study paper --quick
     """
@@ -80,6 +83,8 @@ def group(context: click.Context) -> None:
 
 def main(arguments: list[str] | None = None) -> Any:
     """Run the command line; an error of the user's ends with one line and exit code 2."""
+    # Before NumPy is loaded: small matrices gain nothing from BLAS threads, which get in the way of our own.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         return group.main(args=arguments, prog_name="faintspot", standalone_mode=False)
     except click.ClickException as error:

@@ -83,7 +83,8 @@ def command(
     and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are lit. A
     picture shows the frame with the windows that were found: look at it.
 
-    The settings written beside the layout are a start: the strength noise_std is taken from the frame's
+    A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
+    Else the settings written beside the layout are a start: the strength noise_std is taken from the frame's
     background noise and flux, which must be typical of the frames to come.
 
     \b
@@ -92,7 +93,8 @@ def command(
       faintspot layout cube.npz --dark dark.fits --gain 1.9 --pixels 16
     """
     target = Path(output)
-    if target.exists() and not overwrite:
+    keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
+    if target.exists() and not overwrite and not keeps_settings:
         raise InputError(f"{output}: exists already; --overwrite replaces its layout and settings")
     with open_frames(frames, key=key) as source:
         calibration = _calibration(target, dark, gain)
@@ -110,6 +112,9 @@ def command(
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, layout, mean, hot)
     settings, noise, flux = _first_settings(layout, calibration, first)
+    if keeps_settings:
+        settings = configuration.load(target, "settings")
+        notes.append(f"  the settings that {output} has are kept")
     drawn = _draw(np.where(bad, np.nanmedian(mean), mean), layout, picture, target)
     for item in (layout, settings, calibration):
         configuration.save(target, item)

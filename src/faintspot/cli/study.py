@@ -47,6 +47,7 @@ def command() -> None:
     Examples:
       faintspot study run my-study.toml -o my-study.zarr
       faintspot study paper --quick
+      faintspot study estimators --quick
     """
 
 
@@ -62,9 +63,10 @@ def run(
     """Run a study of your own.
 
     TOML lists what is varied (flux, read noise, spot size and shape, elongation, sub-aperture size, range of
-    positions, background, EM gain), which methods are compared and what they may choose from; docs/study.md
-    has examples. Each finished cell of the sweep is stored; interrupted or killed and started again, the
-    command goes on where it stopped. The store opens with faintspot.study.open_study or xarray.open_zarr.
+    positions, background, EM gain, turbulence), which methods are compared and what they may choose from;
+    docs/study.md has examples. Each finished cell of the sweep is stored; interrupted or killed and started
+    again, the command goes on where it stopped. The store opens with faintspot.study.open_study or
+    xarray.open_zarr.
 
     \b
     Examples:
@@ -118,6 +120,51 @@ def paper(
     page = Path(target).with_suffix(".html")
     study_of_paper.report(results, page)
     click.echo(f"{page}: open it in a browser")
+
+
+@command.command(short_help="Compare all estimators with each other and with the limit.")
+@click.option("--quick", is_flag=True, help="A few cells of fewer realisations: less than a minute.")
+@click.option(
+    "--output",
+    "-o",
+    metavar="ZARR",
+    help="Where results go; the report beside it. Default: estimators.zarr, or estimators-quick.zarr.",
+)
+@click.option("--table", metavar="MD", help="Also write the tables as a Markdown file.")
+@_run_options
+def estimators(
+    quick: bool,
+    output: str | None,
+    table: str | None,
+    scheduler: str | None,
+    workers: int | None,
+    overwrite: bool,
+) -> None:
+    """Compare all estimators with each other and with the Cramer-Rao bound.
+
+    Photon efficiency, gain and outliers over signal and read noise, for round and elongated spots, and the
+    error on spots that turbulence has speckled, in one report page beside the store of results.
+
+    \b
+    Examples:
+      faintspot study estimators --quick
+      faintspot study estimators -o estimators.zarr --table efficiency.md
+    """
+    from faintspot.report.pictures import write_file
+    from faintspot.study import estimators as study_of_estimators
+    from faintspot.study.efficiency import markdown
+
+    described = study_of_estimators.specification(quick)
+    target = output or f"estimators{'-quick' if quick else ''}.zarr"
+    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    page = Path(target).with_suffix(".html")
+    study_of_estimators.report(results, page)
+    click.echo(f"{page}: open it in a browser")
+    if table is not None:
+        options = " --quick" if quick else ""
+        made_by = f"faintspot study estimators{options} --table {shlex.quote(table)}"
+        write_file(Path(table), markdown(results, made_by).encode("utf-8"))
+        click.echo(f"{table}: tables")
 
 
 def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:

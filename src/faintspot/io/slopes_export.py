@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.io.raw import open_plain_or_gzip
-from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes
+from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, with_absent
 
 _PIECE_NUMBERS = 1 << 18
 _FITS_BLOCK_BYTES = 2880
@@ -46,7 +46,7 @@ def read_npz(path: Path) -> StoredSlopes:
     # numpy.load leaves a file that it opened itself open when the archive is damaged.
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
-    variables = {name: arrays.pop(name) for name in VARIABLES}
+    variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
     attributes = json.loads(str(arrays.pop("attributes")))
     return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 
@@ -94,7 +94,9 @@ def read_fits(path: Path) -> StoredSlopes:
                 arrays = {unit.name.lower(): _native(unit.data) for unit in units[1:]}
         except Warning as warning:
             raise ValueError(str(warning)) from None
-    variables = {name: arrays.pop(name).astype(variable.dtype) for name, variable in VARIABLES.items()}
+    variables = with_absent(
+        {name: arrays.pop(name).astype(VARIABLES[name].dtype) for name in VARIABLES if name in arrays}
+    )
     attributes = json.loads(arrays.pop("attributes").tobytes())
     return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 
@@ -122,10 +124,13 @@ def read_csv(path: Path) -> StoredSlopes:
         names = stream.readline().strip().split(",")
     table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     width = int(table[:, names.index("subaperture")].max()) + 1
-    variables = {
-        name: table[:, names.index(variable.csv_name)].reshape(-1, width).astype(variable.dtype)
-        for name, variable in VARIABLES.items()
-    }
+    variables = with_absent(
+        {
+            name: table[:, names.index(variable.csv_name)].reshape(-1, width).astype(variable.dtype)
+            for name, variable in VARIABLES.items()
+            if variable.csv_name in names
+        }
+    )
     return StoredSlopes(variables, {}, {}, True, len(variables["x"]))
 
 

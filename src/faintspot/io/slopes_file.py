@@ -27,6 +27,7 @@ from faintspot.io.slopes_format import (
     checked_block,
     exists_already,
     output_errors,
+    with_absent,
     write_atomically,
 )
 
@@ -155,9 +156,12 @@ def read_partial(folder: Path) -> StoredSlopes:
     variables: dict[str, NDArray[Any]] = {}
     for name, variable in VARIABLES.items():
         empty = np.empty(shape, variable.dtype)
-        variables[name] = np.memmap(folder / name, variable.dtype, "r", shape=shape) if finished else empty
+        if (folder / name).exists():
+            variables[name] = (
+                np.memmap(folder / name, variable.dtype, "r", shape=shape) if finished else empty
+            )
     return StoredSlopes(
-        variables=variables,
+        variables=with_absent(variables),
         coordinates={name: np.asarray(values) for name, values in description["coordinates"].items()},
         attributes=description["attributes"],
         complete=False,

@@ -26,6 +26,8 @@ class Variable:
     units: str
     long_name: str
     csv_name: str
+    if_absent: float | None = None
+    """What takes its place where it is not given, as in files that were written before it existed."""
 
 
 VARIABLES: Mapping[str, Variable] = {
@@ -36,7 +38,15 @@ VARIABLES: Mapping[str, Variable] = {
     "flags": Variable("uint8", "1", "why a position is not valid, as bits", "flags"),
     "iterations": Variable("int32", "1", "iterations of the denoiser", "iterations"),
     "bad_pixels": Variable("int32", "1", "pixels that were replaced", "bad_pixels"),
+    "standard_error_x": Variable(
+        "float32", "px", "standard error of x, infinite where not known", "standard_error_x_px", np.inf
+    ),
+    "standard_error_y": Variable(
+        "float32", "px", "standard error of y, infinite where not known", "standard_error_y_px", np.inf
+    ),
 }
+
+REQUIRED = frozenset(name for name, variable in VARIABLES.items() if variable.if_absent is None)
 
 RESERVED_ATTRIBUTES = frozenset({"n_frames", "n_subapertures", "finished_frames", "complete", "coordinates"})
 
@@ -50,7 +60,8 @@ class StoredSlopes:
     Attributes
     ----------
     variables : mapping
-        x, y (px), flux (e-), valid, flags, iterations, bad_pixels, each (n_finished, n_subapertures).
+        x, y (px), flux (e-), valid, flags, iterations, bad_pixels, standard_error_x, standard_error_y (px),
+        each (n_finished, n_subapertures).
     coordinates : mapping
         Per sub-aperture (n_subapertures,), as centre_x and centre_y (px in the frame).
     attributes : mapping
@@ -97,6 +108,8 @@ class SlopeWriter(Protocol):
     def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
         """Add frames `start`, `start` + 1 ...: every variable of `VARIABLES`, (n, n_subapertures).
 
+        Those that may be absent need not be given.
+
         Raises
         ------
         InputError
@@ -117,18 +130,28 @@ def checked_block(run: Run, finished: int, start: int, block: Mapping[str, Any])
     """Return the block's variables in the file's types, or say what is wrong with them."""
     if start != finished:
         raise InputError(f"slopes: expected the block that starts at frame {finished}, got frame {start}")
-    if set(block) != set(VARIABLES):
+    if set(block) - set(VARIABLES) or REQUIRED - set(block):
         raise InputError(f"slopes: expected {', '.join(VARIABLES)}, got {', '.join(block)}")
     n = len(np.atleast_1d(block["x"]))
     if not 0 < n <= run.n_frames - finished:
         raise InputError(f"slopes: expected 1 to {run.n_frames - finished} more frames, got {n}")
     arrays = {}
-    for name, variable in VARIABLES.items():
-        array = np.asarray(block[name])
+    for name, values in with_absent(block).items():
+        array = np.asarray(values)
         if array.shape != (n, run.n_subapertures):
             raise InputError(f"slopes: {name}: expected shape {(n, run.n_subapertures)}, got {array.shape}")
-        arrays[name] = array.astype(variable.dtype, copy=False)
+        arrays[name] = array.astype(VARIABLES[name].dtype, copy=False)
     return arrays
+
+
+def with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all variables in their order, those that are absent filled; KeyError when one is needed."""
+    return {
+        name: np.full(np.shape(found["x"]), variable.if_absent, variable.dtype)
+        if name not in found and variable.if_absent is not None
+        else found[name]
+        for name, variable in VARIABLES.items()
+    }
 
 
 @contextlib.contextmanager

@@ -28,6 +28,7 @@ from faintspot.io.slopes_format import (
     checked_block,
     exists_already,
     output_errors,
+    with_absent,
     write_atomically,
 )
 from faintspot.io.zarr_files import is_store, zarr
@@ -156,7 +157,9 @@ def read_store(path: Path) -> StoredSlopes:
         del attributes[size]
     group: Any = zarr.open_group(str(path), mode="r")
     return StoredSlopes(
-        variables={name: np.asarray(group[name][:finished]) for name in VARIABLES},
+        variables=with_absent(
+            {name: np.asarray(group[name][:finished]) for name in VARIABLES if name in group}
+        ),
         coordinates={name: np.asarray(group[name][:]) for name in coordinates},
         attributes=attributes,
         complete=complete,

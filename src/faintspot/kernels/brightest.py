@@ -14,6 +14,7 @@ from faintspot.kernels.simd import (
     multiply_add,
     select,
     splat,
+    square_root,
     store,
     width_of,
 )
@@ -24,7 +25,9 @@ SUBTRACT = 1  # in: 1 to take the threshold off the pixels that stay, 0 to keep 
 THRESHOLD = 2  # out
 LARGEST = 3  # out: largest magnitude of the image
 SUM, X, Y = 4, 5, 6  # out: flux of what stays and its centre of gravity, px from the centre
-LANE_ROWS = 7
+VARIANCE, EXCESS = 7, 8  # in: variance of a pixel that collects m electrons, VARIANCE + EXCESS m
+ERROR_X, ERROR_Y = 9, 10  # out: standard error of the centre of gravity, px
+LANE_ROWS = 11
 
 _COUNTING_PASSES = 24  # usually 6 to 10 are enough; ties and outliers go on to the exact passes
 
@@ -110,6 +113,16 @@ def find_threshold(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
 
 
 @compiled
+def find_largest(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
+    """Find the largest magnitude of every lane."""
+    width = width_of(lanes)
+    largest = splat(lanes, 0.0)
+    for i in range(pixels):
+        largest = maximum(absolute(load(lanes, image, i * width)), largest)
+    store(numbers, LARGEST * width, largest)
+
+
+@compiled
 def subtract_background(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
     """Zero the pixels below THRESHOLD in place, and take it off the others where SUBTRACT is 1."""
     width = width_of(lanes)
@@ -140,3 +153,31 @@ def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) ->
     store(numbers, SUM * width, total)
     store(numbers, X * width, select(lit, moment_x * inverse, zero))
     store(numbers, Y * width, select(lit, moment_y * inverse, zero))
+
+
+@compiled
+def noise_of_centroid(lanes: Any, image: Any, left: Any, ny: Any, nx: Any, numbers: Any) -> None:
+    """Propagate the noise of the pixels that are left to the centre of gravity: VARIANCE + EXCESS max(g, 0).
+
+    `image` holds the pixels g as they were measured, `left` what is left of them.
+    """
+    width = width_of(lanes)
+    zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
+    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
+    x0, y0 = load(lanes, numbers, X * width), load(lanes, numbers, Y * width)
+    noise_x, noise_y = zero, zero
+    within = splat(lanes, 1.0 / 12.0)  # of the light in a pixel, where in it is not known: px^2
+    for y in range(ny):
+        away_y = splat(lanes, y - 0.5 * (ny - 1)) - y0
+        for x in range(nx):
+            here = (y * nx + x) * width
+            variance = multiply_add(maximum(load(lanes, image, here), zero), e, v)
+            variance = select(load(lanes, left, here) > zero, variance, zero)
+            away_x = splat(lanes, x - 0.5 * (nx - 1)) - x0
+            noise_x = multiply_add(variance, multiply_add(away_x, away_x, within), noise_x)
+            noise_y = multiply_add(variance, multiply_add(away_y, away_y, within), noise_y)
+    total = load(lanes, numbers, SUM * width)
+    lit = total > zero
+    inverse = one / select(lit, total, one)
+    store(numbers, ERROR_X * width, square_root(noise_x) * inverse)
+    store(numbers, ERROR_Y * width, square_root(noise_y) * inverse)

@@ -6,18 +6,22 @@ depend on how they do.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from faintspot.flags import SubapertureFlag
 from faintspot.kernels import brightest, total_variation
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.gather import calibrate, fill_bad_pixels, gather_image, gather_raw, scatter_image
-from faintspot.kernels.simd import width_of
+from faintspot.kernels.simd import load, select, splat, store, width_of
+from faintspot.kernels.smoothing import gather_taps, smooth_group
 from faintspot.kernels.total_variation import denoise_group
 
 _find_threshold = brightest.find_threshold
 _subtract_background = brightest.subtract_background
 _centre_of_gravity = brightest.centre_of_gravity
+_find_largest = brightest.find_largest
+_noise_of_centroid = brightest.noise_of_centroid
 
 NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
@@ -27,12 +31,63 @@ INFEASIBLE_STRENGTH = int(SubapertureFlag.INFEASIBLE_STRENGTH)
 NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
 
 # Rows of the pipeline's table of per-sub-aperture numbers (n_rows, n_subapertures), float32.
-STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, ZERO_X, ZERO_Y, MOST_BAD, FLOOR = range(9)
-SETTING_ROWS = 9
+# All estimators: reference position and how far from it a position may be; bad pixels; noise of a pixel that
+# collects m electrons, VARIANCE + EXCESS m (negative where unknown); factor on the standard error.
+ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE, EXCESS, ERROR_SCALE = range(7)
+# Centre of gravity.
+STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(7, 14)
+# Estimators that know the spot: see `located`.
+FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(14, 19)
+MODEL, KIND, START_LIGHT, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_LIGHT = range(19, 27)
+SETTING_ROWS = 27
+
+# What is done before the background subtraction, and what takes the background off.
+NOTHING, SMOOTH, DENOISE = range(3)
 
 # Rows of explain's stages (n_rows, n_frames, n_subapertures, pixels).
 CALIBRATED, DENOISED, BACKGROUND = range(3)
 STAGE_ROWS = 3
+
+
+@compiled
+def prepare_group(
+    lanes: Any,
+    frames: Any,
+    f: Any,
+    group: Any,
+    corners: Any,
+    ny: Any,
+    nx: Any,
+    calibration: Any,
+    saturation: Any,
+    settings: Any,
+    image: Any,
+    spare: Any,
+    places: Any,
+    flags: Any,
+    bad_counts: Any,
+    numbers: Any,
+) -> None:
+    """Gather and calibrate the W sub-apertures of a group, fill bad pixels and flag what there is to flag.
+
+    The last group of a frame repeats its last sub-aperture to fill the lanes. `spare` holds ny * nx and
+    `numbers` 2 * W numbers of scratch; for the others see `slopes_of_groups`.
+    """
+    width = width_of(lanes)
+    n, first = corners.shape[0], group * width
+    for lane in range(width):
+        s = min(first + lane, n - 1)
+        places[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
+    gather_raw(lanes, frames, f, places, ny, nx, image)
+    calibrate(lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, numbers)
+    for lane in range(width):
+        s = min(first + lane, n - 1)
+        bad = int(numbers[lane])
+        bad_counts[lane] = bad
+        flags[lane] = SATURATED if numbers[width + lane] > 0.0 else 0
+        if bad > 0:
+            fill_bad_pixels(width, lane, ny, nx, image, spare)
+            flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else BAD_PIXELS
 
 
 @compiled
@@ -44,18 +99,20 @@ def slopes_of_groups(
     nx: Any,
     calibration: Any,
     saturation: Any,
-    settings: Any,
+    tables: Any,
+    variants: Any,
+    before: Any,
     algorithm: Any,
+    taps: Any,
     start: Any,
     stop: Any,
     scratch: Any,
     slopes: Any,
     stages: Any,
 ) -> None:
-    """Compute the slopes of the groups [start, stop) of a block of frames.
+    """Compute the slopes of the groups [start, stop) of a block of frames, as centres of gravity.
 
-    Group g is group g % n_groups of frame g // n_groups. The last group of a frame repeats its last
-    sub-aperture to fill the lanes.
+    Group g is group g % n_groups of frame g // n_groups.
 
     Parameters
     ----------
@@ -69,11 +126,20 @@ def slopes_of_groups(
         Dark in ADU, and electrons per ADU (NaN in bad pixels); all lanes of a pixel together.
     saturation : float
         In ADU.
-    settings : (SETTING_ROWS, n_subapertures) float32
+    tables : (n_variants, SETTING_ROWS, n_subapertures) float32
+        Settings.
+    variants : (n_frames,) int64
+        Which of these tables a frame is measured with.
+    before : int
+        NOTHING, SMOOTH or DENOISE.
     algorithm : int
+        Of the denoising.
+    taps : (n_subapertures, 2, 1 + reach) float32
+        Of the smoothing along x and y, the central one first.
     scratch : tuple of arrays, from `new_scratch`
     slopes : tuple of (n_frames, n_subapertures) arrays
-        x, y, flux (float32), flags (uint8), iterations, bad pixels (int32); written.
+        x, y, flux (float32), flags (uint8), iterations, bad pixels (int32), standard errors of x and y
+        (float32); written.
     stages : (STAGE_ROWS or 0, n_frames, n_subapertures, pixels) float32
         Written where it has rows.
     """
@@ -85,35 +151,43 @@ def slopes_of_groups(
     n = corners.shape[0]
     n_groups = (n + width - 1) // width
     for item in range(start, stop):
-        f, first = item // n_groups, (item % n_groups) * width
-        for lane in range(width):
-            s = min(first + lane, n - 1)
-            places[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
-        gather_raw(lanes, frames, f, places, ny, nx, image)
-        group = item % n_groups
-        calibrate(
-            lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, centroid_numbers
+        f, group = item // n_groups, item % n_groups
+        first = group * width
+        settings = tables[variants[f]]
+        prepare_group(
+            lanes,
+            frames,
+            f,
+            group,
+            corners,
+            ny,
+            nx,
+            calibration,
+            saturation,
+            settings,
+            image,
+            output,
+            places,
+            flags,
+            bad_counts,
+            centroid_numbers,
         )
-        for lane in range(width):
-            s = min(first + lane, n - 1)
-            bad = int(centroid_numbers[lane])
-            bad_counts[lane] = bad
-            flags[lane] = SATURATED if centroid_numbers[width + lane] > 0.0 else 0
-            if bad > 0:
-                fill_bad_pixels(width, lane, ny, nx, image, output)
-                flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else BAD_PIXELS
-            numbers[total_variation.STRENGTH * width + lane] = settings[STRENGTH, s]
-            numbers[total_variation.TOLERANCE * width + lane] = settings[TOLERANCE, s]
-            counts[total_variation.LIMIT * width + lane] = int(settings[LIMIT, s])
-            centroid_numbers[brightest.RANK * width + lane] = settings[RANK, s]
-            centroid_numbers[brightest.SUBTRACT * width + lane] = settings[SUBTRACT, s]
-        denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
+        _read_settings(width, first, settings, numbers, counts, centroid_numbers)
+        if before == DENOISE:
+            denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
+        elif before == SMOOTH:
+            gather_taps(width, first, taps, rows)
+            smooth_group(lanes, image, ny, nx, taps.shape[2] - 1, rows, state, output)
+        else:
+            output[: ny * nx * width] = image[: ny * nx * width]
         if stages.shape[0] > 0:
-            _store_stage(width, image, stages[CALIBRATED, f], first)
-            _store_stage(width, output, stages[DENOISED, f], first)
+            store_stage(width, image, stages[CALIBRATED, f], first)
+            store_stage(width, output, stages[DENOISED, f], first)
         _locate(lanes, output, ny, nx, centroid_numbers)
+        if settings[VARIANCE, first] >= 0.0:
+            _noise_of_centroid(lanes, image, output, ny, nx, centroid_numbers)
         if stages.shape[0] > 0:
-            _store_stage(width, output, stages[BACKGROUND, f], first)
+            store_stage(width, output, stages[BACKGROUND, f], first)
         for lane in range(min(width, n - first)):
             _store_slope(
                 width,
@@ -132,15 +206,39 @@ def slopes_of_groups(
 
 
 @compiled
+def _read_settings(
+    width: Any, first: Any, settings: Any, numbers: Any, counts: Any, centroid_numbers: Any
+) -> None:
+    """Copy what the lanes' sub-apertures are set to."""
+    for lane in range(width):
+        s = min(first + lane, settings.shape[1] - 1)
+        numbers[total_variation.STRENGTH * width + lane] = settings[STRENGTH, s]
+        numbers[total_variation.TOLERANCE * width + lane] = settings[TOLERANCE, s]
+        counts[total_variation.LIMIT * width + lane] = int(settings[LIMIT, s])
+        counts[total_variation.ITERATIONS * width + lane] = 0
+        counts[total_variation.CONVERGED * width + lane] = 1
+        counts[total_variation.INFEASIBLE * width + lane] = 0
+        centroid_numbers[brightest.RANK * width + lane] = settings[RANK, s]
+        centroid_numbers[brightest.SUBTRACT * width + lane] = settings[SUBTRACT, s]
+        centroid_numbers[brightest.THRESHOLD * width + lane] = settings[LEVEL, s]
+        centroid_numbers[brightest.VARIANCE * width + lane] = settings[VARIANCE, s]
+        centroid_numbers[brightest.EXCESS * width + lane] = settings[EXCESS, s]
+
+
+@compiled
 def _locate(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
-    """Background subtraction in place, and the centre of gravity."""
-    _find_threshold(lanes, image, ny * nx, numbers)
+    """Background subtraction in place, and the centre of gravity. Without a RANK, THRESHOLD is given."""
+    if numbers[brightest.RANK * width_of(lanes)] > 0.0:
+        _find_threshold(lanes, image, ny * nx, numbers)
+    else:
+        _find_largest(lanes, image, ny * nx, numbers)
     _subtract_background(lanes, image, ny * nx, numbers)
     _centre_of_gravity(lanes, image, ny, nx, numbers)
 
 
 @compiled
-def _store_stage(width: Any, image: Any, stage: Any, first: Any) -> None:
+def store_stage(width: Any, image: Any, stage: Any, first: Any) -> None:
+    """Copy a group's images to where `explain` collects them."""
     for lane in range(min(width, stage.shape[0] - first)):
         scatter_image(width, image, lane, stage, first + lane)
 
@@ -161,7 +259,7 @@ def _store_slope(
     slopes: Any,
 ) -> None:
     """Write one sub-aperture's result; the reference position (slope 0) where it is invalid."""
-    x, y, flux, flag, iterations, bad_pixels = slopes
+    x, y, flux, flag, iterations, bad_pixels, error_x, error_y = slopes
     total = numbers[brightest.SUM * width + lane]
     position_x, position_y = numbers[brightest.X * width + lane], numbers[brightest.Y * width + lane]
     bits = flags[lane]
@@ -176,12 +274,58 @@ def _store_slope(
         if not (lit and inside):
             bits |= NO_LIGHT
     valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
-    x[f, s] = position_x - settings[ZERO_X, s] if valid else 0.0
-    y[f, s] = position_y - settings[ZERO_Y, s] if valid else 0.0
+    reach = settings[RANGE, s]
+    x[f, s] = within(position_x - settings[ZERO_X, s], reach) if valid else 0.0
+    y[f, s] = within(position_y - settings[ZERO_Y, s], reach) if valid else 0.0
+    known = valid and settings[VARIANCE, s] >= 0.0
+    scale = settings[ERROR_SCALE, s]
+    error_x[f, s] = scale * numbers[brightest.ERROR_X * width + lane] if known else math.inf
+    error_y[f, s] = scale * numbers[brightest.ERROR_Y * width + lane] if known else math.inf
     flux[f, s] = total
     flag[f, s] = bits
     iterations[f, s] = counts[total_variation.ITERATIONS * width + lane]
     bad_pixels[f, s] = bad_counts[lane]
+
+
+@compiled
+def within(slope: Any, reach: Any) -> Any:
+    """Keep a slope within the allowed range."""
+    return min(max(slope, -reach), reach)
+
+
+@compiled
+def light_of_groups(
+    lanes: Any,
+    frames: Any,
+    corners: Any,
+    ny: Any,
+    nx: Any,
+    calibration: Any,
+    saturation: Any,
+    start: Any,
+    stop: Any,
+    scratch: Any,
+    light: Any,
+) -> None:
+    """Sum the pixels of every sub-aperture, electrons, bad ones as 0; parameters as `slopes_of_groups`."""
+    width = width_of(lanes)
+    image, _, _, _, numbers, _, lane_counts = scratch
+    n = corners.shape[0]
+    n_groups = (n + width - 1) // width
+    for item in range(start, stop):
+        f, group = item // n_groups, item % n_groups
+        for lane in range(width):
+            s = min(group * width + lane, n - 1)
+            lane_counts[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
+        gather_raw(lanes, frames, f, lane_counts, ny, nx, image)
+        calibrate(lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, numbers)
+        total, zero = splat(lanes, 0.0), splat(lanes, 0.0)
+        for i in range(ny * nx):
+            g = load(lanes, image, i * width)
+            total = total + select(g >= g, g, zero)
+        store(numbers, 0, total)
+        for lane in range(min(width, n - group * width)):
+            light[f, group * width + lane] = numbers[lane]
 
 
 @compiled

@@ -58,12 +58,14 @@ def _sort_brightest_first(image: Any, pixels: Any, counts: Any, keys: Any, order
 
 
 @compiled
-def _measure(image: Any, side: Any, order: Any, rule: Any, floor: Any, x: Any, y: Any, valid: Any) -> None:
+def _measure(
+    image: Any, side: Any, order: Any, rule: Any, floor: Any, reach: Any, x: Any, y: Any, valid: Any
+) -> None:
     """Position for k = 1 .. pixels - 1 of an image whose pixels are sorted by falling value.
 
     With g the k brightest pixels, sums in double precision: sum(g - t), sum((g - t) x), sum((g - t) y) from
     the cumulative sums of g, g x, g y, x and y. What ties with t adds nothing ("subtract_next") or stays
-    whole ("threshold").
+    whole ("threshold"). Positions beyond `reach` become it; infinity leaves them as they are.
     """
     pixels = side * side
     middle = 0.5 * (side - 1)
@@ -85,14 +87,22 @@ def _measure(image: Any, side: Any, order: Any, rule: Any, floor: Any, x: Any, y
         left = total - k * t
         lit = left > floor * largest and left > 0.0
         inverse = 1.0 / left if lit else 0.0
-        x[k - 1] = (moment_x - t * sum_x) * inverse
-        y[k - 1] = (moment_y - t * sum_y) * inverse
+        x[k - 1] = min(max((moment_x - t * sum_x) * inverse, -reach), reach)
+        y[k - 1] = min(max((moment_y - t * sum_y) * inverse, -reach), reach)
         valid[k - 1] = lit
 
 
 @compiled
 def positions_of_every_k(
-    images: Any, side: Any, rule: Any, floor: Any, start: Any, stop: Any, positions: Any, valid: Any
+    images: Any,
+    side: Any,
+    rule: Any,
+    floor: Any,
+    reach: Any,
+    start: Any,
+    stop: Any,
+    positions: Any,
+    valid: Any,
 ) -> None:
     """Write x and y (n, K, 2) and validity (n, K) of images `start` to `stop` for k = 1 to K = pixels - 1."""
     pixels = side * side
@@ -101,7 +111,7 @@ def positions_of_every_k(
     x, y = np.empty(pixels - 1), np.empty(pixels - 1)
     for i in range(start, stop):
         row = _sort_brightest_first(images[i].view(np.uint32), pixels, counts, keys, order)
-        _measure(images[i], side, order[row], rule, floor, x, y, valid[i])
+        _measure(images[i], side, order[row], rule, floor, reach, x, y, valid[i])
         for k in range(pixels - 1):
             positions[i, k, 0] = x[k]
             positions[i, k, 1] = y[k]
@@ -109,7 +119,16 @@ def positions_of_every_k(
 
 @compiled
 def errors_of_every_k(
-    images: Any, side: Any, rule: Any, floor: Any, truth: Any, start: Any, stop: Any, errors: Any, valid: Any
+    images: Any,
+    side: Any,
+    rule: Any,
+    floor: Any,
+    reach: Any,
+    truth: Any,
+    start: Any,
+    stop: Any,
+    errors: Any,
+    valid: Any,
 ) -> None:
     """Write (|dx| + |dy|) / 2 (n, K) and validity (n, K), as `positions_of_every_k`."""
     pixels = side * side
@@ -118,7 +137,7 @@ def errors_of_every_k(
     x, y = np.empty(pixels - 1), np.empty(pixels - 1)
     for i in range(start, stop):
         row = _sort_brightest_first(images[i].view(np.uint32), pixels, counts, keys, order)
-        _measure(images[i], side, order[row], rule, floor, x, y, valid[i])
+        _measure(images[i], side, order[row], rule, floor, reach, x, y, valid[i])
         true_x, true_y = truth[i, 0], truth[i, 1]
         for k in range(pixels - 1):
             errors[i, k] = 0.5 * (abs(x[k] - true_x) + abs(y[k] - true_y))

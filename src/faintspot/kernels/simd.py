@@ -284,24 +284,25 @@ def square_root(typing_context: Any, a: Any) -> Any:
     return a(a), emit
 
 
-# Hardware estimates of 1 / sqrt(a) by processor feature and float32 lanes: LLVM's name, arguments after `a`.
+# Hardware estimates by processor feature and float32 lanes: LLVM's name, arguments after `a`.
 # With avx512vl all widths use the same estimate, so that results do not depend on the width.
-_ESTIMATES = {
+_ROOT_ESTIMATES = {
     ("avx512vl", 16): "llvm.x86.avx512.rsqrt14.ps.512",
     ("avx512vl", 8): "llvm.x86.avx512.rsqrt14.ps.256",
     ("avx512vl", 4): "llvm.x86.avx512.rsqrt14.ps.128",
     ("avx", 8): "llvm.x86.avx.rsqrt.ps.256",
     ("sse", 4): "llvm.x86.sse.rsqrt.ps",
 }
+_INVERSE_ESTIMATES = {key: name.replace("rsqrt", "rcp") for key, name in _ROOT_ESTIMATES.items()}
 
 
-def _square_root_estimate(builder: Any, vector: Vector, value: Any) -> Any:
-    """Emit the hardware's estimate of 1 / sqrt(value), to 4e-4 or better; None where there is none."""
+def _estimate(builder: Any, vector: Vector, value: Any, names: dict[tuple[str, int], str]) -> Any:
+    """Emit the hardware's estimate, to 4e-4 or better; None where there is none."""
     import llvmlite.binding as llvm
 
     features = llvm.get_host_cpu_features()
-    usable = [key for key in _ESTIMATES if key[1] == vector.width and features.get(key[0])]
-    if not usable:
+    usable = [key for key in names if key[1] == vector.width and features.get(key[0])]
+    if not usable or vector.scalar != types.float32:
         return None
     feature, width = usable[0]
     llvm_vector, arguments = _llvm_vector(vector), [value]
@@ -309,8 +310,14 @@ def _square_root_estimate(builder: Any, vector: Vector, value: Any) -> Any:
         bits = ir.IntType(max(width, 8))
         arguments += [ir.Constant(llvm_vector, None), ir.Constant(bits, -1)]
     kind = ir.FunctionType(llvm_vector, [argument.type for argument in arguments])
-    function = cgutils.get_or_insert_function(builder.module, kind, _ESTIMATES[usable[0]])
+    function = cgutils.get_or_insert_function(builder.module, kind, names[usable[0]])
     return builder.call(function, arguments)
+
+
+def _constant(vector: Vector, number: float) -> Any:
+    return ir.Constant(
+        _llvm_vector(vector), [ir.Constant(_llvm_scalar(vector.scalar), number)] * vector.width
+    )
 
 
 @intrinsic
@@ -322,16 +329,51 @@ def twice_reciprocal_square_root(typing_context: Any, a: Any) -> Any:
     """
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        def constant(number: float) -> Any:
-            return ir.Constant(_llvm_vector(a), [ir.Constant(_llvm_scalar(a.scalar), number)] * a.width)
-
-        estimate = _square_root_estimate(builder, a, args[0]) if a.scalar == types.float32 else None
+        estimate = _estimate(builder, a, args[0], _ROOT_ESTIMATES)
         if estimate is None:
-            return builder.fdiv(constant(2.0), _call(builder, "sqrt", a, args))
+            return builder.fdiv(_constant(a, 2.0), _call(builder, "sqrt", a, args))
         minus = builder.fneg(builder.fmul(args[0], estimate))
-        return builder.fmul(estimate, _call(builder, "fmuladd", a, (minus, estimate, constant(3.0))))
+        return builder.fmul(estimate, _call(builder, "fmuladd", a, (minus, estimate, _constant(a, 3.0))))
 
     return a(a), emit
+
+
+@intrinsic
+def reciprocal(typing_context: Any, a: Any) -> Any:
+    """1 / a for ordinary numbers (not 0, not near the ends of the range), to about 3e-7 in float32."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        estimate = _estimate(builder, a, args[0], _INVERSE_ESTIMATES)
+        if estimate is None:
+            return builder.fdiv(_constant(a, 1.0), args[0])
+        minus = builder.fneg(args[0])
+        return builder.fmul(estimate, _call(builder, "fmuladd", a, (minus, estimate, _constant(a, 2.0))))
+
+    return a(a), emit
+
+
+@intrinsic
+def rounded(typing_context: Any, a: Any) -> Any:
+    """The nearest whole number, halves to even."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _call(builder, "rint", a, args)
+
+    return a(a), emit
+
+
+@intrinsic
+def sum_of(typing_context: Any, a: Any) -> Any:
+    """The sum of all lanes, in any order."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        scalar, llvm_vector = _llvm_scalar(a.scalar), _llvm_vector(a)
+        kind = ir.FunctionType(scalar, [scalar, llvm_vector])
+        name = f"llvm.vector.reduce.fadd.v{a.width}f{a.scalar.bitwidth}"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, [ir.Constant(scalar, -0.0), args[0]], fastmath=("reassoc",))
+
+    return a.scalar(a), emit
 
 
 @intrinsic

@@ -285,6 +285,14 @@ def _disagreement(store: _Store, arm: Arm, frame: NDArray[Any], number: int) -> 
     ]
 
 
+def _median_standard_error(store: _Store) -> float:
+    """Median over the slopes whose standard error is known of its rms of x and y, px; NaN without any."""
+    x, y = (store.stored.variables[f"standard_error_{axis}"].astype(np.float64) for axis in "xy")
+    errors = np.sqrt((x**2 + y**2) / 2)
+    known = errors[np.isfinite(errors)]
+    return float(np.median(known)) if known.size else np.nan
+
+
 def _facts(stores: Sequence[_Store], arms: Sequence[Arm]) -> dict[str, str]:
     sources = list(dict.fromkeys(source for store in stores for source in store.sources))
     shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
@@ -295,7 +303,11 @@ def _facts(stores: Sequence[_Store], arms: Sequence[Arm]) -> dict[str, str]:
     for store, arm in zip(stores, arms, strict=True):
         known = store.settings is not None and store.layout is not None
         words = settings_in_words(store.settings, store.layout) if known else "not stored"  # type: ignore[arg-type]
-        facts[f"Settings of {arm.name!r}" if len(arms) > 1 else "Settings"] = words
+        of = f" of {arm.name!r}" if len(arms) > 1 else ""
+        facts[f"Settings{of}"] = words
+        error_px = _median_standard_error(store)
+        if np.isfinite(error_px):
+            facts[f"Median standard error{of}"] = f"{error_px:.3g} px per axis"
     if any("reference" in store.stored.attributes for store in stores):
         facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
     return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}

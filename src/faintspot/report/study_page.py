@@ -16,6 +16,8 @@ from faintspot.report import drawing
 from faintspot.report.pictures import write_file
 from faintspot.study.baselines import ARM_NAMES, against_tv
 from faintspot.study.claims import fixed_mode, verdicts
+from faintspot.study.efficiency import compares_estimators, findings
+from faintspot.study.estimator_figures import estimator_figures
 from faintspot.study.figure_data import StudyFigure, csv_text, mode_in_words
 from faintspot.study.figures import baselines_figure, kept_pixels_figure, sweep_figure
 from faintspot.study.gains import gains_by_mode
@@ -126,8 +128,12 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[StudyFigure]:
     """Yield the figures of a study, as far as its cells are finished.
 
     A sweep is drawn by the first word of its name, so that several make one figure. The paper's pictures
-    (figures 1 and 5) come with the paper's sweeps only.
+    (figures 1 and 5) come with the paper's sweeps only. A study with arms that know the spot has the figures
+    of `faintspot.study.estimator_figures` instead.
     """
+    if compares_estimators(dataset):
+        yield from estimator_figures(dataset)
+        return
     groups = _cells_by_figure(dataset)
     if _is_paper(groups):
         yield triple_picture()
@@ -182,12 +188,15 @@ def _is_paper(names: Iterable[str]) -> bool:
 
 
 def _page(dataset: xarray.Dataset, pictures: list[_Picture]) -> str:
-    judged = verdicts(dataset)
+    of_estimators = compares_estimators(dataset)
+    judged = [] if of_estimators else verdicts(dataset)  # the paper's arms have no search range
     fixed = mode_in_words(fixed_mode(dataset))
     attributes = dataset.attrs
     done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
     return _render(
-        title=f"Slope errors with and without TV: study “{_name(dataset)}”",
+        title=f"{_subject(of_estimators)}: study “{_name(dataset)}”",
+        findings=findings(dataset) if of_estimators else [],
+        of_estimators=of_estimators,
         facts={
             "Cells": f"{done} of {total} finished",
             "Realisations": f"{attributes['n']} a cell: settings chosen on one half, scored on the other",
@@ -206,14 +215,18 @@ def _page(dataset: xarray.Dataset, pictures: list[_Picture]) -> str:
             for case in finding.cases
         ],
         cases_csv=_csv_uri(_cases_csv(judged)),
-        guidance=guidance(dataset),
+        guidance=[] if of_estimators else guidance(dataset),
         baselines=_baselines_rows(dataset),
         gain_modes=[mode_in_words(str(mode)) for mode in dataset["mode"].values],
-        gains=_gains_rows(dataset),
+        gains=[] if of_estimators else _gains_rows(dataset),
         pictures=pictures,
         specification=str(attributes["specification"]).strip(),
         version=attributes.get("faintspot_version", ""),
     )
+
+
+def _subject(of_estimators: bool) -> str:
+    return "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
 
 
 def _name(dataset: xarray.Dataset) -> str:

@@ -18,6 +18,7 @@ FLAG_MEANINGS = {
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
     SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std is not below the image's rms: denoised to a constant.",
     SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
+    SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
 }
 _MOST_LISTED = 20
 _OFTEN_INFEASIBLE = 0.05

@@ -32,6 +32,13 @@ class Calibration:
     saturation_adu : float, optional
         Raw value from which a pixel counts as saturated. Default: the largest value of the frames' integer
         dtype; none for floating-point frames.
+    read_noise_e : float, optional
+        Standard deviation of the read noise in electrons at the camera's output, after multiplication: in
+        photo-electrons it is read_noise_e / em_gain. Needed for standard errors and for the estimators "ml"
+        and "map".
+    background_e : float
+        Mean photo-electrons per pixel and frame of sky and dark current: `dark` takes off their mean, but
+        their noise stays.
 
     Raises
     ------
@@ -45,6 +52,8 @@ class Calibration:
     em_gain: float = 1.0
     bad_pixels: Any = None
     saturation_adu: float | None = None
+    read_noise_e: float | None = None
+    background_e: float = 0.0
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -53,6 +62,9 @@ class Calibration:
             put(self, "flat", _map("calibration.flat", self.flat))
         for name in ("gain_e_per_adu", "em_gain"):
             put(self, name, number_between(f"calibration.{name}", getattr(self, name), 0.0, low_open=True))
+        if self.read_noise_e is not None:
+            put(self, "read_noise_e", number_between("calibration.read_noise_e", self.read_noise_e, 0.0))
+        put(self, "background_e", number_between("calibration.background_e", self.background_e, 0.0))
         if self.saturation_adu is not None:
             level = number_between("calibration.saturation_adu", self.saturation_adu, 0.0, low_open=True)
             put(self, "saturation_adu", level)
@@ -74,6 +86,16 @@ class Calibration:
         )
 
     __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def excess_noise(self) -> float:
+        """Factor of the multiplication register on the variance of the electrons: 2, or 1 without one."""
+        return 2.0 if self.em_gain > 1 else 1.0
+
+    @property
+    def read_noise_photoelectrons(self) -> float | None:
+        """Read noise divided by the multiplication gain; None where it is not known."""
+        return None if self.read_noise_e is None else self.read_noise_e / self.em_gain
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:

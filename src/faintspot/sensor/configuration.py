@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomlkit
@@ -18,10 +18,35 @@ from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
 from faintspot.sensor.settings import PER_SUBAPERTURE, PerSubaperture, Settings
 
-TABLES: dict[str, type] = {"layout": Layout, "calibration": Calibration, "settings": Settings}
+TABLES: dict[str, type] = {
+    "layout": Layout,
+    "calibration": Calibration,
+    "settings": Settings,
+    "psf": PSF,
+    "score": TrainedScore,
+}
+_FILED: dict[str, type[PSF] | type[TrainedScore]] = {
+    "psf": PSF,
+    "score": TrainedScore,
+}  # kept in files of their own, which the table names
 GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
+ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
+# Settings that a reader of the file looks for, also where they are at their defaults; the second ones only
+# where denoising or brightest pixels have a say.
+_ALWAYS_WRITTEN = ("estimator", "flux_floor", "max_bad_fraction")
+_WRITTEN_FOR_GRAVITY = (
+    "noise_std",
+    "tolerance",
+    "max_iterations",
+    "keep_brightest",
+    "rule",
+    "denoise",
+    "algorithm",
+)
 _CALIBRATION_MAPS = ("dark", "flat", "bad_pixels")
 
 
@@ -47,18 +72,42 @@ def load(path: str | Path, table: str) -> Any:
     return _build(path, table, _read(path))
 
 
-def load_all(path: str | Path) -> tuple[Layout, Settings, Calibration]:
-    """Read layout, settings and calibration from a configuration file."""
+class Configuration(NamedTuple):
+    """Everything that a configuration file describes."""
+
+    layout: Layout
+    settings: Settings
+    calibration: Calibration
+    psf: PSF | None
+    score: TrainedScore | None
+
+
+def load_all(path: str | Path) -> Configuration:
+    """Read everything from a configuration file; PSF and score may be absent."""
     path = Path(path)
     document = _read(path)
-    return (
+    return Configuration(
         _build(path, "layout", document),
         _build(path, "settings", document),
         _build(path, "calibration", document),
+        _build(path, "psf", document) if "psf" in document else None,
+        _build(path, "score", document) if "score" in document else None,
     )
 
 
-def save(path: str | Path, item: Layout | Calibration | Settings) -> None:
+def has(path: str | Path, table: str) -> bool:
+    """Say whether a configuration file exists and has a table.
+
+    Raises
+    ------
+    InputError
+        When the file exists and cannot be read, or is not TOML.
+    """
+    path = Path(path)
+    return path.exists() and table in _read(path)
+
+
+def save(path: str | Path, item: Layout | Calibration | Settings | PSF | TrainedScore) -> None:
     """Write an object into its table of a configuration file; other tables and comments stay as they are.
 
     Raises
@@ -69,7 +118,12 @@ def save(path: str | Path, item: Layout | Calibration | Settings) -> None:
     path = Path(path)
     table = next(name for name, kind in TABLES.items() if isinstance(item, kind))
     document = _parse(path) if path.exists() else tomlkit.document()
-    values = _values(item)
+    if isinstance(item, PSF | TrainedScore):
+        store = path.with_suffix(f".{table}.npz")
+        item.save(store)
+        values: dict[str, Any] = {"file": store.name}
+    else:
+        values = _values(item)
     maps = {key: value for key, value in values.items() if table == "calibration" and _is_map(value)}
     store = path.with_suffix(".calibration.npz")
     values.update({key: f"{store.name}:{key}" for key in maps})
@@ -132,6 +186,8 @@ def _build(path: Path, table: str, document: dict[str, Any]) -> Any:
         if table == "layout" and "grid" in values:
             return _grid(values)
         kind = TABLES[table]
+        if table in _FILED:
+            return _filed(path, table, values)
         for key in values:
             _known(f"{table}.", key, [f.name for f in fields(kind)], "key")
         required = [f.name for f in fields(kind) if f.default is MISSING]
@@ -147,6 +203,20 @@ def _build(path: Path, table: str, document: dict[str, Any]) -> Any:
         text = str(error)
         where = "" if text.startswith((f"{table}.", f"{table}:")) else f"{table}."
         raise InputError(f"{path}: {where}{text}") from None
+
+
+def _filed(path: Path, table: str, values: dict[str, Any]) -> Any:
+    """A PSF or a score, from the file that the table names; or an analytic PSF."""
+    if table == "psf" and "profile" in values:
+        for key in values:
+            _known("psf.", key, ANALYTIC_KEYS, "key beside profile")
+        return PSF.analytic(**values)
+    for key in values:
+        _known(f"{table}.", key, ["file", "profile"] if table == "psf" else ["file"], "key")
+    name = values.get("file")
+    if not isinstance(name, str):
+        raise InputError(f"{table}.file: expected the name of a file, found {name!r}")
+    return _FILED[table].load(path.parent / name)
 
 
 def _grid(values: dict[str, Any]) -> Layout:
@@ -209,12 +279,15 @@ def _is_map(value: Any) -> bool:
 
 
 def _values(item: Any) -> dict[str, Any]:
-    """The fields that are not at their default."""
+    """The fields that are not at their default, and those that are always written."""
     values = {}
     for f in fields(item):
         value = getattr(item, f.name)
         at_default = f.default is not MISSING and not isinstance(value, np.ndarray) and value == f.default
-        if value is not None and not (at_default and not isinstance(item, Settings)):
+        always = isinstance(item, Settings) and (
+            f.name in _ALWAYS_WRITTEN or (f.name in _WRITTEN_FOR_GRAVITY and item.estimator == "cog")
+        )
+        if value is not None and (always or not at_default):
             values[f.name] = value
     return values
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from dataclasses import replace as dataclass_replace
@@ -12,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import numbers_between, one_of
+from faintspot.checks import number_between, numbers_between, one_of
 from faintspot.errors import InputError
 
 ALGORITHMS = ("fgp", "chambolle")
 RULES = ("subtract_next", "threshold", "subtract_kth")
+ESTIMATORS = ("cog", "thresholded", "smoothed", "weighted", "matched", "ml", "map", "trained")
+AUTO = "auto"
 KEPT_FRACTION = 0.08  # of a window's pixels, where keep_brightest is not given: 20 of 16 x 16
 FEWEST_KEPT = 5
 
@@ -29,7 +32,50 @@ PER_SUBAPERTURE = (
     "denoise",
     "flux_floor",
     "max_bad_fraction",
+    "threshold_e",
+    "smoothing_px",
+    "spot_fwhm_px",
+    "weight_fwhm_px",
+    "model_error",
+    "weight_floor",
+    "search_range_px",
+    "flux_e",
+    "prior_std_px",
+    "error_scale",
 )
+_OPTIONAL = (
+    "noise_std",
+    "keep_brightest",
+    "threshold_e",
+    "smoothing_px",
+    "spot_fwhm_px",
+    "weight_fwhm_px",
+    "search_range_px",
+    "flux_e",
+    "prior_std_px",
+)
+"""Settings that may be none: not needed, or found by themselves."""
+
+# Bounds of the numbers, and whether the lower one is refused itself.
+_BOUNDS = {
+    "max_iterations": (1, 2**24, False),
+    "keep_brightest": (1, 2**24, False),
+    "tolerance": (0.0, 1.0, False),
+    "noise_std": (0.0, math.inf, False),
+    "flux_floor": (0.0, 1.0, False),
+    "max_bad_fraction": (0.0, 1.0, False),
+    "threshold_e": (0.0, 1e12, False),
+    "smoothing_px": (0.0, 16.0, True),
+    "spot_fwhm_px": (0.1, 64.0, False),
+    "weight_fwhm_px": (0.1, 64.0, False),
+    "model_error": (0.0, 10.0, False),
+    "weight_floor": (0.0, 1.0, False),
+    "search_range_px": (0.0, 1e4, True),
+    "flux_e": (0.0, 1e12, True),
+    "prior_std_px": (0.0, 1e4, True),
+    "error_scale": (0.0, 1e3, True),
+}
+_WHOLE = ("max_iterations", "keep_brightest")
 
 
 @dataclass(frozen=True)
@@ -48,20 +94,21 @@ class PerSubaperture:
 class Settings:
     """How each sub-aperture's image is turned into a position; immutable.
 
-    Every value but `algorithm` is a scalar or holds one value per sub-aperture.
+    Every value but `estimator`, `algorithm` and `steps` is a scalar or holds one value per sub-aperture.
 
     Parameters
     ----------
-    noise_std : float or array, electrons
-        Strength of the denoising: the standard deviation of the noise to remove from a pixel. A good value
-        at low read noise is sqrt(read_noise^2 + 0.25 * flux / pixels). Needed where `denoise` is true.
+    noise_std : float or array, electrons, or "auto"
+        Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from
+        read noise, light and spot, by `faintspot.estimate.automatic.automatic_strength`. Needed by the
+        estimator "cog" where `denoise` is true.
     tolerance : float or array
         Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`.
     max_iterations : int or array
         Its iteration limit.
-    keep_brightest : int or array, optional
+    keep_brightest : int or array or "auto", optional
         Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at
-        least 5.
+        least 5. "auto": by `faintspot.estimate.automatic.automatic_kept_pixels`.
     rule : str or array of str
         "subtract_next" | "threshold" | "subtract_kth"; see `faintspot.brightest_pixels`.
     denoise : bool or array of bool
@@ -73,6 +120,36 @@ class Settings:
         above this fraction of its image's largest pixel.
     max_bad_fraction : float or array
         A sub-aperture with a larger fraction of bad pixels is invalid.
+    estimator : str
+        How a position is found, see `faintspot.estimators`: "cog" (TV denoising where `denoise` is true,
+        brightest pixels, centre of gravity), "smoothed" (linear smoothing instead of TV), "thresholded",
+        "weighted", "matched", "ml", "map", "trained".
+    threshold_e : float or array, electrons
+        What "thresholded" takes off every pixel; what is negative then becomes 0.
+    smoothing_px : float or array
+        Standard deviation of the Gaussian of "smoothed". Default 0.7.
+    spot_fwhm_px : float or array
+        Full width at half maximum of the spots. Default: that of the PSF.
+    weight_fwhm_px : float or array
+        Full width at half maximum of the weight of "weighted". Default: that of the spot.
+    steps : int
+        Of "ml", "matched" and "map" (default 3) or of "weighted" (default 8).
+    model_error : float or array
+        How far the spots differ from the PSF, as a fraction of each pixel's light: "ml" and "map" trust
+        bright pixels no more than that. 0.1 to 0.5 for speckled spots.
+    weight_floor : float or array
+        Variance, as a fraction of the light, that is added to every pixel's weight, so that small errors
+        of the PSF in dark wings carry no large weights.
+    search_range_px : float or array
+        Largest slope: positions are sought, and kept, within so much of the reference. Default: the
+        whole window.
+    flux_e : float or array, electrons
+        Light expected of a spot in a frame; "map", "trained" and "auto" use it. Default: measured in each
+        frame, as the mean of all sub-apertures.
+    prior_std_px : float or array
+        Standard deviation of the prior of "map". Default: none but the search range.
+    error_scale : float or array
+        Factor on the standard errors.
 
     Raises
     ------
@@ -89,17 +166,34 @@ class Settings:
     algorithm: str = "fgp"
     flux_floor: Any = 1e-4
     max_bad_fraction: Any = 0.25
+    estimator: str = "cog"
+    threshold_e: Any = None
+    smoothing_px: Any = None
+    spot_fwhm_px: Any = None
+    weight_fwhm_px: Any = None
+    steps: int | None = None
+    model_error: Any = 0.0
+    weight_floor: Any = 2e-4
+    search_range_px: Any = None
+    flux_e: Any = None
+    prior_std_px: Any = None
+    error_scale: Any = 1.0
 
     def __post_init__(self) -> None:
         one_of("algorithm", self.algorithm, ALGORITHMS)
+        one_of("estimator", self.estimator, ESTIMATORS)
+        if self.steps is not None:
+            object.__setattr__(self, "steps", int(number_between("steps", self.steps, 1, 100, integer=True)))
         for name in PER_SUBAPERTURE:
             object.__setattr__(self, name, _checked(name, getattr(self, name)))
         lengths = {name: len(value) for name in PER_SUBAPERTURE if _is_array(value := getattr(self, name))}
         if len(set(lengths.values())) > 1:
             sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise InputError(f"settings: expected arrays of one length, got {sizes}")
-        if _lacks_strength(self.noise_std, self.denoise):
-            raise InputError("noise_std: expected a number (electrons), got none; or set denoise = false")
+        if self.estimator == "cog" and _lacks_strength(self.noise_std, self.denoise):
+            raise InputError(
+                'noise_std: expected a number (electrons) or "auto", got none; or set denoise = false'
+            )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Settings):
@@ -179,7 +273,9 @@ class Settings:
     def _default(name: str, pixels: int) -> Any:
         if name == "keep_brightest":
             return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
-        return 0.0  # noise_std where nothing is denoised
+        if name == "smoothing_px":
+            return 0.7
+        return 0.0 if name == "noise_std" else math.nan  # where nothing is denoised; what is not set
 
 
 def _is_array(value: Any) -> bool:
@@ -248,8 +344,10 @@ def _checked(name: str, value: Any) -> Any:
         default = _checked(name, value.default)
         others = {int(index): _checked(name, item) for index, item in value.others.items()}
         return PerSubaperture(default, MappingProxyType(others))
-    if value is None and name in ("noise_std", "keep_brightest"):
+    if value is None and name in _OPTIONAL:
         return None
+    if name in ("noise_std", "keep_brightest") and isinstance(value, str) and value == AUTO:
+        return AUTO
     if name == "rule":
         return _checked_each(name, value, lambda item: one_of("rule", item, RULES))
     if name == "denoise":
@@ -265,15 +363,8 @@ def _checked(name: str, value: Any) -> Any:
 
 
 def _checked_numbers(name: str, value: Any) -> NDArray[Any]:
-    if name == "max_iterations":
-        return numbers_between(name, value, 1, 2**24, integer=True)
-    if name == "keep_brightest":
-        return numbers_between(name, value, 1, integer=True)
-    if name == "tolerance":
-        return numbers_between(name, value, 0.0, 1.0)
-    if name == "noise_std":
-        return numbers_between(name, value, 0.0)
-    return numbers_between(name, value, 0.0, 1.0)
+    low, high, low_open = _BOUNDS[name]
+    return numbers_between(name, value, low, high, integer=name in _WHOLE, low_open=low_open)
 
 
 def _checked_bool(value: Any) -> bool:

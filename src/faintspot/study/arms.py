@@ -1,6 +1,8 @@
-"""The arms of a study: what each does to the images, and its error for every number of kept pixels."""
+"""The arms of a study that keep the brightest pixels, or what is above a threshold."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +18,23 @@ FLUX_FLOOR: float = Settings.flux_floor
 """No light: the sum that is left is not above this fraction of the image's largest pixel."""
 
 Images = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 
 def error_table(
-    arm: str, candidate: float, cell: Cell, images: Images, truth: NDArray[np.float64]
+    arm: str,
+    candidate: float,
+    cell: Cell,
+    images: Images,
+    truth: Floats,
+    search_range_px: float = math.inf,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return (|dx| + |dy|) / 2 of every image for every number k of kept pixels.
 
     Parameters
     ----------
     arm : str
-        One of `faintspot.study.specification.ARMS`.
+        One of `faintspot.study.specification.BRIGHTEST_ARMS`.
     candidate : float
         "tv": strength, as a fraction of `cell.pixel_noise_e`; "gaussian": standard deviation, px, of the
         Gaussian, the image being continued by zeros; "thresholded": threshold in units of
@@ -34,6 +42,8 @@ def error_table(
     cell : Cell
     images : (n, side, side) array, float32
     truth : (n, 2) array, px
+    search_range_px : float
+        Positions beyond plus or minus this become it, on each axis.
 
     Returns
     -------
@@ -43,23 +53,46 @@ def error_table(
         Whether there was light. Where not, the position counts as (0, 0).
     """
     if arm == "thresholded":
-        return _errors_above_threshold(images, candidate * cell.pixel_noise_e, truth)
-    rule = scoring.THRESHOLD if arm == "threshold" else scoring.SUBTRACT_NEXT
-    prepared = np.ascontiguousarray(_prepared(arm, candidate, cell, images)).reshape(len(images), -1)
+        positions, valid = _above_threshold(images, candidate * cell.pixel_noise_e, search_range_px)
+        return np.abs(positions - truth).mean(axis=1).astype(np.float32)[:, None], valid
+    prepared, rule = _prepared(arm, candidate, cell, images)
     errors = np.empty((len(images), prepared.shape[1] - 1), np.float32)
     valid = np.empty(errors.shape, np.bool_)
-    scoring.errors_of_every_k(prepared, cell.pixels, rule, FLUX_FLOOR, truth, 0, len(images), errors, valid)
+    span = (0, len(images))
+    scoring.errors_of_every_k(
+        prepared, cell.pixels, rule, FLUX_FLOOR, search_range_px, truth, *span, errors, valid
+    )
     return errors, valid
 
 
-def _prepared(arm: str, candidate: float, cell: Cell, images: Images) -> Images:
-    """Return the images as the brightest pixels are sought in them."""
+def position_table(
+    arm: str, candidate: float, cell: Cell, images: Images, search_range_px: float = math.inf
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the positions (n, K, 2), px, whose errors `error_table` returns, and their validity (n, K)."""
+    if arm == "thresholded":
+        above, valid = _above_threshold(images, candidate * cell.pixel_noise_e, search_range_px)
+        return above[:, None].astype(np.float64), valid
+    prepared, rule = _prepared(arm, candidate, cell, images)
+    positions = np.empty((len(images), prepared.shape[1] - 1, 2))
+    valid = np.empty(positions.shape[:2], np.bool_)
+    span = (0, len(images))
+    scoring.positions_of_every_k(
+        prepared, cell.pixels, rule, FLUX_FLOOR, search_range_px, *span, positions, valid
+    )
+    return positions, valid
+
+
+def _prepared(arm: str, candidate: float, cell: Cell, images: Images) -> tuple[Images, int]:
+    """Return the images (n, pixels) as the brightest pixels are sought in them, and the rule."""
+    prepared = images
     if arm == "tv":
-        return tv_denoise(images, candidate * cell.pixel_noise_e)
-    if arm == "gaussian":
-        smoothed: Images = gaussian_filter(images, candidate, mode="constant", axes=(-2, -1))
-        return smoothed
-    return median_of_nine(images) if arm == "median" else images
+        prepared = tv_denoise(images, candidate * cell.pixel_noise_e)
+    elif arm == "gaussian":
+        prepared = gaussian_filter(images, candidate, mode="constant", axes=(-2, -1))
+    elif arm == "median":
+        prepared = median_of_nine(images)
+    rule = scoring.THRESHOLD if arm == "threshold" else scoring.SUBTRACT_NEXT
+    return np.ascontiguousarray(prepared).reshape(len(images), -1), rule
 
 
 def median_of_nine(images: Images) -> Images:
@@ -82,13 +115,12 @@ def _sorted_three(a: Images, b: Images, c: Images) -> tuple[Images, Images, Imag
     return np.minimum(low, c), np.maximum(low, np.minimum(high, c)), np.maximum(high, c)
 
 
-def _errors_above_threshold(
-    images: Images, threshold_e: float, truth: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Errors of the centre of gravity of what is above a threshold, the threshold taken off."""
+def _above_threshold(
+    images: Images, threshold_e: float, search_range_px: float
+) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """Centre of gravity (n, 2) of what is above a threshold, the threshold taken off, and validity (n, 1)."""
     left = np.maximum(images - np.float32(threshold_e), np.float32(0.0))
     largest = np.abs(images).max(axis=(1, 2))
     valid = left.sum(axis=(1, 2)) > FLUX_FLOOR * largest
     positions = np.where(valid[:, None], centre_of_gravity(left), 0.0)
-    errors = np.abs(positions - truth).mean(axis=1)
-    return errors.astype(np.float32)[:, None], valid[:, None]
+    return np.clip(positions, -search_range_px, search_range_px), valid[:, None]

@@ -19,6 +19,11 @@ ARM_NAMES = {
     "gaussian": "Gaussian smoothing",
     "median": "3 × 3 median filter",
     "thresholded": "thresholded centre of gravity",
+    "weighted": "weighted centre of gravity",
+    "matched": "matched filter",
+    "ml": "maximum likelihood",
+    "map": "maximum likelihood with prior (MAP)",
+    "trained": "trained score",
 }
 _FAMILY_FALSE_ALARM = 0.05
 

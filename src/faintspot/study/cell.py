@@ -7,37 +7,40 @@ with the number of realisations.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.simulate import Detector, subapertures
-from faintspot.study.arms import Images, error_table
-from faintspot.study.specification import BEST, StudySpecification
+from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
+from faintspot.simulate import subapertures
+from faintspot.study.arms import Images, position_table
+from faintspot.study.estimator_arms import EstimatorArms, detector_of
+from faintspot.study.metric import OUTLIER_PX, slope_statistics
+from faintspot.study.specification import (
+    BEST,
+    ESTIMATOR_ARMS,
+    KEEPING_ARMS,
+    Candidate,
+    Robustness,
+    StudySpecification,
+)
 from faintspot.study.sweep import Cell
+from faintspot.study.tuning import Choice, Tuning
 
 _BLOCK_PIXELS = 1 << 18  # small enough for the processor's cache
+_STACK_PIXELS = 1 << 21  # that an estimator measures at once
 
 Floats = NDArray[np.float64]
+Block = tuple[Images, Floats]
+
+STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
+"""Variables beside R that are made with their standard errors, from `slope_statistics`."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What an arm chose in a mode; `column` is the number of kept pixels less one, 0 where there is none."""
-
-    candidate: float
-    column: int
-
-
-def realisations(
-    cell: Cell, count: int, rng: np.random.Generator
-) -> Iterator[tuple[Images, NDArray[np.float64]]]:
+def realisations(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[Block]:
     """Yield blocks of noisy images (n, side, side), the mean background subtracted, and true positions."""
-    detector = Detector(
-        read_noise_e=cell.read_noise_e * cell.em_gain, background_e=cell.background_e, em_gain=cell.em_gain
-    )
+    detector = detector_of(cell)
     block = _BLOCK_PIXELS // cell.pixels**2
     for start in range(0, count, block):
         images, truth = subapertures(
@@ -48,30 +51,23 @@ def realisations(
             size=cell.size,
             elongation=cell.elongation,
             position_range_px=cell.position_range_px,
+            d_over_r0=cell.d_over_r0,
             detector=detector,
             rng=rng,
         )
         yield images - np.float32(cell.background_e), truth
 
 
-def mean_errors(cell: Cell, arms: dict[str, tuple[float, ...]], blocks: Any) -> dict[str, Floats]:
-    """Return R of every arm's candidates and every k, shape (candidates, K), px."""
-    sums: dict[str, Any] = dict.fromkeys(arms, 0.0)
-    count = 0
-    for images, truth in blocks:
-        count += len(images)
-        for arm, candidates in arms.items():
-            tables = (error_table(arm, candidate, cell, images, truth)[0] for candidate in candidates)
-            sums[arm] = sums[arm] + np.stack([table.sum(axis=0, dtype=np.float64) for table in tables])
-    return {arm: total / count for arm, total in sums.items()}
-
-
-def choose(arm: str, candidates: tuple[float, ...], errors: Floats, kept: int | None) -> Choice:
-    """Return the candidate, and where `kept` is None the k, of the smallest R of a table (candidates, K)."""
-    if kept is not None and arm != "thresholded":
-        return Choice(candidates[int(np.argmin(errors[:, kept - 1]))], kept - 1)
-    row, column = np.unravel_index(np.argmin(errors), errors.shape)
-    return Choice(candidates[int(row)], int(column))
+def _stacks(blocks: Iterator[Block]) -> Iterator[list[Block]]:
+    """Yield several blocks at a time."""
+    stack: list[Block] = []
+    for block in blocks:
+        stack.append(block)
+        if sum(images.size for images, _ in stack) >= _STACK_PIXELS:
+            yield stack
+            stack = []
+    if stack:
+        yield stack
 
 
 def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDArray[Any]]:
@@ -85,91 +81,182 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
     Returns
     -------
     dict
-        The variables of the study's dataset for this cell: `error`, `error_se`, `chosen_k`,
-        `chosen_candidate` and `invalid_fraction` of shape (arm, mode), `error_covariance` (mode, arm, arm),
-        `error_at_k` and `error_at_k_se` (arm, K) with K = pixels^2 - 1. NaN in modes that keep more pixels
-        than the window can.
+        The variables of the study's dataset for this cell, see `faintspot.study.store.VARIABLES`, without
+        the dimension cell; K = pixels^2 - 1. NaN in modes that keep more pixels than the window can.
     """
     rng = np.random.default_rng(cell.seed(specification.seed))
     half = specification.realisations // 2
-    arms = {arm: specification.candidates(arm) for arm in specification.arms}
-    means = mean_errors(cell, arms, realisations(cell, half, rng))
-    kept = {BEST: None} | {f"fixed{k}": k for k in specification.fixed_k if k < cell.pixels**2}
-    choices = {(arm, mode): choose(arm, arms[arm], means[arm], k) for arm in arms for mode, k in kept.items()}
-    scores = _Scores(cell, choices)
-    for images, truth in realisations(cell, specification.realisations - half, rng):
-        scores.add(images, truth)
-    return _results(cell, specification, choices, scores)
+    search = specification.search_range_of(cell)
+    tuning, estimators = Tuning(cell, specification), None
+    for stack in _stacks(realisations(cell, half, rng)):
+        if estimators is None:
+            light = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
+            estimators = EstimatorArms(cell, specification.seed, search, float(light.mean()))
+        tuning.add(stack, estimators)
+    assert estimators is not None
+    scores = _Scores(cell, tuning.choices(), estimators, search)
+    for stack in _stacks(realisations(cell, specification.realisations - half, rng)):
+        scores.add(stack)
+    return _results(cell, specification, scores)
 
 
 class _Scores:
-    """Errors of the chosen settings, block after block."""
+    """Positions with the chosen settings, stack after stack."""
 
-    def __init__(self, cell: Cell, choices: dict[tuple[str, str], Choice]) -> None:
-        self._cell, self._choices = cell, choices
-        self._errors: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
-        self._valid = dict.fromkeys(choices, 0)
+    def __init__(
+        self,
+        cell: Cell,
+        choices: dict[tuple[str, str], Choice],
+        estimators: EstimatorArms,
+        search_range_px: float,
+    ) -> None:
+        self.choices = choices
+        self._cell, self._estimators, self._search_range_px = cell, estimators, search_range_px
+        self._truth: list[Floats] = []
+        self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
+        self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
+        self._stated: dict[str, list[Floats]] = {}
         self.sums: dict[str, Any] = {}  # of the errors and of their squares, for every k
-        self.count = 0
 
-    def add(self, images: Images, truth: Floats) -> None:
-        """Score a block."""
-        self.count += len(images)
-        for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self._choices.items()):
-            errors, valid = error_table(arm, candidate, self._cell, images, truth)
-            for mode in [
-                mode for (a, mode), c in self._choices.items() if (a, c.candidate) == (arm, candidate)
-            ]:
-                column = self._choices[arm, mode].column
-                self._errors[arm, mode].append(errors[:, column].astype(np.float64))
-                self._valid[arm, mode] += int(valid[:, column].sum())
-                if mode == BEST:
-                    squares = np.square(errors, dtype=np.float64)
-                    sums = np.stack([errors.sum(axis=0, dtype=np.float64), squares.sum(axis=0)])
-                    self.sums[arm] = self.sums.get(arm, 0.0) + sums
+    @property
+    def truth(self) -> Floats:
+        """True positions (n, 2), px."""
+        return np.concatenate(self._truth)
 
-    def errors(self, arm: str, mode: str) -> Floats:
-        """Return the errors of all realisations, px."""
-        return np.concatenate(self._errors[arm, mode])
+    def add(self, blocks: list[Block]) -> None:
+        """Score images."""
+        self._truth += [truth for _, truth in blocks]
+        for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
+            if arm in ESTIMATOR_ARMS:
+                self._add_estimator(arm, candidate, np.concatenate([images for images, _ in blocks]))
+            else:
+                for images, truth in blocks:
+                    self._add_table(arm, candidate, images, truth)
 
-    def invalid_fraction(self, arm: str, mode: str) -> float:
-        """Return the fraction of realisations without a valid position."""
-        return 1.0 - self._valid[arm, mode] / self.count
+    def _modes(self, arm: str, candidate: Candidate) -> list[str]:
+        """Modes in which an arm chose a candidate."""
+        same = (arm, candidate)
+        return [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
+
+    def _add_estimator(self, arm: str, candidate: Candidate, images: Images) -> None:
+        slopes = self._estimators.measure(arm, candidate, images)
+        modes = self._modes(arm, candidate)
+        for mode in modes:
+            self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
+            self._valid[arm, mode].append(slopes.valid)
+        if BEST in modes:
+            stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
+            self._stated.setdefault(arm, []).append(stated.astype(np.float64))
+
+    def _add_table(self, arm: str, candidate: Any, images: Images, truth: Floats) -> None:
+        positions, valid = position_table(arm, candidate, self._cell, images, self._search_range_px)
+        for mode in self._modes(arm, candidate):
+            column = self.choices[arm, mode].column
+            self._positions[arm, mode].append(positions[:, column].copy())
+            self._valid[arm, mode].append(valid[:, column].copy())
+            if mode == BEST and arm in KEEPING_ARMS:
+                errors = _errors(positions, truth[:, None])
+                sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
+                self.sums[arm] = self.sums.get(arm, 0.0) + sums
+
+    def positions(self, arm: str, mode: str) -> Floats:
+        """Return the positions of all realisations, (n, 2) px."""
+        return np.concatenate(self._positions[arm, mode])
+
+    def valid(self, arm: str, mode: str) -> NDArray[np.bool_]:
+        """Return which realisations have a valid position."""
+        return np.concatenate(self._valid[arm, mode])
+
+    def stated(self, arm: str) -> Floats | None:
+        """Return the standard errors (n, 2) that an estimator states, px, in mode "best"."""
+        return np.concatenate(self._stated[arm]) if arm in self._stated else None
 
 
-def _results(
-    cell: Cell, specification: StudySpecification, choices: dict[tuple[str, str], Choice], scores: _Scores
-) -> dict[str, NDArray[Any]]:
+def _errors(positions: Floats, truth: Floats) -> Floats:
+    """(|dx| + |dy|) / 2, to the precision of `faintspot.study.arms.error_table`."""
+    errors: NDArray[np.float32] = np.abs(positions - truth).mean(axis=-1).astype(np.float32)
+    return errors.astype(np.float64)
+
+
+def _results(cell: Cell, specification: StudySpecification, scores: _Scores) -> dict[str, NDArray[Any]]:
     """Arrange choices and scores as the dataset has them."""
-    arms, modes = specification.arms, specification.modes
-    table = (len(arms), len(modes))
-    names = ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction")
-    results: dict[str, NDArray[Any]] = {name: np.full(table, np.nan) for name in names}
+    arms, modes, truth = specification.arms, specification.modes, scores.truth
+    names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]
+    names += [name for statistic in STATISTICS for name in (statistic, f"{statistic}_se")]
+    results: dict[str, NDArray[Any]] = {name: np.full((len(arms), len(modes)), np.nan) for name in names}
     results["error_covariance"] = np.full((len(modes), len(arms), len(arms)), np.nan)
     for j, mode in enumerate(modes):
-        if (arms[0], mode) not in choices:
+        if (arms[0], mode) not in scores.choices:
             continue
-        errors = np.stack([scores.errors(arm, mode) for arm in arms])
+        positions = [scores.positions(arm, mode) for arm in arms]
+        errors = np.stack([_errors(part, truth) for part in positions])
         covariance = _covariance_of_means(errors)
         results["error"][:, j] = errors.mean(axis=1)
         results["error_se"][:, j] = np.sqrt(np.diag(covariance))
         results["error_covariance"][j] = covariance
         for i, arm in enumerate(arms):
-            choice = choices[arm, mode]
-            results["chosen_k"][i, j] = np.nan if arm == "thresholded" else choice.column + 1
-            results["chosen_candidate"][i, j] = choice.candidate
-            results["invalid_fraction"][i, j] = scores.invalid_fraction(arm, mode)
-    return results | _results_at_k(cell, arms, scores)
+            choice = scores.choices[arm, mode]
+            results["chosen_k"][i, j] = choice.column + 1 if arm in KEEPING_ARMS else np.nan
+            if isinstance(choice.candidate, Robustness):
+                results["chosen_candidate"][i, j], results["chosen_model_error"][i, j] = choice.candidate
+            else:
+                results["chosen_candidate"][i, j] = choice.candidate
+            results["invalid_fraction"][i, j] = 1.0 - scores.valid(arm, mode).mean()
+            statistics = slope_statistics(positions[i][:, 0], positions[i][:, 1], truth)
+            for name in STATISTICS:
+                estimate = getattr(statistics, name)
+                results[name][i, j] = estimate.value
+                results[f"{name}_se"][i, j] = estimate.standard_error
+    results |= _stated_over_actual(arms, scores)
+    return results | _results_at_k(cell, arms, scores) | _against_the_bound(cell, results["error"])
+
+
+def _stated_over_actual(arms: Any, scores: _Scores) -> dict[str, NDArray[Any]]:
+    """Root mean squares of stated standard errors and of errors: their ratio, without outliers and with."""
+    without, whole = np.full((2, len(arms)), np.nan)
+    for i, arm in enumerate(arms):
+        stated = scores.stated(arm)
+        if stated is not None:
+            errors = scores.positions(arm, BEST) - scores.truth
+            known = np.all(np.isfinite(stated), axis=1)
+            near = known & np.all(np.abs(errors) <= OUTLIER_PX, axis=1)
+            without[i], whole[i] = (
+                np.sqrt(np.mean(np.square(stated[part])) / np.mean(np.square(errors[part])))
+                if part.any()
+                else np.nan
+                for part in (near, known)
+            )
+    return {"stated_over_actual": without, "stated_over_actual_all": whole}
+
+
+def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
+    """Cramer-Rao bound and photon efficiency; NaN for speckled spots, whose bound is not known."""
+    bounds, efficiency = np.full(2, np.nan), np.full(errors.shape, np.nan)
+    if cell.d_over_r0 == 0:
+        conditions: dict[str, Any] = {
+            "shape": (cell.pixels, cell.pixels),
+            "profile": cell.profile,
+            "size": cell.size,
+            "elongation": cell.elongation,
+            "detector": detector_of(cell),
+            "position_range_px": cell.position_range_px,
+        }
+        bound = cramer_rao(cell.flux_e, **conditions)
+        bounds = np.array([MEAN_ABSOLUTE * bound.mean(), np.sqrt(np.mean(np.square(bound)))])
+        known = errors > 0
+        efficiency[known] = photon_efficiency(errors[known], cell.flux_e, **conditions)
+    return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 
 def _results_at_k(cell: Cell, arms: Any, scores: _Scores) -> dict[str, NDArray[Any]]:
     """R and its standard error for every k, at the candidate of mode "best"."""
     errors, standard_errors = np.full((2, len(arms), cell.pixels**2 - 1), np.nan)
+    count = len(scores.truth)
     for i, arm in enumerate(arms):
-        if arm != "thresholded":
-            mean, mean_square = scores.sums[arm] / scores.count
+        if arm in KEEPING_ARMS:
+            mean, mean_square = scores.sums[arm] / count
             errors[i] = mean
-            standard_errors[i] = np.sqrt(np.maximum(mean_square - mean**2, 0.0) / (scores.count - 1))
+            standard_errors[i] = np.sqrt(np.maximum(mean_square - mean**2, 0.0) / (count - 1))
     return {"error_at_k": errors, "error_at_k_se": standard_errors}
 
 

@@ -38,6 +38,7 @@ class Configuration:
     pixels: int
     background_e: float = 0.0
     em_gain: float = 1.0
+    d_over_r0: float = 0.0
 
     @property
     def prior_error_px(self) -> float:
@@ -58,6 +59,8 @@ class Configuration:
             words.append(f"background {self.background_e:g} e-/px")
         if self.em_gain != 1:
             words.append(f"EM gain {self.em_gain:g}")
+        if self.d_over_r0:
+            words.append(f"d/r0 {self.d_over_r0:g}")
         return ", ".join(words)
 
 

@@ -11,11 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.study.claims import BEST_MODE
+from faintspot.study.specification import CORRECTED
 from faintspot.study.sweep import PARAMETERS
 
 if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
+
+
+_STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction", "photon_efficiency")
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,9 @@ def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def mode_in_words(mode: str) -> str:
-    """Return "best k" or "fixed k = 40"."""
+    """Return "best k", "fixed k = 40", or "best gain-corrected rms"."""
+    if mode == CORRECTED:
+        return "best gain-corrected rms"
     return "best k" if mode == BEST_MODE else f"fixed k = {mode.removeprefix('fixed')}"
 
 
@@ -66,10 +72,15 @@ def parameter_in_words(name: str, value: Any) -> str:
         "position_range_px": "positions within ±{:g} px",
         "background_e": "background {:g} e-/px",
         "em_gain": "EM gain {:g}",
+        "d_over_r0": "d/r0 {:g}",
     }
-    if (name, value) in {("elongation", 1.0), ("background_e", 0.0), ("em_gain", 1.0)}:
-        return {"elongation": "round", "background_e": "no background", "em_gain": "no EM gain"}[name]
-    return words[name].format(value)
+    without = {
+        ("elongation", 1.0): "round",
+        ("background_e", 0.0): "no background",
+        ("em_gain", 1.0): "no EM gain",
+        ("d_over_r0", 0.0): "no turbulence",
+    }
+    return without.get((name, value)) or words[name].format(value)
 
 
 def numbers_of(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
@@ -83,8 +94,9 @@ def numbers_of(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str]
         "chosen_k",
         "chosen_candidate",
         "invalid_fraction",
+        *_STATISTICS,
     ]
-    names = ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction")
+    names = ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)
     arrays = [dataset[name].transpose("cell", "mode", "arm").values for name in names]
     rows = []
     for cell, parameters in zip(cells, parameters_of(dataset, cells), strict=True):

@@ -19,6 +19,7 @@ from faintspot.study.figure_data import (
     parameters_of,
 )
 from faintspot.study.kept_pixels import kept_panels
+from faintspot.study.specification import BRIGHTEST_ARMS
 from faintspot.study.sweep import PARAMETERS
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ _AXIS_NAMES = {
     "position_range_px": "half range of true positions (px)",
     "background_e": "background (e- per pixel)",
     "em_gain": "EM gain",
+    "d_over_r0": "d/r0",
 }
 ERROR_AXIS = "slope error R (px)"
 MAIN_NOISES_E = (0.1, 3.0, 16.0)
@@ -141,13 +143,13 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> StudyFigure | None:
 def baselines_figure(dataset: xarray.Dataset, profile: str) -> StudyFigure | None:
     """Draw R of every arm over R without denoising, for the main read noises; None without cells."""
     cells = _main_cells(dataset, profile)
-    arms = [str(arm) for arm in dataset["arm"].values]
+    arms = [str(arm) for arm in dataset["arm"].values if arm in BRIGHTEST_ARMS]
     if not cells or "plain" not in arms or len(arms) < 2:
         return None
     modes = _modes(dataset)
     figure = new_figure(WIDTH, _ROW_HEIGHT * len(cells) + 0.8)
     axes = figure.subplots(len(cells), len(modes), squeeze=False, sharey="row")
-    colours = dict(zip(ARM_NAMES, _COLOURS, strict=True))
+    colours = dict(zip(ARM_NAMES, _COLOURS, strict=False))
     reach = float(dataset["position_range_px"].values[next(iter(cells.values()))[0]])
     for panels, (noise, indices) in zip(axes, cells.items(), strict=True):
         lowest = 0.6
@@ -304,7 +306,7 @@ def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]
     """Return the cells of round Nyquist-sampled spots in 16 px, by read noise and flux."""
     done = np.flatnonzero(dataset["done"].values)
     standard = {"profile": profile, "size": 1.0, "elongation": 1.0, "pixels": 16}
-    standard |= {"background_e": 0.0, "em_gain": 1.0}
+    standard |= {"background_e": 0.0, "em_gain": 1.0, "d_over_r0": 0.0}
     table = zip(done, parameters_of(dataset, done.tolist()), strict=True)
     kept = [(int(i), row) for i, row in table if all(row[name] == value for name, value in standard.items())]
     if not kept:

@@ -12,6 +12,9 @@ from faintspot.checks import finite_array, number_between, numbers_between
 from faintspot.errors import InputError
 
 _RESAMPLES = 500
+OUTLIER_PX = 1.0
+"""An error beyond this on either axis is an outlier: half the width of a Nyquist-sampled spot. It does not
+scale with the errors' own spread, which would forgive a worse estimator more."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,106 @@ def slope_error(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> Estimate:
     """Return R = mean of |estimate - truth| per axis, x and y averaged (Basden et al. 2015), in px."""
     errors = absolute_errors(x, y, truth)
     return Estimate.of_mean(errors)
+
+
+@dataclass(frozen=True)
+class SlopeStatistics:
+    """How good slopes are. R alone flatters an estimator that falls back to the reference."""
+
+    error: Estimate
+    """Slope error R, the mean of (|dx| + |dy|) / 2, px."""
+    gain: Estimate
+    """Slope of the estimate against the truth, x and y pooled; 1 where nothing is lost. NaN where the truth
+    does not vary."""
+    rms: Estimate
+    """Root of the mean of (dx^2 + dy^2) / 2, px."""
+    corrected_rms: Estimate
+    """rms after offset and gain are taken off: of (estimate - offset) / gain - truth, px. What a control loop
+    of the right gain is left with. Infinite where the gain is not above 0, NaN where it is not defined."""
+    outlier_fraction: Estimate
+    """Fraction of slopes with an error beyond `outlier_px` on either axis."""
+    invalid_fraction: Estimate
+    """Fraction of slopes that are not valid; they count as they are in everything else."""
+
+
+def slope_statistics(
+    x: ArrayLike,
+    y: ArrayLike,
+    truth: ArrayLike,
+    *,
+    valid: ArrayLike | None = None,
+    outlier_px: float = OUTLIER_PX,
+) -> SlopeStatistics:
+    """Return error, gain, rms and outliers of slopes whose truth is known.
+
+    Gain and offset are those of a linear regression of the estimate on the truth: an offset for each axis,
+    one gain for both. Standard errors are those of independent pairs (x, y), to first order.
+
+    Parameters
+    ----------
+    x, y : (...) array, px
+    truth : (..., 2) array, px
+    valid : (...) array of bool, optional
+        Which slopes were measured. Default: all.
+    outlier_px : float
+        Error on either axis beyond which a slope is an outlier.
+
+    Raises
+    ------
+    InputError
+        When the shapes do not fit, there are no slopes, or the limit is not above 0.
+    """
+    outlier_px = number_between("outlier_px", outlier_px, 0.0, low_open=True)
+    estimate = np.stack([finite_array("x", x), finite_array("y", y)], axis=-1).astype(np.float64)
+    error = absolute_errors(x, y, truth).ravel()
+    measured = np.ones(estimate.shape[:-1], bool) if valid is None else np.asarray(valid, dtype=bool)
+    if measured.shape != estimate.shape[:-1]:
+        raise InputError(f"valid: expected shape {estimate.shape[:-1]}, got {measured.shape}")
+    estimate = estimate.reshape(-1, 2)
+    true = np.asarray(truth, dtype=np.float64).reshape(-1, 2)
+    gain, corrected_rms = _gain_and_corrected_rms(estimate, true)
+    outlier = np.any(np.abs(estimate - true) > outlier_px, axis=1)
+    return SlopeStatistics(
+        Estimate.of_mean(error),
+        gain,
+        _root(Estimate.of_mean(np.mean(np.square(estimate - true), axis=1))),
+        corrected_rms,
+        Estimate.of_mean(outlier.astype(np.float64)),
+        Estimate.of_mean(1.0 - measured.ravel()),
+    )
+
+
+def _root(mean_square: Estimate) -> Estimate:
+    """Root of a mean square, with its standard error to first order."""
+    root = float(np.sqrt(mean_square.value))
+    return Estimate(root, mean_square.standard_error / (2 * root) if root > 0 else 0.0)
+
+
+def _gain_and_corrected_rms(
+    estimate: NDArray[np.float64], truth: NDArray[np.float64]
+) -> tuple[Estimate, Estimate]:
+    """Regression of (n, 2) estimates on the truth: its gain, and the rms of its residuals over the gain."""
+    undefined = Estimate(float("nan"), float("nan"))
+    centred = truth - truth.mean(axis=0)
+    spread = float(np.mean(np.square(centred)))
+    if spread == 0.0:
+        return undefined, undefined
+    deviation = estimate - estimate.mean(axis=0)
+    gain = float(np.mean(deviation * centred)) / spread
+    residual = deviation - gain * centred
+    moves_gain = np.mean(residual * centred, axis=1) / spread  # what each slope adds to the gain, times n
+    root_n = np.sqrt(len(truth))
+    gain_estimate = Estimate(gain, float(moves_gain.std() / root_n))
+    if gain <= 0:
+        return gain_estimate, Estimate(float("inf"), float("inf"))
+    squares = np.mean(np.square(residual), axis=1)
+    mean_square = float(squares.mean())
+    if mean_square == 0.0:
+        return gain_estimate, Estimate(0.0, 0.0)
+    # Influence of each slope on the logarithm of mean_square / gain^2.
+    influence = squares / mean_square - 2 * moves_gain / gain
+    rms = float(np.sqrt(mean_square)) / gain
+    return gain_estimate, Estimate(rms, rms / 2 * float(influence.std() / root_n))
 
 
 def flux_gain(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomlkit
@@ -18,18 +19,46 @@ from faintspot.checks import number_between, one_of
 from faintspot.errors import InputError
 from faintspot.study.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
 
-__all__ = ["ARMS", "PROFILES", "StudySpecification", "Sweep"]
+__all__ = ["ARMS", "ESTIMATOR_ARMS", "PROFILES", "StudySpecification", "Sweep"]
 
-ARMS = ("plain", "tv", "threshold", "gaussian", "median", "thresholded")
-BEST = "best"
-_CANDIDATES = {"tv": "strengths", "gaussian": "widths", "thresholded": "thresholds"}
+KEEPING_ARMS = ("plain", "tv", "threshold", "gaussian", "median")
+"""Arms that keep the k brightest pixels."""
+BRIGHTEST_ARMS = (*KEEPING_ARMS, "thresholded")
+"""Arms that know nothing of the spot."""
+ESTIMATOR_ARMS = ("weighted", "matched", "ml", "map", "trained")
+"""Arms that do: estimators of `faintspot.estimators`."""
+ARMS = (*BRIGHTEST_ARMS, *ESTIMATOR_ARMS)
+_WITH_PSF = ("matched", "ml", "map")
+BEST, CORRECTED = "best", "corrected"
+_CANDIDATES = {
+    "tv": "strengths",
+    "gaussian": "widths",
+    "thresholded": "thresholds",
+    "weighted": "weight_widths",
+}
 _CANDIDATE_RANGES = {
     "strengths": Range("1", 0.0, 10.0, low_open=True),
     "widths": Range("px", 0.0, 10.0, low_open=True),
     "thresholds": Range("1", 0.0, 100.0),
+    "weight_widths": Range("1", 0.0, 100.0, low_open=True),
+    "blurs": Range("px", 0.0, 10.0),
+    "model_errors": Range("1", 0.0, 10.0),
 }
 _RANGE_KEYS = ("from", "to", "points", "spacing")
-_FORMAT = 1  # of the results: raised when the same specification gives other numbers or another layout
+_FORMAT = 2  # of the results: raised when the same specification gives other numbers or another layout
+
+
+class Robustness(NamedTuple):
+    """How an arm with a PSF allows for spots that are unlike it."""
+
+    blur_px: float
+    """Standard deviation of the Gaussian that the PSF is blurred with."""
+    model_error: float
+    """`faintspot.Settings.model_error`."""
+
+
+Candidate = float | Robustness
+"""What an arm may choose; NaN for an arm with nothing but k to choose."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +76,27 @@ class StudySpecification:
         Simulated images of each cell, at least 20. Settings are chosen on the first half of them and scored
         on the second.
     arms : sequence of str
-        What is compared, of "plain", "tv", "threshold", "gaussian", "median", "thresholded".
+        What is compared, of `ARMS`; those that know nothing of the spot by default.
     strengths : sequence of float
         Strengths of "tv" to choose from, as fractions of the noise of a mean pixel.
     widths : sequence of float
         Widths (standard deviations, px) of "gaussian" to choose from.
     thresholds : sequence of float
         Thresholds of "thresholded" to choose from, in units of the noise of a mean pixel.
+    weight_widths : sequence of float
+        Widths of the weight of "weighted" to choose from, as fractions of the spot's.
+    blurs : sequence of float
+        Standard deviations (px) of the Gaussian that blurs the PSF of "matched", "ml" and "map" to choose
+        from for spots that turbulence has speckled. Other spots are not blurred.
+    model_errors : sequence of float
+        `Settings.model_error` of "ml" and "map" to choose from, together with the blur, for the same spots.
     fixed_k : sequence of int
         Numbers of kept pixels of the modes in which all arms keep the same number.
+    corrected : bool
+        Whether there is also a mode in which settings are chosen for the smallest gain-corrected rms.
+    search_range_px : float, optional
+        Largest position of any arm, on each axis. Default: the range of true positions of each cell where an
+        arm is an estimator that knows the spot, so that all have the same; else none.
 
     Raises
     ------
@@ -68,11 +109,16 @@ class StudySpecification:
     sweeps: Sequence[Sweep]
     seed: int = 1
     realisations: int = 10_000
-    arms: Sequence[str] = ARMS
+    arms: Sequence[str] = BRIGHTEST_ARMS
     strengths: Sequence[float] = (0.3, 0.5, 0.7, 0.85, 1.0)
     widths: Sequence[float] = (0.4, 0.6, 0.8, 1.0, 1.3)
     thresholds: Sequence[float] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+    weight_widths: Sequence[float] = (1.0, 1.4, 2.0, 3.0, 4.5)
+    blurs: Sequence[float] = (0.0, 0.5, 1.0, 1.8, 3.0, 5.0)
+    model_errors: Sequence[float] = (0.0, 0.2, 0.5)
     fixed_k: Sequence[int] = (20, 40, 60)
+    corrected: bool = False
+    search_range_px: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -86,6 +132,11 @@ class StudySpecification:
             items = _checked_list(name, getattr(self, name))
             self._set(name, tuple(checked_numbers(name, items, bounds)))
         self._set("fixed_k", self._checked_fixed_k())
+        if not isinstance(self.corrected, bool):
+            raise InputError(f"corrected = {self.corrected!r}: expected true or false")
+        if self.search_range_px is not None:
+            search = number_between("search_range_px", self.search_range_px, 0.0, low_open=True)
+            self._set("search_range_px", search)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -104,12 +155,33 @@ class StudySpecification:
 
     @property
     def modes(self) -> tuple[str, ...]:
-        """Names of the modes: "best", then "fixed20" and so on."""
-        return (BEST, *(f"fixed{k}" for k in self.fixed_k))
+        """Names of the modes: "best", then "fixed20" and so on, and "corrected" where it is asked for."""
+        return (BEST, *(f"fixed{k}" for k in self.fixed_k), *([CORRECTED] if self.corrected else []))
 
-    def candidates(self, arm: str) -> tuple[float, ...]:
-        """Return what an arm chooses from; one NaN for an arm that has nothing but k to choose."""
-        return tuple(getattr(self, _CANDIDATES[arm])) if arm in _CANDIDATES else (float("nan"),)
+    def kept_pixels(self, cell: Cell) -> dict[str, int | None]:
+        """Return the number of pixels that each mode keeps, None where arms choose it.
+
+        Modes that keep more pixels than the window of the cell has are left out.
+        """
+        fixed = {f"fixed{k}": k for k in self.fixed_k if k < cell.pixels**2}
+        return {mode: fixed.get(mode) for mode in self.modes if mode in (BEST, CORRECTED, *fixed)}
+
+    def candidates(self, arm: str, cell: Cell) -> tuple[Candidate, ...]:
+        """Return what an arm chooses from in a cell."""
+        if arm in _CANDIDATES:
+            return tuple(getattr(self, _CANDIDATES[arm]))
+        if arm not in _WITH_PSF:
+            return (float("nan"),)
+        if cell.d_over_r0 == 0:
+            return (Robustness(0.0, 0.0),)
+        model_errors = (0.0,) if arm == "matched" else self.model_errors
+        return tuple(Robustness(blur, error) for blur in self.blurs for error in model_errors)
+
+    def search_range_of(self, cell: Cell) -> float:
+        """Return the largest position of all arms in a cell, px; infinite where there is none."""
+        if self.search_range_px is not None:
+            return self.search_range_px
+        return cell.position_range_px if set(self.arms) & set(ESTIMATOR_ARMS) else math.inf
 
     def cells(self) -> list[Cell]:
         """Return all cells, each once, in the order of the sweeps."""
@@ -130,8 +202,8 @@ class StudySpecification:
         """Return the specification as TOML with every value written out."""
         document = tomlkit.document()
         for field in fields(self):
-            if field.name != "sweeps":
-                value = getattr(self, field.name)
+            value = getattr(self, field.name)
+            if field.name != "sweeps" and value is not None:  # TOML has no word for nothing
                 document[field.name] = list(value) if isinstance(value, tuple) else value
         sweeps = tomlkit.table()
         for sweep in self.sweeps:

@@ -19,6 +19,7 @@ from faintspot import __version__
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.locations import one_line
 from faintspot.io.slopes_format import output_errors
+from faintspot.study.metric import OUTLIER_PX
 from faintspot.study.recognise import study_attributes
 from faintspot.study.specification import StudySpecification
 from faintspot.study.sweep import PARAMETERS, RANGES
@@ -36,12 +37,34 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "chosen_k": (("cell", "arm", "mode"), "px", "number of kept pixels"),
     "chosen_candidate": (
         ("cell", "arm", "mode"),
-        "tv, thresholded: noise of a mean pixel; gaussian: px",
-        "strength, width or threshold chosen",
+        "tv, thresholded: noise of a mean pixel; gaussian, matched, ml, map: px; weighted: width of the spot",
+        "strength, width, threshold or blur chosen",
     ),
+    "chosen_model_error": (("cell", "arm", "mode"), "1", "model error chosen by an arm with a PSF"),
     "error_at_k": (("cell", "arm", "k"), "px", "R for every number of kept pixels, candidate as in best"),
     "error_at_k_se": (("cell", "arm", "k"), "px", "standard error of R for every number of kept pixels"),
     "invalid_fraction": (("cell", "arm", "mode"), "1", "fraction of positions without light, taken as 0"),
+    "gain": (("cell", "arm", "mode"), "1", "slope of the estimate against the truth, x and y pooled"),
+    "gain_se": (("cell", "arm", "mode"), "1", "standard error of the gain"),
+    "rms": (("cell", "arm", "mode"), "px", "root of the mean of (dx^2 + dy^2) / 2"),
+    "rms_se": (("cell", "arm", "mode"), "px", "standard error of the rms"),
+    "corrected_rms": (("cell", "arm", "mode"), "px", "rms after offset and gain are taken off"),
+    "corrected_rms_se": (("cell", "arm", "mode"), "px", "standard error of the gain-corrected rms"),
+    "outlier_fraction": (("cell", "arm", "mode"), "1", f"fraction of errors beyond {OUTLIER_PX:g} px"),
+    "outlier_fraction_se": (("cell", "arm", "mode"), "1", "standard error of the fraction of outliers"),
+    "photon_efficiency": (
+        ("cell", "arm", "mode"),
+        "1",
+        "flux at which the Cramer-Rao bound has the arm's R, over the flux",
+    ),
+    "stated_over_actual": (
+        ("cell", "arm"),
+        "1",
+        f"stated over actual rms error of slopes whose error is below {OUTLIER_PX:g} px, mode best",
+    ),
+    "stated_over_actual_all": (("cell", "arm"), "1", "the same for all slopes"),
+    "bound": (("cell",), "px", "R of an estimator at the Cramer-Rao bound, over the cell's positions"),
+    "bound_rms": (("cell",), "px", "rms of the same"),
 }
 """Dimensions, units and description of every variable but `done`."""
 
@@ -102,6 +125,9 @@ def open_study(path: str | Path) -> xarray.Dataset:
         dataset: xarray.Dataset = xarray.open_zarr(path, chunks=None, consolidated=False).load()
     except Exception as error:  # a broken chunk makes each codec raise its own kind
         raise InputError(f"{path}: cannot be read: the store is damaged ({one_line(error)})") from None
+    missing = [name for name in (*VARIABLES, *PARAMETERS) if name not in dataset.variables]
+    if missing:
+        raise InputError(f"{path}: has no {missing[0]}: measured by another version, measure it again")
     for name, coordinate in dataset.coords.items():
         if coordinate.dtype.kind == "T":  # as in memory: Zarr's texts have a type of their own
             dataset[name] = (coordinate.dims, np.array(coordinate.values.tolist()), coordinate.attrs)
@@ -188,7 +214,10 @@ class StoredResults:
 
 def _place(target: NDArray[Any], index: int, values: NDArray[Any]) -> None:
     """Write a cell's values; a smaller window has fewer k."""
-    target[index][..., : values.shape[-1]] = values
+    if values.ndim:
+        target[index][..., : values.shape[-1]] = values
+    else:
+        target[index] = values
 
 
 def _create(path: Path, specification: StudySpecification) -> None:

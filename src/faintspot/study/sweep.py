@@ -35,6 +35,7 @@ RANGES = {
     "position_range_px": Range("px", 0.0, 32.0, low_open=True),
     "background_e": Range("electron", 0.0, 1e6),
     "em_gain": Range("1", 1.0, 1e5),
+    "d_over_r0": Range("1", 0.0, 10.0),
 }
 """The numeric parameters; `profile` is the only other one."""
 
@@ -62,6 +63,9 @@ class Cell:
         Mean electrons per pixel, whose mean is subtracted and whose noise stays.
     em_gain : float
         Gain of an electron-multiplying register; 1 is a detector without one.
+    d_over_r0 : float
+        Side of the sub-aperture in units of the Fried parameter: above 0 turbulence speckles the spots, see
+        `faintspot.simulate.subapertures`.
     """
 
     flux_e: float
@@ -73,6 +77,7 @@ class Cell:
     position_range_px: float
     background_e: float
     em_gain: float
+    d_over_r0: float = 0.0
 
     @property
     def excess_noise(self) -> float:
@@ -87,7 +92,10 @@ class Cell:
 
     def seed(self, study_seed: int) -> np.random.SeedSequence:
         """Return the cell's own seed, from the study's seed and its coordinates alone."""
-        coordinates = ";".join(f"{name}={value!r}" for name, value in asdict(self).items())
+        values = asdict(self)
+        if self.d_over_r0 == 0:
+            del values["d_over_r0"]  # cells without turbulence keep the seeds they had before it was known
+        coordinates = ";".join(f"{name}={value!r}" for name, value in values.items())
         words = np.frombuffer(hashlib.sha256(coordinates.encode()).digest(), "<u4")
         return np.random.SeedSequence([study_seed, *(int(word) for word in words)])
 
@@ -102,13 +110,15 @@ class Sweep:
     Parameters
     ----------
     name : str
-    flux_e, read_noise_e, profile, size, elongation, pixels, position_range_px, background_e, em_gain
+    flux_e, read_noise_e, profile, size, elongation, pixels, position_range_px, background_e, em_gain, \
+    d_over_r0
         A value or a sequence of values each, see `Cell`.
 
     Raises
     ------
     InputError
-        For a value out of its range, an empty sequence, an unknown profile.
+        For a value out of its range, an empty sequence, an unknown profile, turbulence with other spots than
+        round ones of profile "diffraction".
     """
 
     name: str
@@ -121,11 +131,17 @@ class Sweep:
     position_range_px: Any = 1.0
     background_e: Any = 0.0
     em_gain: Any = 1.0
+    d_over_r0: Any = 0.0
 
     def __post_init__(self) -> None:
         for name in PARAMETERS:
             checked = _values(f"sweep {self.name!r}: {name}", name, getattr(self, name))
             object.__setattr__(self, name, checked)
+        if any(self.d_over_r0) and (self.profile != ("diffraction",) or self.elongation != (1.0,)):
+            raise InputError(
+                f"sweep {self.name!r}: d_over_r0 = {max(self.d_over_r0):g}: expected profile 'diffraction' "
+                f"and elongation 1"
+            )
 
     def cells(self) -> list[Cell]:
         """Return the cells, the last parameter varying fastest."""

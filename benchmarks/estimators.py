@@ -1,0 +1,116 @@
+"""What each estimator costs, against the pipeline with TV denoising (20 iterations, brightest pixels).
+
+Frame to slopes, 16 x 16 pixels, one thread, all in turns. "of TV pipeline" is the ratio of the whole times.
+"own, of 20 iterations" is what an estimator adds to gathering and calibrating the images (timed as the sum of
+every window's pixels), over what 20 iterations add to the pipeline without denoising. Positions are sought
+within +-1 px, and in the rows marked "whole window" everywhere.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import faintspot as fs
+from benchmarks.measuring import Candidate, Row, Table, best, interleaved, median_ratio, pinned
+from faintspot.kernels import fused
+from faintspot.kernels.host import lanes_for
+from faintspot.kernels.parallel import new_scratch
+from faintspot.preparation import packed_calibration
+
+ITERATIONS, KEEP, NOISE_STD, FLUX_E, READ_NOISE_E = 20, 12, 0.45, 200.0, 0.1
+SHAPES = ((6, 6), (32, 32))
+LIMITS = {"ml": 0.35, "weighted": 0.35}
+TRAINED_LIMIT = 0.15
+
+
+def _score(rng: np.random.Generator) -> fs.TrainedScore:
+    """A score of three passes; what is in its tables does not matter for the time."""
+    tables = rng.normal(0.0, 1e-3, (1, 1, 3, 2, 65, 65)).astype(np.float32)
+    return fs.TrainedScore(tables, np.array([FLUX_E]), np.full((1, 1, 2), 0.1))
+
+
+def _pipelines(layout: fs.Layout) -> dict[str, fs.SlopePipeline]:
+    """Return every estimator's pipeline."""
+    calibration = fs.Calibration(read_noise_e=READ_NOISE_E)
+    psf, score = fs.PSF.analytic(), _score(np.random.default_rng(1))
+    rotated = fs.PSF.analytic(elongation=2.0, angle_deg=30.0)
+
+    def pipeline(estimator: str, spot: fs.PSF = psf, **settings: Any) -> fs.SlopePipeline:
+        chosen = fs.Settings(estimator=estimator, keep_brightest=KEEP, **settings)
+        return fs.SlopePipeline(layout, chosen, calibration, psf=spot, score=score, threads=1)
+
+    near: dict[str, Any] = {"search_range_px": 1.0}
+    tv: dict[str, Any] = {"noise_std": NOISE_STD, "tolerance": 0.0, "max_iterations": ITERATIONS}
+    return {
+        "tv": pipeline("cog", **tv),
+        "cog": pipeline("cog", denoise=False),
+        "thresholded": pipeline("thresholded", threshold_e=0.5),
+        "smoothed": pipeline("smoothed", smoothing_px=0.7),
+        "weighted": pipeline("weighted", **near),
+        "matched": pipeline("matched", **near),
+        "ml": pipeline("ml", **near),
+        "ml, whole window": pipeline("ml"),
+        "ml, rotated elongated PSF": pipeline("ml", rotated, **near),
+        "map": pipeline("map", flux_e=FLUX_E, **near),
+        "map, prior of 0.3 px": pipeline("map", flux_e=FLUX_E, prior_std_px=0.3, **near),
+        "trained": pipeline("trained", flux_e=FLUX_E, **near),
+    }
+
+
+def _gather(layout: fs.Layout, frame: Any) -> Candidate:
+    """Return a run of gathering and calibrating alone."""
+    lanes = lanes_for(np.float32)
+    n, (ny, nx) = len(layout), layout.window
+    calibration = packed_calibration(layout, fs.Calibration(), lanes.width)
+    scratch, light = new_scratch(lanes, ny, nx), np.empty((1, n), np.float32)
+    groups, frames = -(-n // lanes.width), frame[None]
+
+    def run() -> None:
+        fused.light_of_groups(
+            lanes, frames, layout.corners, ny, nx, calibration, np.inf, 0, groups, scratch, light
+        )
+
+    return run
+
+
+def _table(shape: tuple[int, int]) -> Table:
+    layout = fs.Layout.grid(shape, pixels=16)
+    frames, _ = fs.simulate.sensor_frames(
+        layout.corners,
+        layout.window,
+        layout.frame_shape,
+        1,
+        flux_e=FLUX_E,
+        rng=np.random.default_rng(2),
+    )
+    frame, n = frames[0], len(layout)
+    pipelines = _pipelines(layout)
+    candidates: dict[str, Candidate] = {
+        name: partial(pipeline, frame) for name, pipeline in pipelines.items()
+    }
+    times = interleaved(candidates | {"gather": _gather(layout, frame)}, seconds=12.0)
+    each = {name: best(times, name) / n * 1e6 for name in times}
+    iterations = each["tv"] - each["cog"]
+    rows = []
+    for name in pipelines:
+        ratio, own = each[name] / each["tv"], (each[name] - each["gather"]) / iterations
+        values = {"us per sub-aperture": each[name], "of TV pipeline": ratio}
+        values |= {"median": median_ratio(times, name, "tv"), "own, of 20 iterations": own}
+        if name in LIMITS:
+            met = ratio <= LIMITS[name] and values["median"] <= LIMITS[name]
+            rows.append(Row(name, values, f"<= {LIMITS[name]} of TV pipeline", met))
+        elif name == "trained":
+            rows.append(Row(name, values, f"own <= {TRAINED_LIMIT}", own <= TRAINED_LIMIT))
+        else:
+            rows.append(Row(name, values))
+    notes = [f"gathering and calibrating: {each['gather']:.3f} us"]
+    return Table(f"estimators_{n}", f"Estimators, {n} sub-apertures of 16 x 16 pixels", rows, notes)
+
+
+def run() -> list[Table]:
+    """Time all estimators on a small and a large sensor."""
+    with pinned():
+        return [_table(shape) for shape in SHAPES]

@@ -1,0 +1,69 @@
+"""Where a spot is, roughly: the brightest pixel of the image smoothed by a Gaussian."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from faintspot.kernels.compiling import compiled
+from faintspot.kernels.simd import load, maximum, minimum, select, splat, store, width_of
+from faintspot.kernels.smoothing import smooth_pixel
+from faintspot.kernels.spot_numbers import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, START_LIGHT, X, Y
+
+LEAST_LIGHT_E = 1.0  # an estimate of the light below this says nothing
+
+
+@compiled
+def _pixel_range(lanes: Any, numbers: Any, low: Any, high: Any, n: Any) -> Any:
+    """First and last pixel whose centre is within half a pixel of some lane's allowed positions."""
+    width = width_of(lanes)
+    first, last = n - 1, 0
+    for lane in range(width):
+        lowest, highest = numbers[low * width + lane], numbers[high * width + lane]
+        first = min(first, math.ceil(lowest - 0.5 + 0.5 * (n - 1)))
+        last = max(last, math.floor(highest + 0.5 + 0.5 * (n - 1)))
+    return max(first, 0), min(last, n - 1)
+
+
+@compiled
+def find_start(
+    lanes: Any, image: Any, ny: Any, nx: Any, reach: Any, taps: Any, smoothed: Any, numbers: Any
+) -> None:
+    """Write X, Y and FLUX of every lane: its largest smoothed pixel within the allowed positions.
+
+    Of equal ones the first. FLUX follows from what such a pixel has of a spot's light, START_LIGHT.
+
+    Parameters
+    ----------
+    image : (ny * nx * W,)
+    reach, taps
+        See `smooth_pixel`.
+    smoothed : (ny * nx * W,)
+        Scratch.
+    """
+    width = width_of(lanes)
+    first_x, last_x = _pixel_range(lanes, numbers, LOW_X, HIGH_X, nx)
+    first_y, last_y = _pixel_range(lanes, numbers, LOW_Y, HIGH_Y, ny)
+    for y in range(max(first_y - reach, 0), min(last_y + reach + 1, ny)):
+        for x in range(first_x, last_x + 1):
+            at = (y * nx + x) * width
+            store(smoothed, at, smooth_pixel(lanes, image, at, width, x, nx, taps, 0, reach))
+    half, minus_half = splat(lanes, 0.5), splat(lanes, -0.5)
+    low_x, high_x = load(lanes, numbers, LOW_X * width), load(lanes, numbers, HIGH_X * width)
+    low_y, high_y = load(lanes, numbers, LOW_Y * width), load(lanes, numbers, HIGH_Y * width)
+    best = splat(lanes, -math.inf)
+    best_x, best_y = half * (low_x + high_x), half * (low_y + high_y)
+    for y in range(first_y, last_y + 1):
+        v = splat(lanes, y - 0.5 * (ny - 1))
+        for x in range(first_x, last_x + 1):
+            value = smooth_pixel(lanes, smoothed, (y * nx + x) * width, nx * width, y, ny, taps, 1, reach)
+            u = splat(lanes, x - 0.5 * (nx - 1))
+            inside = minimum(minimum(u - low_x, high_x - u), minimum(v - low_y, high_y - v)) >= minus_half
+            value = select(inside, value, splat(lanes, -math.inf))
+            larger = value > best
+            best = select(larger, value, best)
+            best_x, best_y = select(larger, u, best_x), select(larger, v, best_y)
+    light = best / load(lanes, numbers, START_LIGHT * width)
+    store(numbers, X * width, minimum(maximum(best_x, low_x), high_x))
+    store(numbers, Y * width, minimum(maximum(best_y, low_y), high_y))
+    store(numbers, FLUX * width, maximum(light, splat(lanes, LEAST_LIGHT_E)))

@@ -1,0 +1,129 @@
+"""Centre of gravity under a weight that follows the spot (iteratively weighted centre of gravity)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from faintspot.kernels.compiling import compiled
+from faintspot.kernels.profiles import look_up
+from faintspot.kernels.simd import load, maximum, minimum, multiply_add, select, splat, store, width_of
+from faintspot.kernels.spot_numbers import (
+    ERROR_X,
+    ERROR_Y,
+    EXCESS,
+    FLUX,
+    GAIN_X,
+    GAIN_Y,
+    HIGH_X,
+    HIGH_Y,
+    LOW_X,
+    LOW_Y,
+    SEEN,
+    SEEN_ERROR,
+    VARIANCE,
+    X,
+    Y,
+)
+
+LARGEST_MOVE_PX = 1.0
+SMALLEST_VARIANCE = 1e-4  # of a pixel, electrons squared
+LEAST_FRACTION = 0.05  # of the light at the start: less under the weight would only amplify noise
+
+
+@compiled
+def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, numbers: Any) -> None:
+    """Move every lane by the weighted centre of gravity of its image, seen from where it is."""
+    width = width_of(lanes)
+    padded = profiles.shape[3]
+    zero = splat(lanes, 0.0)
+    x0, y0 = load(lanes, numbers, X * width), load(lanes, numbers, Y * width)
+    total, moment_x, moment_y = zero, zero, zero
+    for y in range(ny):
+        weight_y = load(lanes, profiles, (2 * padded + y) * width)
+        row, row_x = zero, zero
+        for x in range(nx):
+            weighted = load(lanes, profiles, x * width) * load(lanes, image, (y * nx + x) * width)
+            row = row + weighted
+            row_x = multiply_add(weighted, splat(lanes, x - 0.5 * (nx - 1)), row_x)
+        total = multiply_add(row, weight_y, total)
+        moment_x = multiply_add(row_x, weight_y, moment_x)
+        moment_y = multiply_add(row * weight_y, splat(lanes, y - 0.5 * (ny - 1)), moment_y)
+    inverse = splat(lanes, 1.0) / maximum(total, floor)
+    most, least = splat(lanes, LARGEST_MOVE_PX), splat(lanes, -LARGEST_MOVE_PX)
+    dx = load(lanes, numbers, GAIN_X * width) * ((moment_x - x0 * total) * inverse)
+    dy = load(lanes, numbers, GAIN_Y * width) * ((moment_y - y0 * total) * inverse)
+    x0, y0 = x0 + minimum(maximum(dx, least), most), y0 + minimum(maximum(dy, least), most)
+    low, high = load(lanes, numbers, LOW_X * width), load(lanes, numbers, HIGH_X * width)
+    store(numbers, X * width, minimum(maximum(x0, low), high))
+    low, high = load(lanes, numbers, LOW_Y * width), load(lanes, numbers, HIGH_Y * width)
+    store(numbers, Y * width, minimum(maximum(y0, low), high))
+
+
+@compiled
+def _store_errors(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, numbers: Any) -> None:
+    """Propagate the pixels' noise, VARIANCE + EXCESS * g, through the last step."""
+    width = width_of(lanes)
+    padded = profiles.shape[3]
+    zero = splat(lanes, 0.0)
+    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
+    x0, y0 = load(lanes, numbers, X * width), load(lanes, numbers, Y * width)
+    total, noise_x, noise_y, noise, dark_x, dark_y = zero, zero, zero, zero, zero, zero
+    for y in range(ny):
+        weight_y = load(lanes, profiles, (2 * padded + y) * width)
+        away_y = splat(lanes, y - 0.5 * (ny - 1)) - y0
+        for x in range(nx):
+            weight = weight_y * load(lanes, profiles, x * width)
+            g = load(lanes, image, (y * nx + x) * width)
+            away_x = splat(lanes, x - 0.5 * (nx - 1)) - x0
+            total = multiply_add(weight, g, total)
+            square = weight * weight
+            variance = square * multiply_add(g, e, v)
+            noise = noise + variance
+            noise_x = multiply_add(variance * away_x, away_x, noise_x)
+            noise_y = multiply_add(variance * away_y, away_y, noise_y)
+            dark_x = multiply_add(square * away_x, away_x, dark_x)
+            dark_y = multiply_add(square * away_y, away_y, dark_y)
+    least = splat(lanes, SMALLEST_VARIANCE)
+    lit = total > floor
+    inverse = splat(lanes, 1.0) / maximum(total, floor)
+    gain_x, gain_y = load(lanes, numbers, GAIN_X * width), load(lanes, numbers, GAIN_Y * width)
+    unknown = splat(lanes, math.inf)
+    # Pixels that noise has made negative must not take away more than the light's own noise.
+    noise_x = maximum(noise_x, maximum(v, least) * dark_x)
+    noise_y = maximum(noise_y, maximum(v, least) * dark_y)
+    error_x = gain_x * gain_x * inverse * inverse * noise_x
+    error_y = gain_y * gain_y * inverse * inverse * noise_y
+    store(numbers, ERROR_X * width, select(lit, error_x, unknown))
+    store(numbers, ERROR_Y * width, select(lit, error_y, unknown))
+    store(numbers, SEEN * width, total)
+    store(numbers, SEEN_ERROR * width, maximum(noise, least))
+    for lane in range(width):
+        numbers[SEEN_ERROR * width + lane] = math.sqrt(numbers[SEEN_ERROR * width + lane])
+        for row in (ERROR_X, ERROR_Y):
+            numbers[row * width + lane] = math.sqrt(max(numbers[row * width + lane], 0.0))
+
+
+@compiled
+def weigh_group(
+    lanes: Any,
+    image: Any,
+    ny: Any,
+    nx: Any,
+    tables: Any,
+    which: Any,
+    steps: Any,
+    numbers: Any,
+    starts: Any,
+    profiles: Any,
+) -> None:
+    """Follow the W spots of a group with a weight; parameters as `likelihood.fit_group`.
+
+    The tables hold the weight's profile, 1 at its centre.
+    """
+    width = width_of(lanes)
+    floor = splat(lanes, LEAST_FRACTION) * load(lanes, numbers, FLUX * width)
+    for _ in range(steps):
+        look_up(lanes, tables, which, ny, nx, numbers, starts, profiles)
+        _move(lanes, image, ny, nx, profiles, floor, numbers)
+    _store_errors(lanes, image, ny, nx, profiles, floor, numbers)

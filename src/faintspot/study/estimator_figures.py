@@ -1,0 +1,291 @@
+"""The figures of a study that compares estimators: error, efficiency, gain and outliers, speckled spots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from faintspot.report.drawing import GREY, WIDTH, new_figure, styled
+from faintspot.study.baselines import ARM_NAMES
+from faintspot.study.figure_data import StudyFigure, numbers_of, parameter_in_words, parameters_of
+from faintspot.study.specification import BEST, CORRECTED, ESTIMATOR_ARMS
+from faintspot.study.sweep import PARAMETERS
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_ROW_HEIGHT = 4.4
+_COLUMNS = 2
+_FEWEST_POINTS = 3
+# Okabe & Ito (2008) and two greys; arms that know the spot are solid, the others dashed.
+_STYLES = {
+    "plain": ("#000000", "o"),
+    "tv": ("#D55E00", "s"),
+    "gaussian": ("#E69F00", "D"),
+    "thresholded": ("#9a9a9a", "X"),
+    "weighted": ("#009E73", "^"),
+    "matched": ("#CC79A7", "v"),
+    "ml": ("#0072B2", "P"),
+    "map": ("#56B4E9", "*"),
+    "trained": ("#6b3fa0", "h"),
+}
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """Cells along one axis."""
+
+    title: str
+    cells: list[int]
+    """By increasing value of what varies."""
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Panels of cells that have all but some parameters in common."""
+
+    common: dict[str, Any]
+    panels: list[_Panel]
+
+    @property
+    def cells(self) -> list[int]:
+        return [cell for panel in self.panels for cell in panel.cells]
+
+    @property
+    def name(self) -> str:
+        """A short name, different for every group."""
+        standard = {"elongation": 1.0, "size": 1.0, "pixels": 16, "position_range_px": 1.0}
+        standard |= {"background_e": 0.0, "em_gain": 1.0, "d_over_r0": 0.0}
+        words = [
+            f"{key.partition('_')[0]}{value:g}"
+            for key, value in self.common.items()
+            if key in standard and value != standard[key]
+        ]
+        return "-".join([self.common["profile"], *words])
+
+    @property
+    def words(self) -> str:
+        """What the cells have in common."""
+        named = [parameter_in_words(key, value) for key, value in self.common.items()]
+        return ", ".join(text for text in named if not text.startswith("no "))
+
+
+def estimator_figures(dataset: xarray.Dataset) -> Iterator[StudyFigure]:
+    """Yield the figures of a study that compares estimators, as far as its cells are finished.
+
+    Cells that differ in flux (or, speckled ones, in d/r0) alone are a line, where there are at least three.
+    """
+    for group in _groups(dataset, "flux_e", ("read_noise_e",), speckled=False):
+        yield _error_figure(dataset, group)
+        yield _efficiency_figure(dataset, group)
+        yield _gain_figure(dataset, group)
+    for group in _groups(dataset, "d_over_r0", ("read_noise_e", "flux_e"), speckled=True):
+        yield _turbulence_figure(dataset, group)
+
+
+def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: bool) -> Iterator[_Group]:
+    """Yield the groups of cells that differ in `axis`, within a panel, and in `by`, between panels."""
+    done = [int(cell) for cell in np.flatnonzero(dataset["done"].values)]
+    table = dict(zip(done, parameters_of(dataset, done), strict=True))
+    found: dict[tuple[Any, ...], dict[tuple[Any, ...], list[int]]] = {}
+    common = [name for name in PARAMETERS if name not in (axis, *by)]
+    for cell, row in table.items():
+        if (row["d_over_r0"] > 0) == speckled:
+            panels = found.setdefault(tuple(row[name] for name in common), {})
+            panels.setdefault(tuple(row[name] for name in by), []).append(cell)
+    for values, panels in sorted(found.items()):
+        kept = [
+            _Panel(
+                ", ".join(parameter_in_words(name, value) for name, value in zip(by, key, strict=True)),
+                sorted(cells, key=lambda cell: float(table[cell][axis])),
+            )
+            for key, cells in sorted(panels.items())
+            if len(cells) >= _FEWEST_POINTS
+        ]
+        if kept:
+            yield _Group(dict(zip(common, values, strict=True)), kept)
+
+
+@styled
+def _error_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+    figure, axes = _grid(group)
+    for panel, part in zip(axes, group.panels, strict=False):
+        _lines(panel, dataset, part, "error", BEST, "flux_e")
+        flux = dataset["flux_e"].values[part.cells]
+        panel.plot(flux, dataset["bound"].values[part.cells], color="black", lw=3, alpha=0.35, zorder=1)
+        panel.axhline(group.common["position_range_px"] / 2, color=GREY, lw=1, ls=":")
+        panel.set_yscale("log")
+        _plain_numbers(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
+    _label(axes, group, "slope error R (px)")
+    _legend(figure, dataset, bound=True)
+    title = f"Slope error against signal: {group.words}"
+    figure.suptitle(title, fontsize=14)
+    caption = (
+        "Solid: estimators that know the spot; dashed: those that do not, each with its own best k, "
+        "strength, width or threshold. Broad grey line: the Cramer-Rao bound. Dotted: R of always "
+        "answering the centre. Bars: one standard error. All have the same search range, that of the true "
+        "positions."
+    )
+    return StudyFigure(f"error-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
+
+
+@styled
+def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+    figure, axes = _grid(group)
+    for panel, part in zip(axes, group.panels, strict=False):
+        _lines(panel, dataset, part, "photon_efficiency", BEST, "flux_e")
+        panel.axhline(1.0, color="black", lw=3, alpha=0.35, zorder=1)
+        panel.set_ylim(0, 1.35)
+    _label(axes, group, "photon efficiency")
+    _legend(figure, dataset, bound=True)
+    title = f"Photon efficiency: {group.words}"
+    figure.suptitle(title, fontsize=14)
+    caption = (
+        "The light with which an estimator at the Cramer-Rao bound would have the same R, over the light "
+        "that was used. More than 1 at little light: there the search range says more than the light. "
+        "What lies above 1.35 is cut off; the numbers are in the data."
+    )
+    name = f"efficiency-{group.name}"
+    return StudyFigure(name, title, caption, figure, *numbers_of(dataset, group.cells))
+
+
+@styled
+def _gain_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+    columns = len(group.panels)
+    figure = new_figure(WIDTH * max(1.0, columns / 3), 2 * _ROW_HEIGHT + 0.9)
+    axes = figure.subplots(2, columns, squeeze=False, sharex="col", sharey="row")
+    for (upper, lower), part in zip(axes.T, group.panels, strict=True):
+        _lines(upper, dataset, part, "gain", BEST, "flux_e")
+        upper.axhline(1.0, color="black", lw=3, alpha=0.35, zorder=1)
+        upper.set_title(part.title)
+        _lines(lower, dataset, part, "outlier_fraction", BEST, "flux_e")
+        lower.set_yscale("symlog", linthresh=1e-3)
+        _plain_numbers(lower.yaxis, (0, 1e-3, 1e-2, 0.1, 0.5))
+        _flux_axis(lower)
+    drawn = dataset["outlier_fraction"].sel(mode=BEST).isel(cell=group.cells).values
+    axes[1, 0].set_ylim(-1e-4, max(2e-3, min(1.0, 1.5 * float(np.nanmax(drawn)))))
+    axes[0, 0].set_ylabel("gain")
+    axes[1, 0].set_ylabel("fraction of errors beyond 1 px")
+    _legend(figure, dataset, bound=False)
+    title = f"Gain and outliers: {group.words}"
+    figure.suptitle(title, fontsize=14)
+    caption = (
+        "Above: slope of the estimate against the truth, 1 where nothing is lost. An estimator that falls "
+        "back to the centre has a small R and a small gain. Below: fraction of slopes with an error "
+        "beyond 1 px on either axis, linear below 0.001."
+    )
+    return StudyFigure(f"gain-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
+
+
+@styled
+def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+    mode = CORRECTED if CORRECTED in dataset["mode"].values else BEST
+    figure, axes = _grid(group)
+    for panel, part in zip(axes, group.panels, strict=False):
+        _lines(panel, dataset, part, "corrected_rms", mode, "d_over_r0")
+        values = dataset["corrected_rms"].sel(mode=mode).isel(cell=part.cells)
+        drawn = values.sel(arm=[arm for arm in dataset["arm"].values if arm in _STYLES])
+        best = drawn.min("arm").values
+        x = dataset["d_over_r0"].values[part.cells]
+        panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
+        panel.set_yscale("log")
+        panel.set_xscale("log")
+        _plain_numbers(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))
+        _plain_numbers(panel.yaxis, (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2))
+        panel.set_ylim(0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(drawn.values))))
+    _label(axes, group, "gain-corrected rms (px)", flux=False)
+    _legend(figure, dataset, bound=False)
+    title = f"Speckled spots: {group.words}"
+    figure.suptitle(title, fontsize=14)
+    caption = (
+        "Root mean square error per axis after each arm’s own offset and gain are taken off, with "
+        "settings chosen for it. Ring: the best arm of the cell. Bars: one standard error. Solid: "
+        "estimators that know the spot; dashed: those that do not."
+    )
+    name = f"turbulence-{group.name}"
+    return StudyFigure(name, title, caption, figure, *numbers_of(dataset, group.cells))
+
+
+def _grid(group: _Group) -> tuple[Figure, list[Axes]]:
+    """Return a figure and axes, one for each panel, two in a row."""
+    columns = min(_COLUMNS, len(group.panels))
+    rows = -(-len(group.panels) // columns)
+    figure = new_figure(WIDTH, _ROW_HEIGHT * rows + 0.9)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for unused in axes[len(group.panels) :]:
+        unused.set_axis_off()
+    return figure, axes[: len(group.panels)]
+
+
+def _lines(panel: Axes, dataset: xarray.Dataset, part: _Panel, name: str, mode: str, axis: str) -> None:
+    """Draw a variable of every arm."""
+    x = dataset[axis].values[part.cells]
+    for arm, (colour, marker) in _STYLES.items():
+        if arm not in dataset["arm"].values:
+            continue
+        chosen = dataset.sel(arm=arm, mode=mode).isel(cell=part.cells)
+        se_name = f"{name}_se"
+        se = chosen[se_name].values if se_name in dataset else None
+        style = "-" if arm in ESTIMATOR_ARMS else "--"
+        size = 8 if marker == "*" else 5.5
+        bars: dict[str, Any] = {
+            "color": colour,
+            "marker": marker,
+            "ms": size,
+            "lw": 1.8,
+            "elinewidth": 1,
+            "ls": style,
+        }
+        panel.errorbar(x, chosen[name].values, se, label=ARM_NAMES[arm], zorder=3, **bars)
+
+
+def _label(axes: list[Axes], group: _Group, y: str, *, flux: bool = True) -> None:
+    for index, (panel, part) in enumerate(zip(axes, group.panels, strict=True)):
+        panel.set_title(part.title)
+        panel.set_xlabel("side of the sub-aperture over r0")
+        if index % _COLUMNS == 0:
+            panel.set_ylabel(y)
+        if flux:
+            _flux_axis(panel)
+
+
+def _flux_axis(panel: Axes) -> None:
+    panel.set_xscale("log")
+    _plain_numbers(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
+    panel.set_xlabel("signal (photo-electrons per spot)")
+
+
+def _plain_numbers(axis: Any, values: Sequence[float]) -> None:
+    """Ticks at these values, written as plain numbers."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    axis.set_major_locator(FixedLocator(list(values)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _legend(figure: Figure, dataset: xarray.Dataset, *, bound: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    arms = {str(arm) for arm in dataset["arm"].values}
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=colour,
+            marker=marker,
+            lw=1.8,
+            ls="-" if arm in ESTIMATOR_ARMS else "--",
+            label=ARM_NAMES[arm],
+        )
+        for arm, (colour, marker) in _STYLES.items()
+        if arm in arms
+    ]
+    if bound:
+        handles.append(Line2D([], [], color="black", lw=3, alpha=0.35, label="Cramer-Rao bound"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)

@@ -1,0 +1,245 @@
+"""The oracle of the estimators applied to a case, and what it means that slopes equal it.
+
+The kernels compute in float32. How far that can take an iteration from the oracle's float64 depends on the
+spot (a faint one at the window's edge amplifies rounding, a bright one does not), so each case is measured by
+itself: the oracle is run again with every pixel, and every value of the PSF, changed at random by one unit of
+float32 rounding. ROUNDING times the largest change is the tolerance, with a floor for positions themselves.
+Cases near a decision that rounding may turn (two pixels that tie for the start, two phases of the tables, a
+singular matrix) have a margin below MARGIN and are not compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from tests import naive
+from tests import naive_estimators as oracle
+from tests.estimator_cases import Case, assert_sane
+from tests.naive_estimators import Estimate, Task
+from tests.naive_spots import PHASES, Floats, Spot, spots_of
+
+import faintspot as fs
+from faintspot.sensor.psf import PSF
+from faintspot.spot_tables import posterior_grid
+
+EPS = float(np.finfo(np.float32).eps)
+ROUNDING = 30.0
+FLOOR_PX = 1e-5
+MARGIN = 1e-3
+REPEATS = 2
+
+
+class ShakenSpot(Spot):
+    """A spot whose values are off by one unit of float32 rounding."""
+
+    def __init__(self, spot: Spot, rng: np.random.Generator) -> None:
+        vars(self).update(vars(spot))
+        self.rng = rng
+
+    def images(self, x: float, y: float, shape: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
+        first, second, third = super().images(x, y, shape)
+        return self._shaken(first), self._shaken(second), self._shaken(third)
+
+    def _shaken(self, values: Floats) -> Floats:
+        return values * (1 + EPS * self.rng.standard_normal(values.shape))
+
+
+def electrons(case: Case) -> NDArray[np.float64]:
+    """Calibrated images with bad pixels filled."""
+    calibrated = naive.calibrate(case.images.reshape(-1, case.images.shape[2]), case.calibration)
+    return np.stack([naive.fill_bad_pixels(image) for image in calibrated.reshape(case.images.shape)])
+
+
+def tasks(case: Case) -> list[Task]:
+    """What the oracle's estimators may know about each image."""
+    n, ny, nx = case.images.shape
+    calibration, settings = case.calibration, case.settings
+    noise = (calibration.read_noise_e or 0.0) / calibration.em_gain
+    excess = 2.0 if calibration.em_gain > 1 else 1.0
+    search = np.nan_to_num(case.each("search_range_px"), nan=max(nx, ny) / 2)
+    made = []
+    for s in range(n):
+        made.append(
+            Task(
+                variance=noise**2 + excess * calibration.background_e,
+                excess=excess,
+                weight_floor=case.each("weight_floor")[s],
+                model_error=case.each("model_error")[s],
+                search_range=(search[s], search[s]),
+                steps=settings.steps,
+                error_scale=case.each("error_scale")[s],
+                prior=(0.0, 0.0) if case.prior is None else tuple(case.prior[s]),
+                prior_std=case.each("prior_std_px")[s],
+                weight_fwhm=case.each("weight_fwhm_px")[s],
+                spot_fwhm=case.each("spot_fwhm_px")[s],
+                phases=PHASES,
+            )
+        )
+    return made
+
+
+def spot_tasks(case: Case) -> list[Task]:
+    """Those of the estimators that know the PSF."""
+    assert case.psf is not None
+    n, ny, nx = case.images.shape
+    spots, index = spots_of(case.psf, tabulated=True), case.psf.index_of(n)
+    width = case.psf.fwhm_px
+    reach = start_reach(width.max(), (ny, nx))
+    noise = case.calibration.read_noise_e or 0.0
+    whole = noise < 0.25 and case.calibration.em_gain == 1 and case.calibration.background_e == 0
+    whole = whole and case.settings.estimator != "matched"
+    made = []
+    for task, kind in zip(tasks(case), index, strict=True):
+        variance = task.variance
+        if whole:  # what rounding leaves: one electron more or less where the noise is beyond a half
+            variance = math.erfc(0.5 / (noise * math.sqrt(2))) if noise else 0.0
+        fwhm = (width[kind, 0], width[kind, 1])
+        known = replace(task, spot=spots[kind], fwhm=fwhm, reach=reach, variance=variance)
+        made.append(replace(known, whole_electrons=whole))
+    return made
+
+
+def start_reach(fwhm: float, window: tuple[int, int]) -> int:
+    """Reach of the start's smoothing, that of the widest spot for all."""
+    return min(math.ceil(2.5 * oracle.START_STD_PER_FWHM * fwhm), max(window) - 1)
+
+
+@cache
+def gaussian_spot(fwhm: float) -> Spot:
+    return spots_of(PSF.analytic("gaussian", size=fwhm / 2, radius_px=10))[0]
+
+
+def begin(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    """The start is found with the PSF itself, not with tables."""
+    if case.psf is None:
+        spot = gaussian_spot(task.spot_fwhm)
+        fwhm = (task.spot_fwhm, task.spot_fwhm)
+        reach = start_reach(case.each("spot_fwhm_px").max(), (g.shape[0], g.shape[1]))
+        return oracle.start(g, replace(task, spot=spot, fwhm=fwhm, reach=reach))
+    spot = exact_spots(case.psf)[case.psf.index_of(len(case.images))[s]]
+    image = np.rint(g) if task.whole_electrons else g
+    return oracle.start(image, replace(task, spot=spot))
+
+
+@cache
+def exact_spots(psf: PSF) -> list[Spot]:
+    return spots_of(psf)
+
+
+def by_fit(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    return oracle.fisher(g, task, case.settings.estimator, begin(case, s, g, task))
+
+
+def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    """The posterior's mean where it is broader than half the grid, else the fit that begins there."""
+    assert case.psf is not None
+    ny, nx = g.shape
+    g = np.rint(g) if task.whole_electrons else g
+    search = case.each("search_range_px")
+    reach = float(np.where(np.isnan(search), np.inf, search).max())
+    grid, spacing = posterior_grid(reach, float(case.psf.fwhm_px.min()), (ny, nx))
+    flux = max(case.each("flux_e")[s], 1.0)
+    spot = exact_spots(case.psf)[case.psf.index_of(len(case.images))[s]]
+    variance = max(task.variance + task.weight_floor * flux, oracle.LEAST_VARIANCE)
+    known = replace(task, spot=spot, variance=variance)
+    broad = oracle.grid_posterior(g, known, flux, np.unique(grid[:, 0]), np.unique(grid[:, 1]), spacing)
+    broad = replace(
+        broad,
+        x=oracle.clamp(broad.x, *task.limits((ny, nx))[0]),
+        y=oracle.clamp(broad.y, *task.limits((ny, nx))[1]),
+    )
+    fitted = oracle.fisher(g, task, "map", replace(broad, flux=flux))
+    margin = fitted.margin
+    for axis in "xy":
+        spread = getattr(broad, f"error_{axis}") / task.error_scale / (0.5 * spacing)
+        margin = min(margin, abs(spread - 1))
+        if spread > 1 or math.isinf(getattr(fitted, f"error_{axis}")):
+            names = (axis, f"error_{axis}")
+            fitted = replace(fitted, **{name: getattr(broad, name) for name in names})
+    return replace(fitted, margin=margin)
+
+
+def by_weight(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    return oracle.weighted(g, task, begin(case, s, g, task))
+
+
+def by_score(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    assert case.score is not None
+    assert case.score.index is not None
+    first = Estimate(*task.prior)
+    if case.score.start == "peak":
+        width = case.score.smoothing_px / oracle.START_STD_PER_FWHM
+        first = oracle.start(g, replace(task, fwhm=(width, width), reach=min(4, max(g.shape) - 1)))
+    kind, flux = int(case.score.index[s]), float(case.each("flux_e")[s])
+    return oracle.trained(g, case.score, kind, flux, first, task)
+
+
+def by_gravity(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    """Without denoising."""
+    keep, image = int(case.each("keep_brightest")[s]), g
+    if case.settings.estimator == "thresholded":
+        left = np.maximum(g - case.each("threshold_e")[s], 0.0)
+    else:
+        if case.settings.estimator == "smoothed":
+            std = case.each("smoothing_px")
+            reach = min(math.ceil(2.5 * std.max()), max(g.shape) - 1)
+            image = oracle.smoothed(g, std[s], std[s], reach)
+        left = naive.brightest_pixels(image, keep)
+    x, y = naive.centre_of_gravity(left)
+    error_x, error_y = (
+        task.error_scale * e for e in oracle.gravity_error(left, g, task.variance, task.excess)
+    )
+    (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
+    return Estimate(
+        oracle.clamp(x, low_x, high_x), oracle.clamp(y, low_y, high_y), float(left.sum()), error_x, error_y
+    )
+
+
+Method = Callable[[Case, int, Floats, Task], Estimate]
+METHODS: dict[str, tuple[Callable[[Case], list[Task]], Method]] = {
+    "cog": (tasks, by_gravity),
+    "thresholded": (tasks, by_gravity),
+    "smoothed": (tasks, by_gravity),
+    "weighted": (tasks, by_weight),
+    "matched": (spot_tasks, by_fit),
+    "ml": (spot_tasks, by_fit),
+    "map": (spot_tasks, by_posterior),
+    "trained": (tasks, by_score),
+}
+
+
+def estimates(case: Case) -> Iterator[list[Estimate]]:
+    """For every image the oracle's estimate, and those of images and spots off by rounding."""
+    rng = np.random.default_rng(0)
+    tasks_of, method = METHODS[case.settings.estimator]
+    for s, (g, task) in enumerate(zip(electrons(case), tasks_of(case), strict=True)):
+        found = [method(case, s, g, task)]
+        size = EPS * np.abs(g).max()
+        for _ in range(REPEATS):
+            spot = None if task.spot is None else ShakenSpot(task.spot, rng)
+            noise = size * rng.uniform(-1.0, 1.0, g.shape)
+            found.append(method(case, s, g + noise, replace(task, spot=spot, rounding=rng)))
+        yield found
+
+
+def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> int:
+    """Compare what is valid and not near a decision; return how many slopes that were."""
+    assert_sane(slopes)
+    compared = 0
+    for s, (expected, *shaken) in enumerate(estimates(case)):
+        margins = [expected.margin, *(other.margin for other in shaken)]
+        if not slopes.valid[s] or min(margins) < MARGIN:
+            continue
+        compared += 1
+        for name, relative in (("x", 0.0), ("y", 0.0), ("error_x", 1e-4), ("error_y", 1e-4)):
+            value = getattr(expected, name)
+            change = max(abs(getattr(other, name) - value) for other in shaken)
+            bound = FLOOR_PX + relative * value + ROUNDING * change
+            result = getattr(slopes, name.replace("error", "standard_error"))[s]
+            assert abs(result - value) <= bound, (s, name, float(result), value, bound)
+    return compared

@@ -1,0 +1,369 @@
+"""The slow, obvious oracle of the estimators: one image at a time, plain NumPy, float64.
+
+Written from the formulas, not from the kernels. Positions are px from the image's centre, and a `Task` holds
+everything else that an estimator may know.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from tests import naive
+from tests.naive_spots import Floats, Spot, phase_margins, pixel_centres, window
+
+FWHM_PER_STD = 2 * math.sqrt(2 * math.log(2))
+START_STD_PER_FWHM = 0.73
+STEPS = {"ml": 4, "matched": 4, "map": 4, "weighted": 8}
+LEAST_VARIANCE, LEAST_FLUX = 1e-4, 1e-2
+LEAST_FRACTION = 0.05
+PRIOR_REACH = 4.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an estimator knows about one sub-aperture; electrons and px."""
+
+    spot: Spot | None = None
+    fwhm: tuple[float, float] = (2.0, 2.0)
+    variance: float = 0.01
+    """Read noise and the noise of the background that is taken off, of a pixel."""
+    excess: float = 1.0
+    weight_floor: float = 1e-3
+    model_error: float = 0.0
+    search_range: tuple[float, float] | None = None
+    """Along x and y; None is half the window. It never leaves the window."""
+    reference: tuple[float, float] = (0.0, 0.0)
+    reach: int | None = None
+    """Of the taps of the start's smoothing, px; None is 2.5 standard deviations on each axis."""
+    steps: int | None = None
+    error_scale: float = 1.0
+    whole_electrons: bool = False
+    prior: tuple[float, float] = (0.0, 0.0)
+    prior_std: float = math.inf
+    phases: int | None = None
+    """Of the table of the weight."""
+    weight_fwhm: float = 2.0
+    spot_fwhm: float = 2.0
+
+    rounding: np.random.Generator | None = None
+    """Where given, sums of the posterior are off by a unit of float32 rounding of what is summed."""
+
+    def rounded_sum(self, values: Floats) -> float:
+        """Sum the values."""
+        total = float(np.sum(values))
+        if self.rounding is None:
+            return total
+        return total + float(np.finfo(np.float32).eps * np.abs(values).sum() * self.rounding.uniform(-1, 1))
+
+    def limits(self, shape: tuple[int, int]) -> list[tuple[float, float]]:
+        """Lowest and highest x, and y."""
+        half = (shape[1] / 2, shape[0] / 2)
+        ranges = half if self.search_range is None else self.search_range
+        return [
+            (max(middle - r, -h), min(middle + r, h))
+            for middle, r, h in zip(self.reference, ranges, half, strict=True)
+        ]
+
+
+@dataclass
+class Estimate:
+    x: float
+    y: float
+    flux: float = math.nan
+    error_x: float = math.inf
+    error_y: float = math.inf
+    margin: float = math.inf
+    """How near a decision was to another one: below 1e-3 rounding to float32 may turn it."""
+
+
+# Start ------------------------------------------------------------------------------------------------
+
+
+def smoothing_taps(std: float, reach: int | None = None) -> Floats:
+    """Weights of a Gaussian at whole pixels out to ceil(2.5 std), their sum 1."""
+    reach = math.ceil(2.5 * std) if reach is None else reach
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / std) ** 2) if std > 0 else np.ones(1)
+    return np.asarray(taps / taps.sum())
+
+
+def smoothed(g: ArrayLike, std_x: float, std_y: float, reach: int | None = None) -> Floats:
+    """Gaussian smoothing; outside the image there is nothing."""
+    result: Any = np.asarray(g, np.float64)
+    for axis, std in ((0, std_y), (1, std_x)):
+        taps = smoothing_taps(std, reach)
+        k = len(taps) // 2
+        padded = np.pad(result, [(k, k) if a == axis else (0, 0) for a in (0, 1)])
+        n = result.shape[axis]
+        result = sum(tap * np.take(padded, np.arange(k, k + n), axis=axis) for k, tap in enumerate(taps))
+    return np.asarray(result)
+
+
+def start(g: ArrayLike, task: Task) -> Estimate:
+    """The largest pixel of the smoothed image within the search range, and the flux that explains it."""
+    g = np.asarray(g, np.float64)
+    std_x, std_y = (START_STD_PER_FWHM * width for width in task.fwhm)
+    blurred = smoothed(g, std_x, std_y, task.reach)
+    (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
+    found: list[tuple[float, float, float]] = []
+    for j, y in enumerate(pixel_centres(g.shape[0])):
+        for i, x in enumerate(pixel_centres(g.shape[1])):
+            if low_x - 0.5 <= x <= high_x + 0.5 and low_y - 0.5 <= y <= high_y + 0.5:
+                found.append((blurred[j, i], x, y))
+    if not found:
+        return Estimate(*task.reference, flux=1.0)
+    best = max(found, key=lambda item: item[0])
+    others = [item[0] for item in found if item is not best]
+    flux = 1.0
+    if task.spot is not None:
+        flux = max(best[0] / smoothed_peak(task.spot, std_x, std_y, task.reach), 1.0)
+    distance = best[0] - max(others, default=-math.inf)
+    return Estimate(best[1], best[2], flux, margin=100 * distance / max(np.abs(blurred).max(), 1e-30))
+
+
+@cache
+def smoothed_peak(spot: Spot, std_x: float, std_y: float, reach: int | None = None) -> float:
+    """What the brightest pixel of a smoothed spot of 1 e- has: the mean over places within the pixel."""
+    half = math.ceil(2.5 * max(std_x, std_y)) if reach is None else reach
+    shape = (2 * half + 1, 2 * half + 1)
+    places = [(x, y) for x in (-1 / 3, 0.0, 1 / 3) for y in (-1 / 3, 0.0, 1 / 3)]
+    return float(
+        np.mean([smoothed(spot.images(x, y, shape)[0], std_x, std_y, reach)[half, half] for x, y in places])
+    )
+
+
+# Likelihood -------------------------------------------------------------------------------------------
+
+
+def clamp(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
+    """Inverse of the variance that the likelihood ascribes to every pixel."""
+    if name == "matched":
+        return np.ones_like(m)
+    light = np.maximum(m, 0.0)  # a spline may dip below zero
+    floor = max(task.variance + task.weight_floor * first_flux, LEAST_VARIANCE)
+    return 1.0 / (floor + task.excess * light + (task.model_error * light) ** 2)
+
+
+def information(m: Floats, dm: list[Floats], w: Floats, task: Task, name: str) -> tuple[Floats, Floats]:
+    """I = sum w dm dm and J = sum w^2 T dm dm, with the prior; T is the true variance."""
+    true = task.variance + task.excess * np.maximum(m, 0.0)
+    i = np.array([[np.sum(w * a * b) for a in dm] for b in dm])
+    j = np.array([[np.sum(w**2 * true * a * b) for a in dm] for b in dm])
+    if name == "map":
+        for matrix in (i, j):
+            matrix[0, 0] += task.prior_std**-2
+            matrix[1, 1] += task.prior_std**-2
+    return i, j
+
+
+def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = None) -> Estimate:
+    """Fisher scoring in x, y and flux; the standard error is that of the place before the last step.
+
+    A move that is cut short leaves the flux to what it then should be: the flux is solved for last. Without
+    information on the place it stays.
+    """
+    assert task.spot is not None
+    g = np.rint(g) if task.whole_electrons and name in ("ml", "map") else np.asarray(g, np.float64)
+    begin = start(g, task) if begin is None else begin
+    limits, margin = task.limits(g.shape), begin.margin
+    x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
+    errors = (math.inf, math.inf)
+    for _ in range(STEPS[name] if task.steps is None else task.steps):
+        f, fx, fy = task.spot.images(x, y, g.shape)
+        m, dm = flux * f, [flux * fx, flux * fy, f]
+        w = weights(m, task, begin.flux, name)
+        score = np.array([np.sum((g - m) * w * d) for d in dm])
+        if name == "map":
+            score[:2] += (np.array(task.prior) - (x, y)) / task.prior_std**2
+        i, j = information(m, dm, w, task, name)
+        margin = min(margin, soundness(i) - 1e-3, *phase_margins(x, y, g.shape, task.spot.phases))
+        move = np.clip(np.linalg.solve(i, score)[:2], -1.0, 1.0) if soundness(i) > 1e-5 else np.zeros(2)
+        errors = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf)
+        x, y = clamp(x + move[0], *limits[0]), clamp(y + move[1], *limits[1])
+        flux = max(clamp(flux + (score[2] - i[2, :2] @ move) / i[2, 2], flux / 2, flux * 2), LEAST_FLUX)
+    return Estimate(x, y, flux, task.error_scale * errors[0], task.error_scale * errors[1], margin)
+
+
+def soundness(i: Floats) -> float:
+    """Determinant of the information on x and y, the flux unknown, in units of its diagonal's product."""
+    if not i[2, 2] > 0:
+        return 0.0
+    a = i[:2, :2] - np.outer(i[:2, 2], i[2, :2]) / i[2, 2]
+    diagonal = a[0, 0] * a[1, 1]
+    return float((diagonal - a[0, 1] ** 2) / diagonal) if min(a[0, 0], a[1, 1]) > 0 else 0.0
+
+
+def sandwich(i: Floats, j: Floats) -> tuple[float, float]:
+    """Roots of the diagonal of I^-1 J I^-1 for x and y."""
+    inverse = np.linalg.inv(i)
+    covariance = inverse @ j @ inverse
+    return math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])
+
+
+def cramer_rao_bound(
+    x: float, y: float, flux: float, shape: tuple[int, int], task: Task
+) -> tuple[float, float]:
+    """The smallest standard deviation that an unbiased estimator of x and y can have, flux unknown."""
+    assert task.spot is not None
+    f, fx, fy = task.spot.images(x, y, shape)
+    w = 1.0 / (task.variance + task.excess * np.maximum(flux * f, 0.0))
+    return sandwich(*information(flux * f, [flux * fx, flux * fy, f], w, task, "ml"))
+
+
+def grid_posterior(
+    g: ArrayLike, task: Task, flux: float, xs: ArrayLike, ys: ArrayLike, cell: float | None = None
+) -> Estimate:
+    """Mean and standard deviation of the posterior on a grid of positions, the flux known.
+
+    The likelihood is the Poisson distribution's of (g + v / e) / e with mean (m + v / e) / e. With `cell`,
+    the grid's spacing, positions count with what of their cell is within the limits; those more than
+    PRIOR_REACH standard deviations from the prior on an axis do not count.
+    """
+    assert task.spot is not None
+    g = np.asarray(g, np.float64)
+    v, e = task.variance, task.excess
+    xs, ys = np.asarray(xs, np.float64), np.asarray(ys, np.float64)
+    (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
+    logarithm = np.full((len(ys), len(xs)), -np.inf)
+    for j, y in enumerate(ys):
+        for i, x in enumerate(xs):
+            m = np.maximum(flux * task.spot.images(x, y, g.shape)[0], 0.0)
+            q = (g + v / e) / e * np.log(1.0 + e * m / v) - m / e
+            distance = ((x - task.prior[0]) ** 2 + (y - task.prior[1]) ** 2) / task.prior_std**2
+            share = 1.0
+            if cell is not None:
+                share = max(min(x + cell / 2, high_x) - max(x - cell / 2, low_x), 0.0)
+                share *= max(min(y + cell / 2, high_y) - max(y - cell / 2, low_y), 0.0)
+                away = max(abs(x - task.prior[0]), abs(y - task.prior[1]))
+                share *= away <= PRIOR_REACH * task.prior_std
+            if share > 0:
+                logarithm[j, i] = task.rounded_sum(q) - distance / 2 + math.log(share)
+    p = np.exp(logarithm - logarithm.max())
+    p /= p.sum()
+    mean_x, mean_y = float(np.sum(p * xs)), float(np.sum(p * ys[:, None]))
+    error_x = math.sqrt(np.sum(p * (xs - mean_x) ** 2))
+    error_y = math.sqrt(np.sum(p * (ys[:, None] - mean_y) ** 2))
+    return Estimate(mean_x, mean_y, flux, task.error_scale * error_x, task.error_scale * error_y)
+
+
+# Centres of gravity -----------------------------------------------------------------------------------
+
+
+def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimate:
+    """Centre of gravity under a Gaussian window that follows it; error of the last step alone.
+
+    Less light under the window than LEAST_FRACTION of the start's counts as that much.
+    """
+    g = np.asarray(g, np.float64)
+    begin = start(g, task) if begin is None else begin
+    limits, margin = task.limits(g.shape), begin.margin
+    x, y = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1])
+    gain = 1.0 + (task.spot_fwhm / task.weight_fwhm) ** 2
+    std = task.weight_fwhm / FWHM_PER_STD
+    u, v = pixel_centres(g.shape[1])[None, :], pixel_centres(g.shape[0])[:, None]
+    floor = LEAST_FRACTION * begin.flux
+    w, total = np.ones_like(g), floor
+    for _ in range(STEPS["weighted"] if task.steps is None else task.steps):
+        margin = min(margin, *phase_margins(x, y, g.shape, task.phases))
+        w = np.outer(window(g.shape[0], y, std, task.phases), window(g.shape[1], x, std, task.phases))
+        total = max(float(np.sum(w * g)), floor)
+        move_x, move_y = (gain * np.sum(w * g * away) / total for away in (u - x, v - y))
+        x = clamp(x + clamp(move_x, -1.0, 1.0), *limits[0])
+        y = clamp(y + clamp(move_y, -1.0, 1.0), *limits[1])
+    noise = w**2 * (task.variance + task.excess * g)
+    least = w**2 * max(task.variance, 1e-4)  # whatever noise has made of the light
+    errors = [
+        math.sqrt(max(np.sum(noise * away**2), np.sum(least * away**2))) / total for away in (u - x, v - y)
+    ]
+    error_x, error_y = (
+        (task.error_scale * gain * e for e in errors) if total > floor else (math.inf, math.inf)
+    )
+    return Estimate(x, y, total, error_x, error_y, margin)
+
+
+def thresholded(g: ArrayLike, threshold_e: float) -> Estimate:
+    """Centre of gravity of what is above a threshold, which is subtracted."""
+    spot = np.maximum(np.asarray(g, np.float64) - threshold_e, 0.0)
+    return Estimate(*naive.centre_of_gravity(spot), flux=float(spot.sum()))
+
+
+def smoothed_brightest(
+    g: ArrayLike, smoothing_px: float, keep: int, rule: str = "subtract_next", reach: int | None = None
+) -> Estimate:
+    """Gaussian smoothing, brightest pixels, centre of gravity."""
+    spot = naive.brightest_pixels(smoothed(g, smoothing_px, smoothing_px, reach), keep, rule)
+    return Estimate(*naive.centre_of_gravity(spot), flux=float(spot.sum()))
+
+
+def gravity_error(
+    image: ArrayLike, g: ArrayLike, variance: float, excess: float = 1.0
+) -> tuple[float, float]:
+    """Standard error of the centre of gravity of an image left by a background subtraction.
+
+    var_x = sum over kept pixels of ((u - x)^2 + 1/12) (v + e max(g, 0)) / (sum of the kept)^2, `g` being
+    the calibrated image and the kept pixels those above zero in `image`; 1/12 px^2 as it is not known where
+    in a pixel the light fell.
+    """
+    image, g = np.asarray(image, np.float64), np.asarray(g, np.float64)
+    x, y = naive.centre_of_gravity(image)
+    total, var_x, var_y = 0.0, 0.0, 0.0
+    for j, v in enumerate(pixel_centres(g.shape[0])):
+        for i, u in enumerate(pixel_centres(g.shape[1])):
+            if image[j, i] > 0:
+                noise = variance + excess * max(g[j, i], 0.0)
+                total += image[j, i]
+                var_x += ((u - x) ** 2 + 1 / 12) * noise
+                var_y += ((v - y) ** 2 + 1 / 12) * noise
+    if total <= 0:
+        return math.inf, math.inf
+    return math.sqrt(var_x) / total, math.sqrt(var_y) / total
+
+
+# Trained score ----------------------------------------------------------------------------------------
+
+
+def trained(g: ArrayLike, score: Any, kind: int, flux: float, begin: Estimate, task: Task) -> Estimate:
+    """x <- q + sum psi(u - q) g / flux, pass after pass; `score` has the fields of TrainedScore.
+
+    `flux` is what the light is divided by; the class is the one nearest to it in logarithm.
+    """
+    g = np.asarray(g, np.float64)
+    classes = np.abs(np.log(np.asarray(score.flux_e)) - math.log(flux))
+    chosen = int(np.argmin(classes))
+    limits = task.limits(g.shape)
+    x, y = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1])
+    steps = score.steps_per_px
+    margin = begin.margin
+    for tables in np.asarray(score.tables, np.float64)[kind, chosen]:
+        margin = min(margin, *(abs((p * steps) % 1.0 - 0.5) for p in (x, y)))
+        qx, qy = np.rint(x * steps) / steps, np.rint(y * steps) / steps
+        moves = [projection(g, table, steps, qx, qy) / flux for table in tables]
+        x, y = clamp(qx + moves[0], *limits[0]), clamp(qy + moves[1], *limits[1])
+    errors = [
+        task.error_scale
+        * np.interp(math.log(flux), np.log(score.flux_e), score.standard_error_px[kind, :, axis])
+        for axis in (0, 1)
+    ]
+    return Estimate(x, y, flux, float(errors[0]), float(errors[1]), margin)
+
+
+def projection(g: Floats, table: Floats, steps: int, qx: float, qy: float) -> float:
+    """Sum of psi(u - q) g, psi being zero outside of its table."""
+    rows, columns = table.shape
+    total = 0.0
+    for j, v in enumerate(pixel_centres(g.shape[0])):
+        for i, u in enumerate(pixel_centres(g.shape[1])):
+            row = (v - qy) * steps + (rows - 1) / 2
+            column = (u - qx) * steps + (columns - 1) / 2
+            r, c = round(row), round(column)
+            if 0 <= r < rows and 0 <= c < columns:
+                total += table[r, c] * g[j, i]
+    return float(total)

@@ -1,0 +1,203 @@
+"""Every estimator's kernel equals the oracle, whatever shares its group, its frame or its threads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests import naive_estimators as oracle
+from tests.estimator_cases import FIELDS, Case, assert_same, one_psf, random_case
+from tests.estimator_oracle import assert_equals_oracle
+from tests.naive_spots import spots_of
+
+import faintspot as fs
+from faintspot.estimators import ESTIMATORS, measure
+from faintspot.sensor.psf import PSF
+
+SEEDS = st.integers(0, 2**32 - 1)
+QUICK = [name for name in ESTIMATORS if name != "map"]  # its oracle looks at every position of a grid
+
+
+class TestAgainstOracle:
+    @pytest.mark.parametrize("estimator", QUICK)
+    @given(seed=SEEDS)
+    @settings(max_examples=10)
+    def test_random_spots(self, estimator: str, seed: int) -> None:
+        case = random_case(seed, estimator)
+        assert_equals_oracle(case, case.measure())
+
+    @given(seed=SEEDS)
+    @settings(max_examples=4)
+    def test_random_spots_with_a_prior(self, seed: int) -> None:
+        case = random_case(seed, "map", n=2)
+        assert_equals_oracle(case, case.measure())
+
+    @pytest.mark.parametrize("width", [4, 8, 16])
+    @pytest.mark.parametrize("estimator", QUICK)
+    def test_any_simd_width(self, estimator: str, width: int) -> None:
+        case = random_case(width, estimator, n=7)
+        assert assert_equals_oracle(case, case.measure(width=width)) > 2
+
+    @pytest.mark.parametrize("estimator", ["ml", "trained", "weighted"])
+    @pytest.mark.parametrize("window", [(4, 4), (5, 17), (20, 24)])
+    def test_any_window(self, estimator: str, window: tuple[int, int]) -> None:
+        case = random_case(11, estimator, n=6, window=window)
+        assert assert_equals_oracle(case, case.measure()) > 2
+
+    def test_comparison_is_not_empty(self) -> None:
+        """Most random spots are compared: less than a fifth is invalid or near a decision."""
+        compared = total = 0
+        for seed in range(6):
+            case = random_case(seed, "ml", n=8)
+            compared += assert_equals_oracle(case, case.measure())
+            total += 8
+        assert compared > 0.8 * total
+
+    def test_standard_error_of_denoised_images(self) -> None:
+        """From the pixels that are left of the denoised image, and the noise of the measured ones."""
+        case = random_case(4, "cog", n=9)
+        denoising = case.settings.replace(denoise=True, noise_std=1.0, error_scale=1.0)
+        pipeline = replace(case, settings=denoising).pipeline()
+        stages = pipeline.explain(case.images.reshape(-1, case.images.shape[2]))
+        noise = case.calibration.read_noise_photoelectrons or 0.0
+        excess = case.calibration.excess_noise
+        variance = noise**2 + excess * case.calibration.background_e
+        for s in np.flatnonzero(stages.slopes.valid):
+            left, g = stages.background_subtracted[s], stages.calibrated[s]
+            expected = oracle.gravity_error(left, g, variance, excess)
+            found = stages.slopes.standard_error_x[s], stages.slopes.standard_error_y[s]
+            np.testing.assert_allclose(found, expected, rtol=1e-4)  # float32 sums of a few hundred pixels
+
+
+class TestIndependence:
+    """Slopes are the same bit by bit."""
+
+    @pytest.mark.parametrize("estimator", ESTIMATORS)
+    def test_order_of_the_subapertures(self, estimator: str) -> None:
+        case = random_case(3, estimator, n=21)
+        order = np.random.default_rng(1).permutation(21)
+        assert_same(case.measure(), case.select(order).measure(), order)
+
+    @pytest.mark.parametrize("estimator", ESTIMATORS)
+    def test_threads_and_frames(self, estimator: str) -> None:
+        case = random_case(5, estimator, n=19)
+        height, width = case.layout.frame_shape
+        frames = np.stack([case.images.reshape(height, width)] * 9)
+        frames += np.arange(9, dtype=np.float32)[:, None, None]
+        prior = np.random.default_rng(2).normal(0.0, 0.5, (9, 19, 2))
+        together = case.pipeline(threads=1)(frames, prior)
+        assert_same(together, case.pipeline(threads=7)(frames, prior))
+        for i in range(9):
+            alone = case.pipeline()(frames[i], prior[i])
+            for name in FIELDS:
+                assert np.array_equal(getattr(together, name)[i], getattr(alone, name)), name
+
+    @pytest.mark.parametrize("estimator", ESTIMATORS)
+    def test_neighbours(self, estimator: str) -> None:
+        """Also next to images of another kind, when they are set alike and have one PSF."""
+        case = random_case(8, estimator, n=12)
+        psf = one_psf() if case.psf is not None else None
+        alike = {
+            name: value[0] for name, value in vars(case.settings).items() if isinstance(value, np.ndarray)
+        }
+        case = replace(case, psf=psf, settings=case.settings.replace(**alike))
+        expected = case.measure()
+        hostile = case.images.copy()
+        hostile[1::2] = np.resize(
+            np.array([0, np.nan, 1e30, -5e3, 7, np.inf], np.float32), hostile[1::2].shape
+        )
+        calm = replace(case, images=hostile).measure()
+        for name in FIELDS:
+            assert np.array_equal(getattr(calm, name)[::2], getattr(expected, name)[::2]), name
+        assert_same(expected, case.select(slice(2, 9)).measure(), slice(2, 9))
+
+    @pytest.mark.parametrize("estimator", ESTIMATORS)
+    def test_measure_is_the_pipeline(self, estimator: str) -> None:
+        case = random_case(9, estimator, n=5)
+        parts: dict[str, Any] = {"psf": case.psf, "score": case.score, "prior": case.prior}
+        slopes = measure(case.images, case.settings, calibration=case.calibration, **parts)
+        assert_same(slopes, case.measure())
+
+    @pytest.mark.parametrize("estimator", ["map", "trained"])
+    def test_measured_light_does_not_depend_on_frames_before(self, estimator: str) -> None:
+        case = random_case(10, estimator, n=6)
+        measured = replace(case, settings=case.settings.replace(flux_e=None))
+        frame = case.images.reshape(-1, case.images.shape[2])
+        used, fresh = measured.pipeline(), measured.pipeline()
+        used(np.stack([frame * scale for scale in (9.0, 0.1, 3.0)]))
+        assert_same(used(frame), fresh(frame))
+
+
+class TestPhysics:
+    """The standard errors are those of the slopes, in 4,000 images of known spots."""
+
+    N = 4000
+
+    def simulated(self, flux: float, noise: float, psf: PSF) -> tuple[Any, Any]:
+        rng = np.random.default_rng(7)
+        places = rng.uniform(-1, 1, (self.N, 2))
+        detector = fs.simulate.Detector(noise)
+        return detector.expose(np.maximum(psf.images(places, (12, 14), flux), 0.0), rng), places
+
+    @pytest.mark.parametrize(
+        ("estimator", "flux", "noise"),
+        [
+            ("ml", 300, 0.1),
+            ("ml", 500, 3.0),
+            ("matched", 500, 3.0),
+            ("weighted", 500, 1.0),
+            ("map", 300, 1.0),
+        ],
+    )
+    def test_scatter(self, estimator: str, flux: float, noise: float) -> None:
+        """8,000 errors give their rms to 1 %; linear propagation of errors is good to 10 % at such light."""
+        psf = one_psf()
+        images, places = self.simulated(flux, noise, psf)
+        chosen = fs.Settings(estimator=estimator, spot_fwhm_px=1.8, flux_e=flux, prior_std_px=10.0)
+        slopes = measure(images, chosen, calibration=fs.Calibration(read_noise_e=noise), psf=psf)
+        assert slopes.valid.all()
+        ratio_x = (slopes.x - places[:, 0]) / slopes.standard_error_x
+        ratio_y = (slopes.y - places[:, 1]) / slopes.standard_error_y
+        for ratio in (ratio_x, ratio_y):
+            assert np.std(ratio) == pytest.approx(1.0, abs=0.1)
+            assert abs(np.mean(ratio)) < 0.1
+
+    def test_likelihood_reaches_the_bound(self) -> None:
+        psf, flux, noise = one_psf(), 300.0, 0.5
+        images, places = self.simulated(flux, noise, psf)
+        calibration = fs.Calibration(read_noise_e=noise)
+        slopes = measure(images, fs.Settings(estimator="ml"), calibration=calibration, psf=psf)
+        spot = spots_of(psf)[0]
+        task = oracle.Task(spot, variance=noise**2)
+        bound = np.mean([oracle.cramer_rao_bound(x, y, flux, (12, 14), task) for x, y in places[:50]])
+        rms = np.sqrt(np.mean((np.stack([slopes.x, slopes.y], axis=1) - places) ** 2))
+        assert rms == pytest.approx(float(bound), rel=0.05)  # 1 % of it from the number of spots
+
+    def test_error_scale(self) -> None:
+        case = random_case(12, "ml", n=8)
+        one = replace(case, settings=case.settings.replace(error_scale=1.0)).measure()
+        two = replace(case, settings=case.settings.replace(error_scale=2.0)).measure()
+        np.testing.assert_allclose(two.standard_error_x, 2 * one.standard_error_x, rtol=1e-6)
+        assert np.array_equal(one.x, two.x)
+
+    def test_prior_pulls(self) -> None:
+        case = random_case(13, "map", n=8)
+        narrow = replace(
+            case, settings=case.settings.replace(prior_std_px=1e-3), prior=np.full((8, 2), 0.25)
+        ).measure()
+        valid = narrow.valid
+        assert np.allclose(narrow.vector.reshape(2, -1)[:, valid], 0.25, atol=0.02)
+
+
+def test_unknown_read_noise_gives_infinite_errors() -> None:
+    for estimator in ("cog", "thresholded", "smoothed", "weighted", "matched"):
+        case: Case = random_case(14, estimator, n=6)
+        calibration = replace(case.calibration, read_noise_e=None)
+        slopes = replace(case, calibration=calibration).measure()
+        assert slopes.valid.any()
+        assert np.all(np.isposinf(slopes.standard_error_x))
+        assert np.all(np.isposinf(slopes.standard_error_y))

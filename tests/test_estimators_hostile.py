@@ -1,0 +1,301 @@
+"""Images and settings that no estimator expects: nothing raises, nothing is NaN, no light is flagged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from tests.estimate.image_cases import refused
+from tests.estimator_cases import Case, assert_same, assert_sane, one_psf, random_case, random_score
+
+import faintspot as fs
+from faintspot.estimators import ESTIMATORS, measure
+from faintspot.sensor.psf import PSF
+
+Flag = fs.SubapertureFlag
+SEEDS = st.integers(0, 2**32 - 1)
+EVERY = pytest.mark.parametrize("estimator", ESTIMATORS)
+FITTED = ("matched", "ml", "map")
+
+
+def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """One kind of trouble for each image."""
+    _, ny, nx = shape
+    hot = np.zeros((ny, nx), np.float32)
+    hot[rng.integers(ny), rng.integers(nx)] = 1e6
+    board = np.indices((ny, nx)).sum(axis=0) % 2
+    noise = rng.normal(0.0, 1.0, (ny, nx))
+    kinds = [
+        np.zeros((ny, nx)),
+        np.full((ny, nx), 7.0),
+        np.full((ny, nx), -7.0),
+        -np.abs(noise),
+        1e3 * noise,
+        1e-30 * np.abs(noise),
+        1e30 * noise,
+        3e38 * np.clip(noise, -1, 1),
+        hot,
+        -hot,
+        1e4 * board,
+        np.where(board, np.nan, 5.0),
+        np.full((ny, nx), np.nan),
+        np.full((ny, nx), np.inf),
+        np.where(rng.random((ny, nx)) < 0.2, -np.inf, noise),
+        np.where(np.arange(nx) == 0, 1e4, 0.0) * np.ones((ny, 1)),
+        100 * noise + 1e6,
+        1e29 + 1e25 * noise,
+    ]
+    chosen = rng.integers(0, len(kinds), shape[0])
+    with np.errstate(over="ignore"):
+        return np.stack([kinds[kind] for kind in chosen]).astype(np.float32)
+
+
+def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
+    """Images with the simplest settings."""
+    n = len(images)
+    chosen: dict[str, Any] = {
+        "estimator": estimator,
+        "denoise": False,
+        "threshold_e": 1.0,
+        "spot_fwhm_px": 2.0,
+        "keep_brightest": 5,
+        **changes,
+    }
+    score = random_score(np.random.default_rng(0), n) if estimator == "trained" else None
+    psf = one_psf() if estimator in FITTED else None
+    return Case(images, fs.Settings(**chosen), fs.Calibration(read_noise_e=1.0), psf, score)
+
+
+class TestImages:
+    @EVERY
+    @given(seed=SEEDS)
+    @settings(max_examples=25)
+    def test_hostile_images(self, estimator: str, seed: int) -> None:
+        case = random_case(seed, estimator)
+        rng = np.random.default_rng(seed)
+        images = hostile_images(rng, case.images.shape)
+        measured = rng.random() < 0.5
+        chosen = case.settings.replace(flux_e=None) if measured else case.settings
+        assert_sane(replace(case, images=images, settings=chosen).measure())
+
+    @EVERY
+    def test_all_pixels_bad(self, estimator: str) -> None:
+        case = flat_case(estimator, np.full((5, 8, 9), np.nan, np.float32))
+        slopes = case.measure()
+        assert_sane(slopes)
+        assert np.all(slopes.flags == Flag.TOO_MANY_BAD_PIXELS)
+        assert np.all(slopes.bad_pixels == 72)
+
+    @EVERY
+    @pytest.mark.parametrize("level", [0.0, -40.0])
+    def test_no_light_is_flagged(self, estimator: str, level: float) -> None:
+        """A frame without any light in which light was expected."""
+        case = flat_case(estimator, np.full((5, 8, 9), level, np.float32), flux_e=400.0)
+        slopes = case.measure()
+        assert_sane(slopes)
+        if estimator == "smoothed" and level < 0:
+            return  # the zeros beyond the window are the light that it sees
+        assert np.all(slopes.flags & Flag.NO_LIGHT)
+
+    def test_map_notices_that_there_is_no_light(self) -> None:
+        images = np.random.default_rng(3).normal(0.0, 1.0, (300, 10, 10)).astype(np.float32)
+        slopes = flat_case("map", images, flux_e=400.0, prior_std_px=1.0).measure()
+        assert np.mean(slopes.flags == 0) < 0.1
+
+    @pytest.mark.parametrize("estimator", ["matched", "ml", "weighted"])
+    def test_dark_frames_are_flagged(self, estimator: str) -> None:
+        """Read noise alone makes about 1 % of spots that look sound; 500 images tell to 0.5 %."""
+        images = np.random.default_rng(3).normal(0.0, 1.0, (500, 10, 10)).astype(np.float32)
+        slopes = flat_case(estimator, images).measure()
+        assert_sane(slopes)
+        assert np.mean(slopes.flags == 0) < 0.04
+
+    @EVERY
+    def test_bad_pixels_and_saturation_are_counted(self, estimator: str) -> None:
+        images = np.round(one_psf().images(np.zeros((6, 2)), (9, 9), 3000.0)).astype(np.uint16)
+        images[0, 4, 4] = 65535
+        case = flat_case(estimator, images)
+        mask = np.zeros((54, 9), bool)
+        mask[9, 0] = True  # the first pixel of the second image
+        slopes = replace(case, calibration=replace(case.calibration, bad_pixels=mask)).measure()
+        assert_sane(slopes)
+        assert slopes.flags[0] & Flag.SATURATED
+        assert slopes.flags[1] & Flag.BAD_PIXELS
+        assert slopes.bad_pixels.tolist() == [0, 1, 0, 0, 0, 0]
+        assert np.all(slopes.flags[2:] == 0)
+
+    @EVERY
+    @pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float16", "float64", ">f4"])
+    def test_dtypes(self, estimator: str, dtype: str) -> None:
+        """Whole numbers that all of them hold give one answer."""
+        images = np.round(one_psf().images([[0.3, -0.2]] * 4, (8, 8), 500.0)).clip(0, 200)
+        case = flat_case(estimator, images.astype(np.float32))
+        assert_same(case.measure(), replace(case, images=images.astype(dtype)).measure())
+
+    @EVERY
+    def test_outside_light_does_not_pull(self, estimator: str) -> None:
+        """A spot beyond the search range gives a slope within it."""
+        images = one_psf().images([[3.0, -3.0]] * 4, (12, 12), 2000.0).astype(np.float32)
+        slopes = flat_case(estimator, images, search_range_px=0.5, flux_e=2000.0).measure()
+        assert_sane(slopes)
+        assert np.all(np.abs(slopes.vector) <= 0.5)
+
+
+class TestSettings:
+    @EVERY
+    @given(seed=SEEDS)
+    @settings(max_examples=15)
+    def test_extreme_settings(self, estimator: str, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        case = random_case(seed, estimator, n=6)
+
+        def extreme(*values: float) -> NDArray[np.float64]:
+            return rng.choice(values, 6)
+
+        chosen = case.settings.replace(
+            search_range_px=extreme(1e-3, 0.5, 3.0, 1e4),
+            flux_e=extreme(1e-3, 1.0, 1e12),
+            prior_std_px=extreme(1e-6, 0.3, 1e4),
+            weight_fwhm_px=extreme(0.1, 2.0, 64.0),
+            spot_fwhm_px=extreme(0.1, 2.0),
+            smoothing_px=extreme(0.01, 1.0, 16.0),
+            threshold_e=extreme(0.0, 1e12),
+            model_error=extreme(0.0, 10.0),
+            weight_floor=extreme(0.0, 1.0),
+            error_scale=extreme(1e-3, 1e3),
+            steps=int(rng.choice([1, 100])),
+        )
+        calibration = replace(case.calibration, read_noise_e=float(rng.choice([0.0, 1e-6, 1e6])))
+        prior = rng.normal(0.0, 1.0, (6, 2)) * rng.choice([1.0, 1e3, 1e30])
+        assert_sane(replace(case, settings=chosen, calibration=calibration, prior=prior).measure())
+
+    @EVERY
+    @pytest.mark.parametrize("distance", [3.9, 5.0, 100.0, 1e6])
+    def test_reference_at_the_edge_and_outside(self, estimator: str, distance: float) -> None:
+        case = random_case(1, estimator, n=5, window=(8, 8))
+        for reference in ([distance, 0.0], [-distance, distance]):
+            assert_sane(case.measure(reference=np.tile(reference, (5, 1))))
+
+    @pytest.mark.parametrize("estimator", FITTED)
+    @pytest.mark.parametrize("nodes", [5, 7, 41])
+    def test_small_and_odd_psfs(self, estimator: str, nodes: int) -> None:
+        """Smaller than a pixel's reach, one-sided, or with negative parts."""
+        rng = np.random.default_rng(nodes)
+        case = random_case(2, estimator, n=7)
+        samples = rng.normal(0.2, 1.0, (nodes, nodes))
+        samples[nodes // 2, nodes // 2] += 30.0
+        for oversampling in (1, 4):
+            assert_sane(replace(case, psf=PSF(samples, oversampling)).measure())
+
+    def test_spot_wider_than_the_window(self) -> None:
+        psf = PSF.analytic("gaussian", size=6.0, radius_px=40)
+        for estimator in FITTED:
+            case = random_case(3, estimator, n=6, window=(4, 5))
+            assert_sane(replace(case, psf=psf).measure())
+
+
+class TestRefused:
+    """One line that names the value, what was expected and where."""
+
+    IMAGES = np.ones((3, 8, 8), np.float32)
+    NOISE = fs.Calibration(read_noise_e=1.0)
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("estimator", "centroid"),
+            ("estimator", None),
+            ("steps", 0),
+            ("steps", 2.5),
+            ("steps", 101),
+            ("threshold_e", -1.0),
+            ("smoothing_px", 0.0),
+            ("smoothing_px", np.nan),
+            ("spot_fwhm_px", 0.0),
+            ("weight_fwhm_px", -2.0),
+            ("weight_fwhm_px", "wide"),
+            ("model_error", -0.1),
+            ("weight_floor", -1e-3),
+            ("search_range_px", 0.0),
+            ("search_range_px", np.inf),
+            ("flux_e", 0.0),
+            ("flux_e", [1.0, np.nan]),
+            ("prior_std_px", 0.0),
+            ("error_scale", 0.0),
+            ("noise_std", "best"),
+            ("keep_brightest", "automatic"),
+            ("rule", "auto"),
+        ],
+    )
+    def test_bad_settings(self, name: str, value: Any) -> None:
+        with refused(name):
+            fs.Settings(**{"noise_std": 1.0, name: value})
+
+    @pytest.mark.parametrize(
+        ("estimator", "words"),
+        [
+            ("matched", ("psf", "'matched'")),
+            ("ml", ("psf", "'ml'")),
+            ("map", ("psf", "'map'")),
+            ("trained", ("score", "TrainedScore")),
+            ("weighted", ("spot_fwhm_px", "'weighted'")),
+            ("thresholded", ("threshold_e", "'thresholded'")),
+        ],
+    )
+    def test_what_an_estimator_lacks(self, estimator: str, words: tuple[str, ...]) -> None:
+        with refused(words[0], *words[1:]):
+            measure(self.IMAGES, fs.Settings(estimator=estimator), calibration=self.NOISE)
+
+    @pytest.mark.parametrize("estimator", ["ml", "map"])
+    def test_read_noise_must_be_known(self, estimator: str) -> None:
+        with refused("calibration.read_noise_e", estimator):
+            measure(self.IMAGES, fs.Settings(estimator=estimator), psf=one_psf())
+
+    @pytest.mark.parametrize("name", ["read_noise_e", "background_e"])
+    @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, "low", [1.0, 2.0]])
+    def test_bad_calibration(self, name: str, value: Any) -> None:
+        with refused(f"calibration.{name}"):
+            fs.Calibration(**{name: value})
+
+    def test_parts_for_another_sensor(self) -> None:
+        ml = fs.Settings(estimator="ml")
+        psf = PSF(one_psf().samples, 8, [0, 0])
+        with refused("psf.index", "3 numbers", "got 2"):
+            measure(self.IMAGES, ml, calibration=self.NOISE, psf=psf)
+        score = random_score(np.random.default_rng(1), 2)
+        with refused("score.index", "3 numbers", "got 2"):
+            measure(self.IMAGES, fs.Settings(estimator="trained"), calibration=self.NOISE, score=score)
+        with refused("flux_e", "3 values", "got 2"):
+            chosen = fs.Settings(estimator="ml", flux_e=[1.0, 2.0])
+            measure(self.IMAGES, chosen, calibration=self.NOISE, psf=one_psf())
+        with refused("keep_brightest = 65"):
+            measure(self.IMAGES, fs.Settings(estimator="smoothed", keep_brightest=65))
+
+    def test_bad_images_and_priors(self) -> None:
+        chosen = fs.Settings(estimator="map", flux_e=10.0)
+
+        def run(images: Any, prior: Any = None) -> fs.Slopes:
+            return measure(images, chosen, calibration=self.NOISE, psf=one_psf(), prior=prior)
+
+        for images, words in (
+            (np.ones((8, 8)), "(8, 8)"),
+            (np.ones((2, 3, 8, 8)), "(2, 3, 8, 8)"),
+            (np.ones((0, 8, 8)), "empty"),
+            (np.ones((3, 8, 8), complex), "complex"),
+            ([["a"]], "real numbers"),
+        ):
+            with refused("images", words):
+                run(images)
+        for prior, words in (
+            (np.zeros((2, 2)), "(2, 2)"),
+            (np.zeros((4, 3, 2)), "(4, 3, 2)"),
+            (np.full((3, 2), np.nan), "finite"),
+            ("ahead", "real numbers"),
+        ):
+            with refused("prior", words):
+                run(self.IMAGES, prior)
