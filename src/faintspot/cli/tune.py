@@ -1,0 +1,300 @@
+"""faintspot tune: which estimator, with which settings."""
+
+from __future__ import annotations
+
+import shlex
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from faintspot.cli.progress import progress_bar
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.io.frames import open_frames
+from faintspot.planner import wording
+from faintspot.planner.camera_file import TABLES, read_camera
+from faintspot.planner.photometry import (
+    DEFAULT_BAND,
+    DEFAULT_QUANTUM_EFFICIENCY,
+    DEFAULT_THROUGHPUT,
+    ZERO_POINTS,
+)
+from faintspot.planner.question import PROFILES
+from faintspot.sensor import configuration
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from faintspot.planner.answer import Answer
+    from faintspot.planner.question import Question
+
+_MOST_FRAMES = 200
+_WIDEST_TEXT = 110
+
+# Name, type, metavar and help of every option that is also a key of the camera file.
+_VALUES: tuple[tuple[str, Any, str | None, str], ...] = (
+    (
+        "read_noise_e",
+        float,
+        "E",
+        "Read noise, electrons at the camera's output (before the EM gain is divided out).",
+    ),
+    ("gain_e_per_adu", float, "E/ADU", "Electrons per ADU. Default: 1, or measured in the frames."),
+    ("em_gain", float, "G", "Gain of the multiplication register of an EMCCD. Default: 1, none."),
+    ("background_e", float, "E", "Photo-electrons of sky and dark current per pixel and frame. Default: 0."),
+    ("pixels", int, "N", "Side of a sub-aperture's window."),
+    ("fwhm_px", float, "PX", "Width (FWHM) of the optical spot."),
+    ("profile", click.Choice(PROFILES), None, "Shape of the spot. Default: diffraction (sinc^2)."),
+    ("lenslet_m", float, "M", "Side of a sub-aperture at the telescope's entrance."),
+    ("wavelength_nm", float, "NM", "Wavelength of the sensor."),
+    ("pixel_scale_arcsec", float, "ARCSEC", "Side of a pixel on the sky."),
+    ("r0_m", float, "M", "Fried parameter at 500 nm: tells whether spots are speckled."),
+    ("magnitude", float, "MAG", "Of the guide star; needs --lenslet-m and --frame-rate-hz."),
+    ("flux_e", float, "E", "Or its light: detected photons per sub-aperture and frame."),
+    ("band", click.Choice(list(ZERO_POINTS)), None, f"Of the magnitude. Default: {DEFAULT_BAND}."),
+    (
+        "zero_point",
+        float,
+        "PHOTONS",
+        "Photons/s/m^2 of magnitude 0 in the sensor's band. Default: of --band.",
+    ),
+    ("frame_rate_hz", float, "HZ", "Frames per second."),
+    ("throughput", float, "T", f"Of atmosphere, telescope and optics. Default: {DEFAULT_THROUGHPUT:g}."),
+    ("quantum_efficiency", float, "Q", f"Default: {DEFAULT_QUANTUM_EFFICIENCY:g}."),
+    ("search_range_px", float, "PX", "Spots are within plus and minus this. Default: FWHM / 2, at least 1."),
+    (
+        "budget",
+        str,
+        "R",
+        "Slope error allowed, such as 0.1 (px), 0.05arcsec: asks for the limiting magnitude.",
+    ),
+)
+
+
+def _values(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of `_VALUES`."""
+    for name, kind, metavar, text in reversed(_VALUES):
+        flags = [f"--{name.replace('_', '-')}", *(["--photons"] if name == "flux_e" else [])]
+        command = click.option(*flags, name, type=kind, metavar=metavar, help=text)(command)
+    return command
+
+
+@click.command(short_help="Say which estimator and settings suit a camera and a star.")
+@click.option("--camera", metavar="TOML", help="File of what is known; options count more.")
+@click.option("--frames", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest in.")
+@click.option("--dark", multiple=True, metavar="FILE", help="Frames without light.")
+@click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@_values
+@click.option("--grid", metavar="RxC", help="Rows and columns of lenslets, such as 7x7, for the layout.")
+@click.option("--layout", "layout_file", metavar="TOML", help="Configuration with the layout.")
+@click.option(
+    "--output",
+    "-o",
+    metavar="TOML",
+    default="faintspot.toml",
+    show_default=True,
+    help="Configuration to write.",
+)
+@click.option("--picture", metavar="PNG", help="The plot. Default: beside the output, with -tune.png.")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the simulation.")
+@click.option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
+def command(
+    camera: str | None,
+    frames: tuple[str, ...],
+    dark: tuple[str, ...],
+    key: str | None,
+    grid: str | None,
+    layout_file: str | None,
+    output: str,
+    picture: str | None,
+    seed: int,
+    overwrite: bool,
+    **options: Any,
+) -> None:
+    """Say which estimator and settings suit a camera and a star.
+
+    Simulates spots as the camera sees them and tries every estimator on them: brightest pixels, thresholding,
+    Gaussian smoothing, TV denoising, weighted centre of gravity, matched filter, maximum likelihood and a
+    posteriori, trained score. Prints the slope error of each, says how many magnitudes it saves, draws it
+    against the star's magnitude, and writes a configuration with the best one's settings.
+
+    What is not known is left out; recorded frames (and darks) tell most of it.
+
+    \b
+    Examples:
+      faintspot tune --camera camera.toml --budget 0.1
+      faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
+      faintspot tune --frames cube.fits --dark dark.fits --magnitude 11 --lenslet-m 0.5 --frame-rate-hz 500
+    """
+    target = Path(output)
+    _check_target(target, overwrite)
+    given = _given(camera, options)
+    known = _sensor(grid, layout_file, target, given)
+    given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
+    with progress_bar("tuning", "steps") as advance:
+        question = _question(frames, dark, key, given)
+        from faintspot.planner.choosing import tune
+
+        answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
+    console = Console(highlight=False)
+    for line in _wrapped([wording.situation(answer)], console):
+        click.echo(line)
+    console.print(answer_table(answer))
+    heading, *rest = wording.recommendation(answer)
+    for line in [*_wrapped([heading], console), *_wrapped(rest, console, "  ")]:
+        click.echo(line)
+    click.echo("This rests on")
+    for line in _wrapped(wording.foundations(answer), console, "  "):
+        click.echo(line)
+    _write(answer, target, picture, frames)
+
+
+def answer_table(answer: Answer) -> Table:
+    """Return the errors of all arms at the star's flux as a table."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("estimator", no_wrap=True)
+    for heading in ("R (px)", "gain", "rms/gain", "outliers", "cost", "mag saved"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for result in answer.results:
+        found = result.statistics
+        table.add_row(
+            result.arm.label,
+            f"{found.error.value:.4f}±{found.error.standard_error:.4f}",
+            f"{found.gain.value:.2f}",
+            f"{found.corrected_rms.value:.4f}",
+            f"{100 * found.outlier_fraction.value:.1f} %",
+            f"{result.arm.cost:.2f}",
+            "" if result.arm.name == "plain" else wording.short_gain(answer, result.over_plain),
+            style="bold" if result is answer.best else None,
+        )
+    bound = float(answer.bound_px[len(answer.flux_e) // 2])
+    table.add_row("Cramer-Rao bound", f"{bound:.4f}       ", "", "", "", "", "", style="dim")
+    table.caption = (
+        "R: mean |error| per axis. rms/gain: rms after correcting gain and offset. outliers: error above "
+        "1 px. cost: 1 is TV with 20 iterations. mag saved: against brightest pixels, by R."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _check_target(target: Path, overwrite: bool) -> None:
+    if not target.absolute().parent.is_dir():
+        raise InputError(f"{target}: the folder {target.parent} does not exist: create it or choose another")
+    if target.exists() and not overwrite:
+        raise InputError(f"{target}: exists already; --overwrite replaces its settings and keeps its layout")
+
+
+def _given(camera: str | None, options: dict[str, Any]) -> dict[str, Any]:
+    """Return what is known: the options, and the file where they say nothing."""
+    chosen = {name: value for name, value in options.items() if value is not None}
+    if "magnitude" in chosen and "flux_e" in chosen:
+        raise InputError("--magnitude, --flux-e: expected one of them, got both")
+    known = {} if camera is None else read_camera(camera)
+    if "magnitude" in chosen or "flux_e" in chosen:
+        known = {name: value for name, value in known.items() if name not in ("magnitude", "flux_e")}
+    return {**known, **chosen}
+
+
+def _sensor(grid: str | None, layout_file: str | None, target: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the layout that was asked for or that the configuration has already, and its calibration."""
+    if grid is not None and layout_file is not None:
+        raise InputError("--grid, --layout: expected one of them, got both")
+    found: dict[str, Any] = {}
+    source = layout_file or (str(target) if target.exists() else None)
+    if source is not None:
+        calibration: Calibration = configuration.load(source, "calibration")
+        found["calibration"] = calibration
+        default = Calibration()
+        for name in ("read_noise_e", "gain_e_per_adu", "em_gain", "background_e"):
+            if getattr(calibration, name) != getattr(default, name):
+                found[name] = getattr(calibration, name)
+        # The target may have no layout yet; a file that was named for its layout must.
+        if layout_file is not None or "[layout" in target.read_text(encoding="utf-8"):
+            found["layout"] = Layout.load(source)
+    if grid is not None:
+        found["layout"] = _grid(grid, given)
+    return found
+
+
+def _grid(grid: str, given: dict[str, Any]) -> Layout:
+    rows, _, columns = grid.lower().partition("x")
+    if not (rows.isdecimal() and columns.isdecimal()):
+        raise InputError(f"--grid {grid}: expected rows and columns of lenslets, such as 7x7")
+    if given.get("pixels") is None:
+        raise InputError("--grid: with it, expected --pixels, the side of a sub-aperture's window")
+    return Layout.grid((int(rows), int(columns)), pixels=given["pixels"])
+
+
+def _question(
+    frames: tuple[str, ...], dark: tuple[str, ...], key: str | None, given: dict[str, Any]
+) -> Question:
+    """Check what is given, and measure the rest in the frames."""
+    from faintspot.planner.question import Question
+    from faintspot.planner.recorded import question_from_frames
+
+    if dark and not frames:
+        raise InputError("--dark: expected --frames as well")
+    try:
+        if not frames:
+            return Question(**given)
+        given.pop("calibration", None)  # measured
+        return question_from_frames(_read(frames, key), _read(dark, None) if dark else None, **given)
+    except InputError as error:
+        raise InputError(f"{error}{_where(str(error))}") from None
+
+
+def _where(text: str) -> str:
+    """Say how to give the value that an error begins with."""
+    name = text.replace("=", ":").partition(":")[0].strip()
+    for table, keys in TABLES.items():
+        if name in keys:
+            return f" (--{name.replace('_', '-')}, or {name} in [{table}] of the --camera file)"
+    return ""
+
+
+def _read(paths: tuple[str, ...], key: str | None) -> NDArray[Any]:
+    with open_frames(paths, key=key) as source:
+        return source.block(0, min(_MOST_FRAMES, source.n_frames))
+
+
+def _wrapped(lines: list[str], console: Console, indent: str = "") -> list[str]:
+    width = min(console.width, _WIDEST_TEXT)
+    return [
+        part
+        for line in lines
+        for part in textwrap.wrap(
+            line, width, initial_indent=indent, subsequent_indent=f"{indent}  ", break_long_words=False
+        )
+    ]
+
+
+def _write(answer: Answer, target: Path, picture: str | None, frames: tuple[str, ...]) -> None:
+    """Write configuration and picture, and say what comes next."""
+    answer.save(target)
+    click.echo(f"{target}: written")
+    path = Path(picture) if picture else target.with_name(f"{target.stem}-tune.png")
+    try:
+        from faintspot.report.drawing import png
+
+        path.write_bytes(png(answer.figure()))
+        click.echo(f"{path}: picture")
+    except MissingExtraError as error:
+        if picture is not None:
+            raise
+        click.echo(f"no picture: {error}")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    if answer.question.layout is None:
+        pixels = answer.question.pixels
+        click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")
+    else:
+        names = shlex.join(frames) if frames else "FRAMES"
+        click.echo(f"Next: faintspot slopes {names} --config {shlex.quote(str(target))} -o slopes.zarr")

@@ -1,0 +1,147 @@
+"""The planner's answer: what to use, how good everything else is, and what this rests on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.planner.arms import SPOT, Arm
+from faintspot.planner.curves import Curve
+from faintspot.planner.question import Question
+from faintspot.sensor import configuration
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.settings import Settings
+from faintspot.study.metric import Estimate, SlopeStatistics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmResult:
+    """One arm at the star's flux, with its best settings."""
+
+    arm: Arm
+    settings: Settings
+    statistics: SlopeStatistics
+    curve: Curve
+    """R at every flux, the settings chosen anew at each."""
+    over_plain: Estimate
+    """Magnitudes of guide star gained over brightest pixels, by R."""
+    over_thresholded: Estimate
+    """The same over thresholding."""
+    limiting_flux_e: Estimate | None = None
+    """Flux at which R equals the budget: 0 below and infinity above the range; None without a budget."""
+    psf: PSF | None = None
+    score: TrainedScore | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What `faintspot.planner.tune` found."""
+
+    question: Question
+    flux_e: Floats
+    """(m,) fluxes of the curves, the star's in the middle."""
+    results: tuple[ArmResult, ...]
+    equal: tuple[str, ...]
+    """Names of the arms that are as good as the best within the errors; the first is recommended."""
+    bound_px: Floats
+    """(m,) R of an estimator at the Cramer-Rao bound, for spots without speckles."""
+    left_out: dict[str, str]
+    """Arms that were not tried, and why."""
+
+    @property
+    def best(self) -> ArmResult:
+        """The recommended arm."""
+        return self[self.equal[0]]
+
+    @property
+    def best_without_psf(self) -> ArmResult:
+        """The best arm of those that need not know the spot."""
+        free = [result for result in self.results if result.arm.knowledge < SPOT]
+        if self.best in free:
+            return self.best
+        return min(free, key=lambda result: _finite(result.statistics.corrected_rms.value))
+
+    @property
+    def prior_rms_px(self) -> float:
+        """Rms per axis of the spots' positions, and so of always answering the reference."""
+        return float(self.question.search_range_px / math.sqrt(3))
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether even the recommended arm's corrected rms is not below the spots' own motion."""
+        return not self.best.statistics.corrected_rms.value < self.prior_rms_px
+
+    @property
+    def magnitude_label(self) -> str:
+        """What `magnitudes` counts."""
+        photometry = self.question.photometry
+        if photometry is None:
+            return "magnitudes fainter than the star"
+        return f"guide star magnitude ({photometry.band})"
+
+    def magnitudes(self, flux_e: ArrayLike) -> Floats:
+        """Return the magnitudes of stars of these fluxes; relative to the star without photometry."""
+        photometry = self.question.photometry
+        if photometry is not None:
+            return photometry.magnitude(flux_e)
+        return np.asarray(-2.5 * np.log10(np.asarray(flux_e) / self.question.star_flux_e))
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera, with the maps that the question brought along."""
+        question = self.question
+        base = Calibration() if question.calibration is None else question.calibration
+        return replace(
+            base,
+            gain_e_per_adu=question.gain_e_per_adu,
+            em_gain=question.em_gain,
+            read_noise_e=question.read_noise_e,
+            background_e=question.background_e,
+        )
+
+    def __getitem__(self, name: str) -> ArmResult:
+        """Return the result of an arm."""
+        return next(result for result in self.results if result.arm.name == name)
+
+    def save(self, path: str | Path) -> None:
+        """Write the recommended settings as a configuration file; what else it holds stays.
+
+        PSF and score lie beside it. Without a layout the file holds the other tables only.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        best = self.best
+        for item in (self.question.layout, best.settings, self.calibration, best.psf, best.score):
+            if item is not None:
+                configuration.save(path, item)
+
+    def figure(self) -> Figure:
+        """Draw R against the star's brightness.
+
+        Raises
+        ------
+        MissingExtraError
+            Without matplotlib.
+        """
+        from faintspot.report.tune_figure import tune_figure
+
+        return tune_figure(self)
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else math.inf

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import pytest
+from tests.cli.cli_cases import LAYOUT, Commands, simulated
+
+from faintspot import Calibration, SlopePipeline
+from faintspot.planner import choosing
+
+KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few spots and fluxes."""
+    monkeypatch.setattr(choosing, "tune", functools.partial(choosing.tune, realisations=256, steps=1))
+
+
+def test_answer_configuration_and_picture(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run.ok("tune", *KNOWN, "--grid", "4x4", "--budget", "0.1")
+    for text in ("brightest pixels", "Cramer-Rao bound", "Recommended: ", "limiting flux", "This rests on"):
+        assert text in result.out
+    assert max(len(line) for line in result.out.splitlines()) <= 80
+    assert (tmp_path / "faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
+    pipeline = SlopePipeline.from_file("faintspot.toml")
+    assert len(pipeline.layout) == 16
+    assert pipeline.calibration.read_noise_e == 3.0
+    assert "faintspot slopes" in result.out
+
+
+def test_camera_file_and_options_that_count_more(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camera.toml").write_text(
+        "[camera]\nread_noise_e = 2.0\npixels = 8\n[spot]\nfwhm_px = 1.8\nlenslet_m = 0.5\n"
+        "[star]\nmagnitude = 9.0\nframe_rate_hz = 500\n[tune]\nbudget = 0.2\n"
+        "[layout.grid]\nshape = [4, 4]\npixels = 8\n"
+    )
+    result = run.ok("tune", "--camera", "camera.toml", "--magnitude", "9.5", "-o", "out.toml")
+    assert "R = 9.50" in result.out
+    assert "limiting magnitude" in result.out
+    assert len(SlopePipeline.from_file("out.toml").layout) == 16
+
+
+def test_without_a_layout_it_says_what_to_do(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "faintspot layout FRAME --pixels 8" in run.ok("tune", *KNOWN).out
+    LAYOUT.save("faintspot.toml")
+    assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
+    run.refused("tune", *KNOWN, naming=("faintspot.toml", "--overwrite"))
+    run.ok("tune", *KNOWN, "--overwrite")
+    assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
+
+
+def test_calibration_of_an_existing_configuration_counts_and_stays(
+    run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    LAYOUT.save("faintspot.toml")
+    Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0).save("faintspot.toml")
+    result = run.ok("tune", "--fwhm-px", "1.8", "--flux-e", 200, "--overwrite")
+    assert "read noise 4 e-" in result.out
+    assert SlopePipeline.from_file("faintspot.toml").calibration == Calibration(
+        dark=100.0, gain_e_per_adu=2.0, read_noise_e=4.0
+    )
+
+
+def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import numpy as np
+
+    monkeypatch.chdir(tmp_path)
+    np.save("frames.npy", simulated())
+    LAYOUT.save("layout.toml")
+    arguments = ("--frames", "frames.npy", "--layout", "layout.toml", "--gain-e-per-adu", 1)
+    result = run.ok("tune", *arguments, "--flux-e", 150)
+    assert "PSF learnt" in result.out
+    assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
+
+
+@pytest.mark.parametrize(
+    ("arguments", "naming"),
+    [
+        ((), ("read_noise_e", "--read-noise-e", "[camera]")),
+        (("--read-noise-e", "abc"), ("--read-noise-e",)),
+        (("--read-noise-e", -3, *KNOWN[2:]), ("read_noise_e = -3",)),
+        (KNOWN[:-2], ("magnitude", "flux_e")),
+        ((*KNOWN, "--magnitude", 3), ("--magnitude", "both")),
+        ((*KNOWN, "--budget", "3furlongs"), ("budget", "0.05arcsec")),
+        ((*KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
+        ((*KNOWN, "--grid", "7x7", "--layout", "a.toml"), ("--grid", "--layout")),
+        ((*KNOWN, "--layout", "nothere.toml"), ("nothere.toml",)),
+        ((*KNOWN, "--dark", "dark.fits"), ("--frames",)),
+        ((*KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
+        (("--camera", "nothere.toml"), ("nothere.toml",)),
+        (("--camera", "broken.toml"), ("broken.toml", "TOML")),
+        (("--camera", "typo.toml"), ("read_noise", "did you mean read_noise_e")),
+        (("--camera", "table.toml"), ("cameras", "did you mean camera")),
+        (("--camera", "layout.toml"), ("layout.grid.shape",)),
+        (("--frames", "nothere.fits"), ("nothere.fits",)),
+    ],
+)
+def test_mistakes_are_named_in_one_line(
+    run: Commands,
+    arguments: tuple[object, ...],
+    naming: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.toml").write_text("read_noise = [\n")
+    (tmp_path / "typo.toml").write_text("[camera]\nread_noise = 3\n")
+    (tmp_path / "table.toml").write_text("[cameras]\nread_noise = 3\n")
+    (tmp_path / "layout.toml").write_text("[layout.grid]\npixels = 8\n")
+    run.refused("tune", *arguments, naming=naming)  # type: ignore[arg-type]
+    assert not (tmp_path / "faintspot.toml").exists()

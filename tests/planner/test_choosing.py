@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from tests.planner.planner_cases import CAMERA, QUICK, answered
+
+from faintspot.errors import InputError
+from faintspot.planner import Question, tune
+from faintspot.planner.arms import ARMS
+from faintspot.planner.choosing import _best_choice, _ranked
+
+
+def test_every_arm_is_scored_on_the_same_spots() -> None:
+    answer = answered()
+    assert [result.arm.name for result in answer.results] == [arm.name for arm in ARMS]
+    shapes = {result.curve.errors_px.shape for result in answer.results}
+    assert shapes == {(3, 512)}
+    assert all(result.settings.search_range_px == 1.0 for result in answer.results)
+
+
+def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
+    """The bound is for unbiased estimators; 512 spots tell R to 3 %."""
+    answer = answered()
+    assert answer["ml"].statistics.error.value == pytest.approx(answer.bound_px[1], rel=0.15)
+    assert answer.best.arm.name in ("ml", "weighted", "matched", "smoothed", "map", "trained")
+    assert answer.best.over_plain.value > 0.1
+
+
+def test_more_light_means_smaller_errors() -> None:
+    for result in answered().results:
+        assert np.all(np.diff(result.curve.error_px) < 0)
+
+
+def test_tv_is_not_recommended_for_gaussian_spots_without_read_noise() -> None:
+    answer = answered(read_noise_e=0.1, profile="gaussian", fwhm_px=2.0, flux_e=100.0)
+    assert answer.best.arm.name != "tv"
+    # Every arm has chosen its settings on 256 spots only.
+    assert abs(answer["tv"].over_plain.value) < 0.1
+
+
+def test_speckled_spots_are_measured_without_trusting_their_mean() -> None:
+    answer = answered(
+        fwhm_px=None, lenslet_m=0.6, wavelength_nm=650.0, pixel_scale_arcsec=0.112, r0_m=0.15, flux_e=500.0
+    )
+    assert answer.question.d_over_r0 > 2
+    # What is blurred or allowed to be wrong is nearer to the truth than the sharp PSF.
+    psf = answer["ml"].psf
+    assert psf is not None
+    assert answer["ml"].settings.model_error > 0 or psf.fwhm_px.max() > 2.0
+    assert answer.best.statistics.corrected_rms.value < answer["plain"].statistics.corrected_rms.value
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    again = tune(Question(**CAMERA), rng=np.random.default_rng(1), **QUICK)
+    for first, second in zip(answered().results, again.results, strict=True):
+        assert first.settings == second.settings
+        np.testing.assert_array_equal(first.curve.errors_px, second.curve.errors_px)
+    assert again.equal == answered().equal
+
+
+def test_progress_is_reported_to_the_end() -> None:
+    seen: list[tuple[int, int]] = []
+    question = Question(**{**CAMERA, "pixels": 8})
+    tune(question, realisations=256, steps=1, progress=lambda done, total: seen.append((done, total)))
+    assert seen[-1][0] == seen[-1][1]
+    assert all(a[0] < b[0] for a, b in itertools.pairwise(seen))
+
+
+def test_of_equal_arms_the_one_that_knows_least_then_the_cheapest_is_taken() -> None:
+    results = list(answered().results)
+    rng = np.random.default_rng(2)
+    common = rng.normal(-2.0, 0.1, 16)
+    blocks = {result.arm.name: common + 1.0 for result in results}
+    for name in ("map", "ml", "tv", "smoothed"):
+        blocks[name] = common + rng.normal(0.0, 0.01, 16)
+    rms = {name: math.exp(float(values.mean())) for name, values in blocks.items()}
+    results = [
+        dataclasses.replace(
+            result,
+            statistics=dataclasses.replace(
+                result.statistics,
+                corrected_rms=dataclasses.replace(
+                    result.statistics.corrected_rms, value=rms[result.arm.name]
+                ),
+            ),
+        )
+        for result in results
+    ]
+    assert _ranked(results, blocks) == ("smoothed", "tv", "ml", "map")
+
+
+def test_choice_follows_the_axes_to_the_minimum() -> None:
+    axes = {"a": [0.0, 1.0, 2.0], "b": [0.0, 1.0, 2.0]}
+
+    def along(choice: dict[str, float], name: str, values: list[float]) -> list[float]:
+        each = [{**choice, name: value} for value in values]
+        return [(one["a"] - 2) ** 2 + 0.1 * (one["b"] - one["a"]) ** 2 for one in each]
+
+    assert _best_choice(axes, along) == {"a": 2.0, "b": 2.0}
+
+
+def test_only_a_question_is_answered() -> None:
+    with pytest.raises(InputError, match="question"):
+        tune({"read_noise_e": 3.0})  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="realisations"):
+        tune(Question(**CAMERA), realisations=3)

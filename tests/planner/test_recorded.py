@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.planner.planner_cases import QUICK
+from tests.shared_data import shared_file
+
+from faintspot.errors import InputError
+from faintspot.io.frames import read_array
+from faintspot.planner import question_from_frames, tune
+from faintspot.sensor.layout import Layout
+from faintspot.simulate import Detector, sensor_frames
+
+LAYOUT = Layout.grid((6, 6), pixels=12)
+CAMERA = Detector(read_noise_e=4.0, gain_e_per_adu=0.5, offset_adu=100.0)
+
+
+def recorded(n_frames: int = 30) -> tuple[np.ndarray, np.ndarray]:
+    """Return frames of a static field and darks."""
+    rng = np.random.default_rng(4)
+    positions = rng.uniform(-0.6, 0.6, (len(LAYOUT), 2))
+    frames, _ = sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        n_frames,
+        flux_e=3000.0,
+        positions=positions,
+        detector=CAMERA,
+        rng=rng,
+    )
+    return frames, CAMERA.expose(np.zeros((20, *LAYOUT.frame_shape)), rng)
+
+
+def test_camera_light_and_spot_are_measured() -> None:
+    frames, darks = recorded()
+    question = question_from_frames(frames, darks, layout=LAYOUT)
+    assert question.gain_e_per_adu == pytest.approx(0.5, rel=0.05)  # 30 frames of 36 spots
+    assert question.read_noise_e == pytest.approx(4.0, rel=0.06)  # as the gain
+    assert question.star_flux_e == pytest.approx(3000.0, rel=0.06)  # spots off the middle lose a little
+    assert question.fwhm_px == pytest.approx(1.77, rel=0.1)
+    assert any("PSF learnt" in fact for fact in question.facts)
+
+
+def test_a_learnt_psf_is_used_and_the_trained_arm_left_out() -> None:
+    frames, darks = recorded()
+    question = question_from_frames(frames, darks, layout=LAYOUT, flux_e=100.0)
+    answer = tune(question, **QUICK)
+    assert "trained" in answer.left_out
+    assert answer["ml"].psf is question.psf
+    assert answer["ml"].settings.weight_floor == 1e-3
+
+
+def test_what_is_given_is_not_measured() -> None:
+    frames, _ = recorded(2)
+    question = question_from_frames(
+        frames[0], layout=LAYOUT, gain_e_per_adu=0.5, read_noise_e=4.0, fwhm_px=1.8, flux_e=50.0
+    )
+    assert (question.read_noise_e, question.fwhm_px, question.star_flux_e) == (4.0, 1.8, 50.0)
+    assert question.psf is None
+
+
+def test_a_single_frame_does_not_tell_the_gain() -> None:
+    frames, darks = recorded(2)
+    with pytest.raises(InputError, match="gain_e_per_adu"):
+        question_from_frames(frames[0], layout=LAYOUT)
+    with pytest.raises(InputError, match="darks"):
+        question_from_frames(frames[0], darks[:, :10], layout=LAYOUT)
+
+
+def test_unreliable_gain_is_not_used() -> None:
+    frames = read_array(f"{shared_file('data/ciao_bench_60x224x224.npz')}:frames")
+    with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):
+        question_from_frames(frames)
+    question = question_from_frames(frames, gain_e_per_adu=2.0, flux_e=200.0)
+    assert question.layout is not None
+    assert len(question.layout) == 64
+    assert question.fwhm_px == pytest.approx(3.7, abs=0.2)
