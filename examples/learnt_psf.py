@@ -2,10 +2,11 @@
 
 Takes bright frames of a static field and thins their electrons as `thinned_spots.py` does, every frame moved
 by up to 2 unbinned pixels before binning. From half of the frames, at that low light, a PSF is learnt; the
-other half is measured: by brightest pixels, and by maximum likelihood with an analytic PSF, with the learnt
-one, and with one for each lenslet learnt at full light. The truth is each estimator's own position in the
-mean frame. Printed are the slope error R and the photon efficiency against the Cramer-Rao bound with the
-PSF from bright frames.
+other half is measured: by brightest pixels, by maximum likelihood with an analytic PSF, with the learnt one
+(from 200 spots, and from all) and with one for each lenslet learnt at full light, and with the learnt PSF
+and a prior on the position. The truth is each estimator's own position in the mean frame. Printed are the
+slope error R and the photon efficiency against the Cramer-Rao bound with the PSF from bright frames, and for
+the last three the actual over the stated standard error.
 
     python examples/learnt_psf.py bench.npz --gain 2.1
 """
@@ -28,7 +29,8 @@ CASES = ((30, 0.1), (50, 0.1), (100, 0.1), (200, 0.1), (1000, 0.1), (100, 3.0), 
 SHIFTS = [(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)]
 KEPT = (6, 8, 10, 12, 16, 20, 25, 30, 40, 60)
 BRIGHT_READ_NOISE_E = 15.0
-SEARCH_PX = 3.0
+SEARCH_PX = 1.5  # positions lie within about as much
+PRIOR_PX = 0.8  # their standard deviation
 
 
 class Bench:
@@ -60,18 +62,21 @@ class Bench:
 
 def positions(
     images: NDArray[Any], settings: fs.Settings, read_noise: float, learnt: Any = None, share: float = 1.0
-) -> NDArray[Any]:
+) -> fs.Slopes:
     """Measure spots; `learnt` holds PSF and background, the latter times `share`."""
     if learnt is None:
-        slopes = fs.estimators.measure(images, settings)
-        return np.stack([slopes.x, slopes.y], axis=-1)
+        return fs.estimators.measure(images, settings)
     psf, background = learnt
     index = np.tile(np.arange(len(psf.samples)), len(images) // len(psf.samples))
     level = float(np.mean(background)) * share
     calibration = fs.Calibration(dark=level, read_noise_e=read_noise, background_e=max(level, 0.0))
-    slopes = fs.estimators.measure(
+    return fs.estimators.measure(
         images, settings, calibration=calibration, psf=fs.PSF(psf.samples, psf.oversampling, index)
     )
+
+
+def place(slopes: fs.Slopes) -> NDArray[Any]:
+    """Return x and y, (n, 2)."""
     return np.stack([slopes.x, slopes.y], axis=-1)
 
 
@@ -94,16 +99,27 @@ def compare(
         for half in range(2)
     ]
     full = bench.mean.reshape(-1, *bench.window)
+    ml = fs.Settings(estimator="ml", search_range_px=SEARCH_PX)
+    ratios: list[float] = []  # actual over stated standard error, of errors below 1 px
 
     def error(settings: fs.Settings, arm: Any = None) -> float:
-        truth = bench.truth(1, positions(full, settings, BRIGHT_READ_NOISE_E, arm, 1 / share))
-        return float(np.abs(positions(thin[1], settings, read_noise, arm) - truth).mean())
+        at_full_light = ml if settings.estimator == "map" else settings
+        truth = bench.truth(1, place(positions(full, at_full_light, BRIGHT_READ_NOISE_E, arm, 1 / share)))
+        slopes = positions(thin[1], settings, read_noise, arm)
+        found = place(slopes) - truth
+        stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
+        near = np.all((np.abs(found) < 1.0) & np.isfinite(stated), axis=-1)
+        if arm is not None:
+            ratios.append(float(np.sqrt(np.mean(found[near] ** 2) / np.mean(stated[near] ** 2))))
+        return float(np.abs(found).mean())
 
     analytic = fs.PSF.analytic("diffraction"), one[1] * share
     learnt = [learnt_from(thin[0][: 4 * bench.n], read_noise), learnt_from(thin[0], read_noise)]
-    ml = fs.Settings(estimator="ml", search_range_px=SEARCH_PX)
-    errors = [min(error(fs.Settings(denoise=False, keep_brightest=k)) for k in KEPT)]
+    errors = [
+        min(error(fs.Settings(denoise=False, keep_brightest=k, search_range_px=SEARCH_PX)) for k in KEPT)
+    ]
     errors += [error(ml, arm) for arm in (analytic, *learnt, (bright[0], bright[1] * share))]
+    errors += [error(ml.replace(estimator="map", prior_std_px=PRIOR_PX, flux_e=flux), learnt[1])]
     background = float(one[1][0])
     light = flux - background * share * np.prod(bench.window)
     conditions: dict[str, Any] = {
@@ -115,7 +131,17 @@ def compare(
     bound = np.sqrt(2 / np.pi) * float(np.mean(fs.cramer_rao(light, **conditions)))
     efficiency = fs.photon_efficiency(np.array(errors), light, **conditions)
     numbers = "".join(f"{value:10.4f}" for value in (*errors, bound))
-    return f"{flux:5.0f} {read_noise:4.1f}{numbers}  | " + " ".join(f"{e:.2f}" for e in efficiency)
+    shown = " ".join(f"{e:.2f}" for e in efficiency), " ".join(f"{r:.2f}" for r in ratios[2:])
+    return f"{flux:5.0f} {read_noise:4.1f}{numbers}  | {shown[0]} | {shown[1]}"
+
+
+def _light_between(raw: NDArray[Any], arguments: argparse.Namespace) -> float:
+    """Return the level (ADU) on which the spots stand: dark level and background that the PSF's fit finds."""
+    dark = float(np.percentile(raw.mean(axis=0), 1))
+    electrons = np.maximum((raw - dark) * arguments.gain, 0)
+    bench = Bench(electrons, arguments.bin, 1, np.random.default_rng(2015))
+    _, background = learnt_from(bench.images(0), BRIGHT_READ_NOISE_E)
+    return dark + float(background[0]) / arguments.bin**2 / arguments.gain
 
 
 def main() -> None:
@@ -123,23 +149,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("frames", nargs="+")
     parser.add_argument("--gain", type=float, default=1.0, help="electrons per ADU")
-    parser.add_argument("--dark", type=float, help="ADU; default: 1st percentile of the mean frame")
+    parser.add_argument("--dark", type=float, help="ADU; default: the light between the spots")
     parser.add_argument("--bin", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=3, help="thinned copies of each frame")
     arguments = parser.parse_args()
     with open_frames(arguments.frames) as source:
         raw = source.block(0, source.n_frames).astype(np.float64)
-    dark = np.percentile(raw.mean(axis=0), 1) if arguments.dark is None else arguments.dark
-    rng = np.random.default_rng(2015)
+    dark = _light_between(raw, arguments) if arguments.dark is None else arguments.dark
     electrons = np.maximum((raw - dark) * arguments.gain, 0)
-    bench = Bench(electrons, arguments.bin, arguments.repeats, rng)
+    bench = Bench(electrons, arguments.bin, arguments.repeats, np.random.default_rng(2015))
+    rng = np.random.default_rng(1503)
     train = bench.images(0)
     lenslet = np.tile(np.arange(bench.n), len(train) // bench.n)
     bright = learnt_from(train, BRIGHT_READ_NOISE_E, lenslet)
     one = learnt_from(train, BRIGHT_READ_NOISE_E)
     light = bench.flux - one[1][0] * np.prod(bench.window)
+    print(f"dark level {dark:.1f} ADU")
     print(f"{bench.n} lenslets of {bench.window}, {bench.flux:.0f} e- each, {light:.0f} e- above background")
-    print("   e- read brightest  analytic 200 spots all spots    bright     bound  | efficiency of each")
+    names = "brightest", "analytic", "200 spots", "all spots", "bright", "prior", "bound"
+    heading = "".join(f"{name:>10}" for name in names)
+    print(f"   e- read{heading}  | {'efficiencies':29} | actual / stated")
     for flux, read_noise in CASES:
         print(compare(bench, flux, read_noise, bright, one, rng), flush=True)
 

@@ -116,6 +116,7 @@ def random_settings(rng: np.random.Generator, estimator: str, n: int, window: tu
         threshold_e=rng.uniform(0.0, 20.0, n),
         smoothing_px=rng.uniform(0.3, 1.5, n),
         spot_fwhm_px=rng.choice([1.8, 2.5], n),
+        spot_fwhm_y_px=rng.choice([1.8, 3.0], n),
         weight_fwhm_px=rng.uniform(2.0, 5.0, n),
         steps=int(rng.integers(1, 6)),
         model_error=rng.choice([0.0, 0.3], n),

@@ -76,7 +76,8 @@ def tasks(case: Case) -> list[Task]:
                 prior=(0.0, 0.0) if case.prior is None else tuple(case.prior[s]),
                 prior_std=case.each("prior_std_px")[s],
                 weight_fwhm=case.each("weight_fwhm_px")[s],
-                spot_fwhm=case.each("spot_fwhm_px")[s],
+                spot_fwhm=math.sqrt(case.each("spot_fwhm_px")[s] * case.each("spot_fwhm_y_px")[s]),
+                axis_ratio=case.each("spot_fwhm_y_px")[s] / case.each("spot_fwhm_px")[s],
                 phases=PHASES,
             )
         )
@@ -110,16 +111,20 @@ def start_reach(fwhm: float, window: tuple[int, int]) -> int:
 
 
 @cache
-def gaussian_spot(fwhm: float) -> Spot:
-    return spots_of(PSF.analytic("gaussian", size=fwhm / 2, radius_px=10))[0]
+def gaussian_spot(fwhm_x: float, fwhm_y: float) -> Spot:
+    low, high = sorted([fwhm_x, fwhm_y])
+    angle = 0.0 if fwhm_x >= fwhm_y else 90.0
+    shape = {"size": low / 2, "elongation": high / low, "angle_deg": angle}
+    return spots_of(PSF.analytic("gaussian", radius_px=10, **shape))[0]
 
 
 def begin(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     """The start is found with the PSF itself, not with tables."""
     if case.psf is None:
-        spot = gaussian_spot(task.spot_fwhm)
-        fwhm = (task.spot_fwhm, task.spot_fwhm)
-        reach = start_reach(case.each("spot_fwhm_px").max(), (g.shape[0], g.shape[1]))
+        fwhm = (case.each("spot_fwhm_px")[s], case.each("spot_fwhm_y_px")[s])
+        spot = gaussian_spot(*fwhm)
+        widest = max(case.each(name).max() for name in ("spot_fwhm_px", "spot_fwhm_y_px"))
+        reach = start_reach(widest, (g.shape[0], g.shape[1]))
         return oracle.start(g, replace(task, spot=spot, fwhm=fwhm, reach=reach))
     spot = exact_spots(case.psf)[case.psf.index_of(len(case.images))[s]]
     image = np.rint(g) if task.whole_electrons else g

@@ -49,6 +49,8 @@ class Task:
     """Of the table of the weight."""
     weight_fwhm: float = 2.0
     spot_fwhm: float = 2.0
+    axis_ratio: float = 1.0
+    """Width along y over that along x, of spot and weight."""
 
     rounding: np.random.Generator | None = None
     """Where given, sums of the posterior are off by a unit of float32 rounding of what is summed."""
@@ -266,14 +268,15 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
     begin = start(g, task) if begin is None else begin
     limits, margin = task.limits(g.shape), begin.margin
     x, y = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1])
-    gain = 1.0 + (task.spot_fwhm / task.weight_fwhm) ** 2
-    std = task.weight_fwhm / FWHM_PER_STD
+    gain = 1.0 + (task.spot_fwhm / task.weight_fwhm) ** 2  # both as geometric means of the axes
+    std_x = task.weight_fwhm / FWHM_PER_STD / math.sqrt(task.axis_ratio)
+    std_y = task.weight_fwhm / FWHM_PER_STD * math.sqrt(task.axis_ratio)
     u, v = pixel_centres(g.shape[1])[None, :], pixel_centres(g.shape[0])[:, None]
     floor = LEAST_FRACTION * begin.flux
     w, total = np.ones_like(g), floor
     for _ in range(STEPS["weighted"] if task.steps is None else task.steps):
         margin = min(margin, *phase_margins(x, y, g.shape, task.phases))
-        w = np.outer(window(g.shape[0], y, std, task.phases), window(g.shape[1], x, std, task.phases))
+        w = np.outer(window(g.shape[0], y, std_y, task.phases), window(g.shape[1], x, std_x, task.phases))
         total = max(float(np.sum(w * g)), floor)
         move_x, move_y = (gain * np.sum(w * g * away) / total for away in (u - x, v - y))
         x = clamp(x + clamp(move_x, -1.0, 1.0), *limits[0])

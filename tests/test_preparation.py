@@ -162,7 +162,8 @@ class TestTables:
         psf = fs.PSF.analytic("gaussian", size=2.0)
         spot = float(psf.fwhm_px[0, 0])
         weight = np.array([3.0, 5.0])
-        known = spot_tables.model_of_weights(weight, np.full(2, spot), psf, (16, 16), 16)
+        both = np.repeat(weight[:, None], 2, axis=1)
+        known = spot_tables.model_of_weights(both, np.full((2, 2), spot), psf, (16, 16), 16)
         assert np.allclose(known.gain[:, 0], 1.0 + (spot / weight) ** 2, rtol=0.01)
 
     def test_least_light_grows_with_noise_and_range(self) -> None:

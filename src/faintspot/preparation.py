@@ -156,12 +156,13 @@ class Preparation:
         """Profiles of the spots or weights; one that is not used where none is needed."""
         window, width = self._layout.window, self._width
         if self.estimator == "weighted":
-            spot, weight = self.spot_fwhm_px.mean(axis=1), self._each("weight_fwhm_px")
-            weight = np.where(np.isnan(weight), spot, weight)
+            spot = self.spot_fwhm_px
+            factor = self._each("weight_fwhm_px") / np.sqrt(spot.prod(axis=1))
+            weight = spot * np.where(np.isnan(factor), 1.0, factor)[:, None]
             return spot_tables.model_of_weights(weight, spot, self._psf, window, width)
         if self._psf is not None and self.estimator in METHODS:
             return spot_tables.model_of_psf(self._psf, self._n, window, width)
-        spot = np.full(self._n, 2.0)
+        spot = np.full((self._n, 2), 2.0)
         return spot_tables.model_of_weights(spot, spot, None, window, width)
 
     @cached_property
@@ -227,7 +228,8 @@ class Preparation:
     @cached_property
     def spot_fwhm_px(self) -> NDArray[np.float64]:
         """Full width at half maximum of every spot along x and y, (n, 2); NaN where unknown."""
-        given = np.repeat(self._each("spot_fwhm_px")[:, None], 2, axis=1).astype(np.float64)
+        along, across = (self._each(name).astype(np.float64) for name in ("spot_fwhm_px", "spot_fwhm_y_px"))
+        given = np.column_stack([along, np.where(np.isnan(across), along, across)])
         if self._psf is None:
             return given
         learnt = self._psf.fwhm_px[self._psf.index_of(self._n)]
@@ -385,8 +387,8 @@ class Preparation:
         if self.estimator == "trained":
             return np.zeros(self._n)
         if self._psf is None:
-            sizes, index = np.unique(self.spot_fwhm_px[:, 0] / 2.0, return_inverse=True)
-            spots = PSF.analytic("gaussian", size=sizes, radius_px=10.0, index=np.arange(len(sizes)))
+            widths, index = np.unique(self.spot_fwhm_px, axis=0, return_inverse=True)
+            spots, index = spot_tables.gaussian_psf(widths), index.reshape(-1)
         else:
             spots, index = self._psf, self._psf.index_of(self._n)
         table: NDArray[np.float64] = np.column_stack([index, search_range_px])

@@ -68,29 +68,39 @@ def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int) -> SpotM
 def model_of_weights(
     weight_fwhm_px: Floats, spot_fwhm_px: Floats, psf: PSF | None, window: tuple[int, int], width: int
 ) -> SpotModel:
-    """Prepare the Gaussian weights of every sub-aperture; the spots are Gaussian unless the PSF is known."""
+    """Prepare the Gaussian weights of every sub-aperture, widths (n, 2) along x and y.
+
+    The spots are Gaussian unless the PSF is known.
+    """
     n = len(weight_fwhm_px)
     planes = np.zeros(n, np.int64) if psf is None else psf.index_of(n)
     kinds, index = np.unique(
         np.column_stack([weight_fwhm_px, spot_fwhm_px, planes]), axis=0, return_inverse=True
     )
-    std = kinds[:, 0] * FWHM_TO_STD
-    table = _gaussian_tables(std, window, width)
-    fwhm = np.repeat(kinds[:, 1:2], 2, axis=1)
+    weights, fwhm, planes = kinds[:, :2], kinds[:, 2:4], kinds[:, 4].astype(np.int64)
+    std = weights * FWHM_TO_STD
+    tables = [_gaussian_tables(std[:, axis], window, width) for axis in range(2)]
     taps = gaussian_taps(START_SMOOTHING * fwhm, window)
-    if psf is None:
-        gain = 1.0 + (kinds[:, 1] / kinds[:, 0]) ** 2
-        gains = np.stack([gain, gain], axis=1)
-        spots = [PSF.analytic("gaussian", size=size / 2.0, radius_px=10.0) for size in kinds[:, 1]]
-        light = np.array([_start_light(spot, taps[i : i + 1])[0] for i, spot in enumerate(spots)])
+    spots = psf
+    if spots is None:
+        spots, planes, gains = gaussian_psf(fwhm), np.arange(len(fwhm)), 1.0 + (fwhm / weights) ** 2
     else:
-        gains = np.stack(
-            [_weighted_gain(psf, int(kind[2]), width_px) for kind, width_px in zip(kinds, std, strict=True)]
-        )
-        light = np.array(
-            [_start_light(psf, taps[i : i + 1], int(kind[2]))[0] for i, kind in enumerate(kinds)]
-        )
-    return SpotModel(np.stack([table, table], axis=1), index.reshape(-1), fwhm, taps, light, gains)
+        gains = np.stack([_weighted_gain(spots, int(i), own) for i, own in zip(planes, std, strict=True)])
+    light = np.array([_start_light(spots, taps[i : i + 1], int(k))[0] for i, k in enumerate(planes)])
+    return SpotModel(np.stack(tables, axis=1), index.reshape(-1), fwhm, taps, light, gains)
+
+
+def gaussian_psf(fwhm_px: Floats) -> PSF:
+    """Return Gaussian spots of widths (n, 2) along x and y."""
+    longer, shorter = fwhm_px.max(axis=1), fwhm_px.min(axis=1)
+    return PSF.analytic(
+        "gaussian",
+        size=shorter / 2.0,
+        elongation=longer / shorter,
+        angle_deg=np.where(fwhm_px[:, 0] < fwhm_px[:, 1], 90.0, 0.0),
+        radius_px=10.0,
+        index=np.arange(len(fwhm_px)),
+    )
 
 
 def gaussian_taps(std_px: Floats, window: tuple[int, int]) -> NDArray[np.float32]:
@@ -146,18 +156,18 @@ def _start_light(psf: PSF, taps: NDArray[np.float32], plane: int | None = None) 
     return np.maximum(light, 1e-6)
 
 
-def _weighted_gain(psf: PSF, plane: int, std_px: float) -> Floats:
+def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:
     """Inverse of what the weighted centre of gravity sees of a small displacement, along x and y."""
-    side = 2 * math.ceil(4.0 * std_px) + 5
+    side = 2 * math.ceil(4.0 * float(std_px.max())) + 5
     u = np.arange(side) - (side - 1) / 2
     step, seen = 0.05, np.zeros(2)
     phases = (0.0, 0.25, 0.5, 0.75)
     for phase in phases:
-        weight = np.exp(-0.5 * ((u - phase) / std_px) ** 2)
+        along, across = (np.exp(-0.5 * ((u - phase) / own) ** 2) for own in std_px)
         for axis in range(2):
             moved = np.full((2, 2), phase)
             moved[:, axis] += [-step, step]
-            images = psf.images(moved, (side, side), which=plane) * weight * weight[:, None]
+            images = psf.images(moved, (side, side), which=plane) * along * across[:, None]
             profile = images.sum(axis=1 if axis == 0 else 2)
             centre = profile @ (u - phase) / profile.sum(axis=1)
             seen[axis] += (centre[1] - centre[0]) / (2 * step) / len(phases)

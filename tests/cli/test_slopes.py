@@ -161,26 +161,24 @@ def test_all_slopes_bad_is_a_hundred_per_cent(folder: Path, run: Commands) -> No
 
 
 def test_memory_is_bounded(folder: Path) -> None:
-    """A sparse cube of 1.7 GB within 1.1 GB, of which compiling the kernels may take 700 MB."""
-    shape = (200, 2048, 2048)
-    with (folder / "large.npy").open("wb") as stream:
-        header = {"descr": "<u2", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(stream, header)
-        stream.truncate(stream.tell() + 2 * 200 * 2048 * 2048)
-    text = (
-        (folder / "faintspot.toml").read_text().replace("pixels = 8", "pixels = 8\nframe_shape=[2048,2048]")
-    )
-    (folder / "faintspot.toml").write_text(text)
-    limit_bytes = 1_100_000_000
+    """A sparse cube of 1.07 GB within 700 MB, once the kernels are compiled."""
+    text = (folder / "faintspot.toml").read_text()
+    (folder / "faintspot.toml").write_text(text.replace("pixels = 8", "pixels = 8\nframe_shape=[2048,2048]"))
     code = (
         "import resource, sys; from faintspot.cli import main; main(sys.argv[1:]);"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
-    answer = subprocess.run(
-        [sys.executable, "-c", code, "slopes", "large.npy", "-o", "s.npz"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert 1024 * int(answer.stdout.splitlines()[-1]) < limit_bytes
-    assert "200 frames" in answer.stdout
+    for n_frames in (1, 128):  # the first run compiles, which takes memory of its own
+        shape = (n_frames, 2048, 2048)
+        with (folder / f"{n_frames}.npy").open("wb") as stream:
+            header = {"descr": "<u2", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.truncate(stream.tell() + 2 * n_frames * 2048 * 2048)
+        answer = subprocess.run(
+            [sys.executable, "-c", code, "slopes", f"{n_frames}.npy", "-o", f"{n_frames}.npz"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    assert 1024 * int(answer.stdout.splitlines()[-1]) < 700_000_000
+    assert "128 frames" in answer.stdout

@@ -35,6 +35,7 @@ PER_SUBAPERTURE = (
     "threshold_e",
     "smoothing_px",
     "spot_fwhm_px",
+    "spot_fwhm_y_px",
     "weight_fwhm_px",
     "model_error",
     "weight_floor",
@@ -49,6 +50,7 @@ _OPTIONAL = (
     "threshold_e",
     "smoothing_px",
     "spot_fwhm_px",
+    "spot_fwhm_y_px",
     "weight_fwhm_px",
     "search_range_px",
     "flux_e",
@@ -67,6 +69,7 @@ _BOUNDS = {
     "threshold_e": (0.0, 1e12, False),
     "smoothing_px": (0.0, 16.0, True),
     "spot_fwhm_px": (0.1, 64.0, False),
+    "spot_fwhm_y_px": (0.1, 64.0, False),
     "weight_fwhm_px": (0.1, 64.0, False),
     "model_error": (0.0, 10.0, False),
     "weight_floor": (0.0, 1.0, False),
@@ -128,10 +131,12 @@ class Settings:
         What "thresholded" takes off every pixel; what is negative then becomes 0.
     smoothing_px : float or array
         Standard deviation of the Gaussian of "smoothed". Default 0.7.
-    spot_fwhm_px : float or array
-        Full width at half maximum of the spots. Default: that of the PSF.
+    spot_fwhm_px, spot_fwhm_y_px : float or array
+        Full width at half maximum of the spots in the frame, along x and y (default: the same). Default: that
+        of the PSF.
     weight_fwhm_px : float or array
-        Full width at half maximum of the weight of "weighted". Default: that of the spot.
+        Full width at half maximum of the weight of "weighted", geometric mean of both axes; it is elongated
+        like the spot. Default: that of the spot.
     steps : int
         Of "ml", "matched" and "map" (default 3) or of "weighted" (default 8).
     model_error : float or array
@@ -170,6 +175,7 @@ class Settings:
     threshold_e: Any = None
     smoothing_px: Any = None
     spot_fwhm_px: Any = None
+    spot_fwhm_y_px: Any = None
     weight_fwhm_px: Any = None
     steps: int | None = None
     model_error: Any = 0.0

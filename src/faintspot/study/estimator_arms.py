@@ -74,8 +74,9 @@ class EstimatorArms:
             spot = {"psf": _psf(self._cell, self._search_range_px, candidate.blur_px)}
             known = {"model_error": candidate.model_error}
         elif arm == "weighted":
-            width = self._spot_fwhm_px
-            known = {"spot_fwhm_px": width, "weight_fwhm_px": candidate * width}
+            along, across = self._spot_fwhm_px
+            weight = candidate * math.sqrt(along * across)
+            known = {"spot_fwhm_px": along, "spot_fwhm_y_px": across, "weight_fwhm_px": weight}
         else:
             spot = {"score": self._score}
         settings = Settings(
@@ -85,9 +86,10 @@ class EstimatorArms:
         return estimators.measure(output, settings, calibration=self._calibration, **spot)
 
     @functools.cached_property
-    def _spot_fwhm_px(self) -> float:
-        """One width for both axes, without turbulence."""
-        return float(np.sqrt(_psf(self._cell, self._search_range_px, 0.0).fwhm_px[0].prod()))
+    def _spot_fwhm_px(self) -> tuple[float, float]:
+        """Width along x and y, without turbulence."""
+        along, across = _psf(self._cell, self._search_range_px, 0.0).fwhm_px[0].tolist()
+        return along, across
 
     @functools.cached_property
     def _score(self) -> TrainedScore:
