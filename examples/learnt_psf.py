@@ -2,11 +2,12 @@
 
 Takes bright frames of a static field and thins their electrons as `thinned_spots.py` does, every frame moved
 by up to 2 unbinned pixels before binning. From half of the frames, at that low light, a PSF is learnt; the
-other half is measured: by brightest pixels, by maximum likelihood with an analytic PSF, with the learnt one
-(from 200 spots, and from all) and with one for each lenslet learnt at full light, and with the learnt PSF
-and a prior on the position. The truth is each estimator's own position in the mean frame. Printed are the
-slope error R and the photon efficiency against the Cramer-Rao bound with the PSF from bright frames, and for
-the last three the actual over the stated standard error.
+other half is measured: by brightest pixels (with the best number of them); with the learnt PSF's width, and
+settings found by themselves, by TV, smoothing and weighting; by maximum likelihood with an analytic PSF,
+with the learnt one (from 200 spots, and from all) and with one for each lenslet learnt at full light; and
+with the learnt PSF and a prior on the position. The truth is each estimator's own position in the mean
+frame. Printed are the slope error R, the photon efficiency against the Cramer-Rao bound with the PSF from
+bright frames, and for the last three the actual over the stated standard error.
 
     python examples/learnt_psf.py bench.npz --gain 2.1
 """
@@ -118,6 +119,9 @@ def compare(
     errors = [
         min(error(fs.Settings(denoise=False, keep_brightest=k, search_range_px=SEARCH_PX)) for k in KEPT)
     ]
+    for name in ("cog", "smoothed", "weighted"):  # with the learnt PSF's width, settings found by themselves
+        automatic = {"noise_std": "auto", "keep_brightest": "auto", "flux_e": flux}
+        errors.append(error(ml.replace(estimator=name, **automatic), learnt[1]))
     errors += [error(ml, arm) for arm in (analytic, *learnt, (bright[0], bright[1] * share))]
     errors += [error(ml.replace(estimator="map", prior_std_px=PRIOR_PX, flux_e=flux), learnt[1])]
     background = float(one[1][0])
@@ -131,7 +135,7 @@ def compare(
     bound = np.sqrt(2 / np.pi) * float(np.mean(fs.cramer_rao(light, **conditions)))
     efficiency = fs.photon_efficiency(np.array(errors), light, **conditions)
     numbers = "".join(f"{value:10.4f}" for value in (*errors, bound))
-    shown = " ".join(f"{e:.2f}" for e in efficiency), " ".join(f"{r:.2f}" for r in ratios[2:])
+    shown = " ".join(f"{e:.2f}" for e in efficiency), " ".join(f"{r:.2f}" for r in ratios[-3:])
     return f"{flux:5.0f} {read_noise:4.1f}{numbers}  | {shown[0]} | {shown[1]}"
 
 
@@ -166,9 +170,20 @@ def main() -> None:
     light = bench.flux - one[1][0] * np.prod(bench.window)
     print(f"dark level {dark:.1f} ADU")
     print(f"{bench.n} lenslets of {bench.window}, {bench.flux:.0f} e- each, {light:.0f} e- above background")
-    names = "brightest", "analytic", "200 spots", "all spots", "bright", "prior", "bound"
+    names = (
+        "brightest",
+        "TV",
+        "smoothed",
+        "weighted",
+        "analytic",
+        "200 spots",
+        "all spots",
+        "bright",
+        "prior",
+        "bound",
+    )
     heading = "".join(f"{name:>10}" for name in names)
-    print(f"   e- read{heading}  | {'efficiencies':29} | actual / stated")
+    print(f"   e- read{heading}  | {'efficiencies':44} | actual / stated")
     for flux, read_noise in CASES:
         print(compare(bench, flux, read_noise, bright, one, rng), flush=True)
 

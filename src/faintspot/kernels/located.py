@@ -128,7 +128,7 @@ def locate_groups(
             _expect_light(width, first, settings, numbers)
         if method == TRAINED:
             apply_score(lanes, image, ny, nx, score[0], kinds, score[1], score[2], numbers, starts, rows)
-            _sum_light(lanes, image, smoothed, ny, nx, first, settings, numbers)
+            _sum_light(lanes, image, ny, nx, first, settings, numbers)
         elif method == WEIGHTED:
             weigh_group(lanes, image, ny, nx, model, models, steps, numbers, starts, profiles)
         else:
@@ -202,21 +202,16 @@ def _expect_light(width: Any, first: Any, settings: Any, numbers: Any) -> None:
 
 
 @compiled
-def _sum_light(
-    lanes: Any, image: Any, sums: Any, ny: Any, nx: Any, first: Any, settings: Any, numbers: Any
-) -> None:
+def _sum_light(lanes: Any, image: Any, ny: Any, nx: Any, first: Any, settings: Any, numbers: Any) -> None:
     """Standard errors from the training, and the light that is seen in the whole window."""
     width = width_of(lanes)
-    # By columns: then an addition need not wait for the last one.
     zero = splat(lanes, 0.0)
-    for x in range(nx):
-        store(sums, x * width, zero)
-    for y in range(ny):
-        for x in range(nx):
-            store(sums, x * width, load(lanes, sums, x * width) + load(lanes, image, (y * nx + x) * width))
     total = zero
-    for x in range(nx):
-        total = total + load(lanes, sums, x * width)
+    for y in range(ny):
+        row = zero  # a sum for each row: they need not wait for each other
+        for x in range(nx):
+            row = row + load(lanes, image, (y * nx + x) * width)
+        total = total + row
     store(numbers, spot_numbers.SEEN * width, total)
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)

@@ -35,17 +35,17 @@ class Arm:
 
 
 ARMS = (
-    Arm("plain", "brightest pixels", "cog", 0.28, NOTHING),
-    Arm("thresholded", "thresholded", "thresholded", 0.28, NOTHING),
-    Arm("smoothed", "Gaussian smoothing", "smoothed", 0.28, NOTHING),
-    Arm("tv", "TV denoising", "cog", 0.28, NOTHING),
-    Arm("weighted", "weighted", "weighted", 0.31, WIDTH),
-    Arm("matched", "matched filter", "matched", 0.33, SPOT),
-    Arm("ml", "maximum likelihood", "ml", 0.33, SPOT),
-    Arm("map", "max. a posteriori", "map", 0.65, SPOT),
-    Arm("trained", "trained score", "trained", 0.29, SPOT),
+    Arm("plain", "brightest pixels", "cog", 0.21, NOTHING),
+    Arm("thresholded", "thresholded", "thresholded", 0.15, NOTHING),
+    Arm("smoothed", "Gaussian smoothing", "smoothed", 0.22, NOTHING),
+    Arm("tv", "TV denoising", "cog", 0.21, NOTHING),
+    Arm("weighted", "weighted", "weighted", 0.23, WIDTH),
+    Arm("matched", "matched filter", "matched", 0.26, SPOT),
+    Arm("ml", "maximum likelihood", "ml", 0.27, SPOT),
+    Arm("map", "max. a posteriori", "map", 0.6, SPOT),
+    Arm("trained", "trained score", "trained", 0.15, SPOT),
 )
-COST_OF_TV_ITERATION = 0.72 / 20
+COST_OF_TV_ITERATION = 0.79 / 20
 
 _KEPT = (1.0, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0, 4.5)  # times the automatic number
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # times the automatic strength
