@@ -160,10 +160,11 @@ def test_all_slopes_bad_is_a_hundred_per_cent(folder: Path, run: Commands) -> No
     assert "  32 slopes without light (100 %)" in run.ok("slopes", "a.npy").out.splitlines()
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 def test_memory_is_bounded(folder: Path) -> None:
-    """A sparse cube of 1.07 GB within 700 MB.
+    """A sparse cube of 1.07 GB within 700 MB, once the kernels are compiled: the second run counts.
 
-    A run that has to compile kernels takes memory of its own: the least of three runs counts.
+    The high-water mark is that of /proc; what getrusage gives is not below that of the process that forked.
     """
     text = (folder / "faintspot.toml").read_text()
     (folder / "faintspot.toml").write_text(text.replace("pixels = 8", "pixels = 8\nframe_shape=[2048,2048]"))
@@ -172,13 +173,12 @@ def test_memory_is_bounded(folder: Path) -> None:
         np.lib.format.write_array_header_1_0(stream, header)
         stream.truncate(stream.tell() + 2 * 128 * 2048 * 2048)
     code = (
-        "import resource, sys; from faintspot.cli import main; main(sys.argv[1:]);"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+        "import sys; from faintspot.cli import main; main(sys.argv[1:]);"
+        "print(next(line for line in open('/proc/self/status') if line.startswith('VmHWM')))"
     )
-    used = []
-    for run in range(3):
+    for run in range(2):
         command = [sys.executable, "-c", code, "slopes", "large.npy", "-o", f"{run}.npz"]
         answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         assert "128 frames" in answer
-        used.append(1024 * int(answer.splitlines()[-1]))
-    assert min(used) < 700_000_000
+    largest_kb = int(answer.split("VmHWM:")[1].split()[0])
+    assert 1024 * largest_kb < 700_000_000
