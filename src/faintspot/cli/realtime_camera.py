@@ -1,0 +1,119 @@
+"""faintspot realtime camera: a simulated camera."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+import numpy as np
+
+from faintspot.realtime.camera import Camera, SpotMotion, readout_type
+from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.sensor.layout import Layout
+from faintspot.simulate import Detector
+
+
+@click.command("camera", short_help="Simulate a camera that publishes frames row by row.")
+@click.option(
+    "--config",
+    "-c",
+    metavar="TOML",
+    default="faintspot.toml",
+    show_default=True,
+    help="Configuration; its layout says where the spots are.",
+)
+@click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring, in shared memory.")
+@click.option("--rate", type=float, metavar="HZ", default=500.0, show_default=True, help="Frames a second.")
+@click.option("--flux-e", type=float, default=200.0, show_default=True, help="Per sub-aperture and frame.")
+@click.option(
+    "--profile",
+    type=click.Choice(["diffraction", "gaussian"]),
+    default="diffraction",
+    show_default=True,
+    help="Of the spots.",
+)
+@click.option(
+    "--size", type=float, default=1.0, show_default=True, help="Of the spots; 1 is Nyquist sampling."
+)
+@click.option("--motion-px", type=float, default=0.3, show_default=True, help="Standard deviation per axis.")
+@click.option("--motion-time", type=float, metavar="S", default=0.01, show_default=True, help="Correlation.")
+@click.option("--read-noise-e", type=float, default=1.0, show_default=True, help="At the output.")
+@click.option("--background-e", type=float, default=0.0, show_default=True, help="Per pixel and frame.")
+@click.option("--dark-e", type=float, default=0.0, show_default=True, help="Per pixel and frame.")
+@click.option("--em-gain", type=float, default=1.0, show_default=True, help="1: no multiplication.")
+@click.option(
+    "--gain", type=float, metavar="E/ADU", default=1.0, show_default=True, help="Electrons per ADU."
+)
+@click.option("--offset-adu", type=float, default=0.0, show_default=True, help="Level of every pixel.")
+@click.option("--bits", type=int, help="Of the converter: whole ADU. Default: continuous values.")
+@click.option(
+    "--readout-fraction", type=float, default=0.8, show_default=True, help="Part of the frame time."
+)
+@click.option("--rows-per-block", type=int, default=4, show_default=True, help="Rows published together.")
+@click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
+@click.option("--distinct", type=int, default=200, show_default=True, help="Frames simulated, then repeated.")
+@click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
+@click.option("--seed", type=click.IntRange(0), help="Of the simulation. Default: another each time.")
+def camera(config: str, name: str, rate: float, frames: int | None, slots: int, **options: Any) -> None:
+    """Simulate a camera that publishes frames row by row, for `faintspot realtime run`.
+
+    Spots move about the centres of the sub-apertures; rows become readable one block after the other at the
+    pace of a real read-out. Ctrl-C stops it and removes its shared memory.
+
+    \b
+    Example:
+      faintspot realtime camera --config faintspot.toml --rate 1000 --flux-e 50 --read-noise-e 0.5
+    """
+    layout = Layout.load(config)
+    detector = Detector(
+        options["read_noise_e"],
+        dark_e=options["dark_e"],
+        background_e=options["background_e"],
+        em_gain=options["em_gain"],
+        gain_e_per_adu=options["gain"],
+        offset_adu=options["offset_adu"],
+        bits=options["bits"],
+    )
+    dtype = readout_type(detector)
+    with PixelRing.create(name, layout.frame_shape, dtype, slots=slots) as ring:
+        source = Camera(
+            layout,
+            ring,
+            frame_rate_hz=rate,
+            flux_e=options["flux_e"],
+            detector=detector,
+            profile=options["profile"],
+            size=options["size"],
+            motion=SpotMotion(options["motion_px"], options["motion_time"]),
+            readout_fraction=options["readout_fraction"],
+            rows_per_block=options["rows_per_block"],
+            n_distinct=options["distinct"],
+            rng=np.random.default_rng(options["seed"]),
+        )
+        rows, columns = layout.frame_shape
+        click.echo(
+            f"{name}: {rows} x {columns} pixels ({dtype}), {len(layout)} sub-apertures, {rate:g} frames/s; "
+            "Ctrl-C stops"
+        )
+        with stop_on_signal() as stop:
+            report = source.run(frames, stop)
+    click.echo(
+        f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.overruns} overruns"
+    )
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Give an event that Ctrl-C, or a request to end, sets: the frame under way is completed."""
+    stop = threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

@@ -1,0 +1,313 @@
+"""Pixels from a camera to the engine, row by row, through a ring of frames in shared memory.
+
+One process writes, any number of processes of the same user read. The writer never waits for a reader;
+a reader asks afterwards (`PixelRing.intact`) whether what it used was overwritten meanwhile.
+
+Memory, in bytes from the segment's start::
+
+    0      header, written once, with a checksum: magic, version, creator, generation, shape, type, slots
+    256    cells, 128 bytes apart, so that no two share a cache line or the pair that is fetched with it:
+           frame that is arriving, rows of it that are complete, closed, arrivals (frames begun so far),
+           then one cell a slot: frame number (-1 while it changes hands), arrival, time of its last row
+    then   the slots, each of (rows, columns) pixels; frame n lies in slot n % slots
+
+Nothing is locked. The writer stores pixels first and progress afterwards, each cell as one aligned store of
+8 bytes; the reader loads progress first. On x86-64 other processors see stores, and make loads, in program
+order, which makes this right without a barrier. Other processors reorder both, so that they are refused.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import time
+from contextlib import suppress
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from faintspot.errors import InputError
+from faintspot.realtime.pixel_segment import (
+    ARRIVALS,
+    CLOSED,
+    FIRST_SLOT,
+    FOLDER,
+    FRAME,
+    ROWS,
+    SLOT_ARRIVAL,
+    SLOT_FRAME,
+    SLOT_TIME,
+    Header,
+    cells_of,
+    create_segment,
+    identity_of,
+    new_header,
+    open_segment,
+    segment_path,
+)
+from faintspot.realtime.processes import process_lives
+
+__all__ = [
+    "ARRIVALS",
+    "CLOSED",
+    "FIRST_SLOT",
+    "FRAME",
+    "ROWS",
+    "SLOT_ARRIVAL",
+    "SLOT_FRAME",
+    "SLOT_TIME",
+    "PixelRing",
+]
+
+_SPIN_S, _NAP_S = 200e-6, 50e-6
+
+
+class PixelRing:
+    """A ring of frames in shared memory, made by `create` (the writer) or `attach` (a reader).
+
+    Readable and writable by the same user only. As a context manager it closes itself.
+
+    Attributes
+    ----------
+    name : str
+    shape : (int, int)
+        Rows and columns of a frame.
+    dtype : numpy.dtype
+    slots : int
+        Frames in the ring.
+    generation : int
+        Another number each time the ring is created.
+    creator_pid : int
+        Process that created it.
+    cells : ndarray, int64, shape (4 + slots, 16)
+        The progress itself, for compiled readers: see `FRAME`, `SLOT_FRAME` and their
+        neighbours.
+    pixels : ndarray, shape (slots, rows, columns)
+        All slots, read-only for a reader.
+    """
+
+    def __init__(self, name: str, memory: mmap.mmap, header: Header, identity: tuple[int, int]) -> None:
+        """For `create` and `attach` only."""
+        self.name, self.slots = name, header.slots
+        self.shape, self.dtype = (header.rows, header.columns), np.dtype(header.dtype)
+        self.generation, self.creator_pid = header.generation, header.pid
+        self._creator_start, self._identity = header.start, identity
+        self.cells = cells_of(memory, header)
+        itemsize = self.dtype.itemsize
+        self.pixels: NDArray[Any] = np.ndarray(
+            (header.slots, *self.shape),
+            self.dtype,
+            memory,
+            offset=header.first_pixel,
+            strides=(header.slot_bytes, header.columns * itemsize, itemsize),
+        )
+        self._writes = self.cells.flags.writeable
+        self._open = True
+
+    @classmethod
+    def create(cls, name: str, shape: tuple[int, int], dtype: DTypeLike, *, slots: int = 4) -> PixelRing:
+        """Make a ring to write into.
+
+        A ring of that name whose creator has died is replaced.
+
+        Parameters
+        ----------
+        name : str
+            Letters, digits, "_", "-" and "."; the segment is /dev/shm/name.
+        shape : (int, int)
+            Rows and columns of a frame.
+        dtype : dtype
+            Integers of up to 32 bits or floating point, native byte order.
+        slots : int
+            Frames in the ring, 2 to 1024: a frame can be read until slots - 1 more have begun.
+
+        Raises
+        ------
+        InputError
+            When a living process owns the name, or something that is not a pixel ring has it, when shared
+            memory is short, or a value is out of range.
+        """
+        path = segment_path(name)
+        header = new_header(shape, dtype, slots)
+        memory, identity = create_segment(path, header)
+        return cls(name, memory, header, identity)
+
+    @classmethod
+    def attach(cls, name: str) -> PixelRing:
+        """Open a ring to read from.
+
+        Raises
+        ------
+        InputError
+            When there is none of that name, or it is not a whole pixel ring of this version and this user.
+        """
+        memory, header, identity = open_segment(segment_path(name))
+        return cls(name, memory, header, identity)
+
+    # ---- writer
+
+    def begin(self, frame_number: int | None = None) -> NDArray[Any]:
+        """Begin a frame and return its slot, (rows, columns), to fill from row 0 on.
+
+        `frame_number` may repeat or skip; by default it is one more than the last, from 0. A frame that
+        was begun and never ended stays incomplete.
+        """
+        if not (self._writes and self._open):
+            raise InputError(f"pixel ring {self.name}: only its open creator writes into it")
+        cells = self.cells
+        number = int(cells[FRAME, 0]) + 1 if frame_number is None else int(frame_number)
+        if number < 0:
+            raise InputError(f"frame_number = {number}: expected a number of at least 0")
+        slot = number % self.slots
+        arrival = int(cells[ARRIVALS, 0]) + 1
+        # The order is the protocol: the old frame is disowned first, and the new one named last.
+        cells[FIRST_SLOT + slot, SLOT_FRAME] = -1
+        cells[FIRST_SLOT + slot, SLOT_TIME] = 0
+        cells[FIRST_SLOT + slot, SLOT_ARRIVAL] = arrival
+        cells[ROWS, 0] = 0
+        cells[FIRST_SLOT + slot, SLOT_FRAME] = number
+        cells[FRAME, 0] = number
+        cells[ARRIVALS, 0] = arrival
+        view: NDArray[Any] = self.pixels[slot]
+        return view
+
+    def rows_ready(self, rows: int) -> None:
+        """Say that the first `rows` rows of the frame that was begun are complete."""
+        cells = self.cells
+        number = int(cells[FRAME, 0])
+        if number < 0 or not cells[ROWS, 0] <= rows <= self.shape[0]:
+            raise InputError(
+                f"rows = {rows}: expected {int(cells[ROWS, 0])} to {self.shape[0]} rows of a frame begun"
+            )
+        if rows == self.shape[0]:
+            cells[FIRST_SLOT + number % self.slots, SLOT_TIME] = time.monotonic_ns()
+        cells[ROWS, 0] = rows
+
+    def end(self) -> None:
+        """Say that the frame that was begun is complete."""
+        if self.cells[ROWS, 0] < self.shape[0]:
+            self.rows_ready(self.shape[0])
+
+    def publish(self, frame: ArrayLike, frame_number: int | None = None) -> None:
+        """Write a whole frame, for sources that do not have it by rows.
+
+        Raises
+        ------
+        InputError
+            When its shape is not the ring's; the ring is untouched then.
+        """
+        array = np.asarray(frame)
+        if array.shape != self.shape:
+            raise InputError(f"frame: expected shape {self.shape}, got {array.shape}")
+        self.begin(frame_number)[...] = array
+        self.end()
+
+    # ---- reader
+
+    @property
+    def arrivals(self) -> int:
+        """Frames begun since the ring was created: goes up when a frame number repeats, too."""
+        return int(self.cells[ARRIVALS, 0])
+
+    @property
+    def closed(self) -> bool:
+        """Whether the writer has ended in order."""
+        return bool(self.cells[CLOSED, 0])
+
+    @property
+    def stale(self) -> bool:
+        """Whether no more frames come: the creator is dead, or the name leads to another ring or to none.
+
+        It asks the operating system (tens of microseconds): not for every frame.
+        """
+        try:
+            named = identity_of(os.stat(FOLDER / self.name))
+        except OSError:
+            return True
+        return named != self._identity or not process_lives(self.creator_pid, self._creator_start)
+
+    def progress(self) -> tuple[int, int]:
+        """Return the number of the frame that is arriving, -1 before the first, and its complete rows.
+
+        For an instant between two frames it is the last number with 0 rows: whether a frame that is no longer
+        arriving is complete, `last_row_time_ns` says.
+        """
+        cells = self.cells
+        while True:
+            arrivals, frame, rows = int(cells[ARRIVALS, 0]), int(cells[FRAME, 0]), int(cells[ROWS, 0])
+            if cells[FRAME, 0] == frame and cells[ARRIVALS, 0] == arrivals:
+                return frame, rows
+
+    def slot(self, frame: int) -> NDArray[Any]:
+        """Return the slot in which that frame lies, or did: (rows, columns). Ask `intact` after its use."""
+        view: NDArray[Any] = self.pixels[frame % self.slots]
+        return view
+
+    def intact(self, frame: int, arrival: int | None = None) -> bool:
+        """Whether the slot still holds that frame, complete or arriving.
+
+        Where frame numbers may repeat, give the value that `arrival(frame)` had before the use.
+        """
+        cell = self.cells[FIRST_SLOT + frame % self.slots]
+        held = bool(cell[SLOT_FRAME] == frame)
+        return held and (arrival is None or bool(cell[SLOT_ARRIVAL] == arrival))
+
+    def arrival(self, frame: int) -> int:
+        """Return which arrival, from 1, put that frame into its slot; -1 when the slot does not hold it."""
+        cell = self.cells[FIRST_SLOT + frame % self.slots]
+        arrival = int(cell[SLOT_ARRIVAL])
+        return arrival if cell[SLOT_FRAME] == frame else -1
+
+    def last_row_time_ns(self, frame: int) -> int:
+        """Return when its last row was complete (CLOCK_MONOTONIC), 0 for incomplete or not held."""
+        cell = self.cells[FIRST_SLOT + frame % self.slots]
+        moment = int(cell[SLOT_TIME])
+        return moment if cell[SLOT_FRAME] == frame else 0
+
+    def wait(self, frame: int, rows: int, timeout_s: float) -> bool:
+        """Wait until the first `rows` rows of a frame are there; False when they do not come.
+
+        Spins for a moment, then sleeps in short naps. False before the time is up when the ring is closed or
+        a later frame is arriving and this one is not held, or was left incomplete.
+        """
+        start = time.perf_counter()
+        while True:
+            arriving, complete = self.progress()
+            if (arriving == frame and complete >= rows) or self.last_row_time_ns(frame):
+                return True
+            elapsed = time.perf_counter() - start
+            if elapsed >= timeout_s or arriving > frame or self.closed:
+                # Complete just now, between the two looks above?
+                return bool(self.last_row_time_ns(frame))
+            if elapsed > _SPIN_S:
+                time.sleep(_NAP_S)
+
+    # ---- both
+
+    def close(self) -> None:
+        """Let go of the ring; its creator also removes its name, and tells readers. Harmless when repeated.
+
+        Views that are still in use keep their memory.
+        """
+        if not self._open:
+            return
+        self._open = False
+        if self._writes and self.creator_pid == os.getpid():
+            self.cells[CLOSED, 0] = 1
+            path = FOLDER / self.name
+            with suppress(OSError):
+                if identity_of(path.stat()) == self._identity:
+                    path.unlink()
+
+    def __enter__(self) -> PixelRing:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
