@@ -10,7 +10,7 @@ import click
 
 from benchmarks import measuring
 
-NAMES = ("rivals", "estimators", "roofline", "startup", "breakdown", "study")
+NAMES = ("rivals", "estimators", "realtime", "roofline", "startup", "breakdown", "study")
 
 
 @click.command()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.checks import finite_array, number_between, real_array
 from faintspot.errors import InputError
@@ -24,7 +24,7 @@ from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.sensor.settings import Settings
 
-_RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
+RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,11 @@ class SlopePipeline:
         layout, settings, calibration, psf, score = configuration.load_all(path)
         return cls(layout, settings, calibration, psf=psf, score=score, **options)
 
+    @property
+    def needs_light(self) -> bool:
+        """Whether settings follow the light of each frame, which is looked at before it is measured."""
+        return self._preparation.needs_light
+
     def fingerprint(self) -> bytes:
         """Return bytes that differ between pipelines that could give different slopes for the same frame."""
         parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape))
@@ -193,49 +198,64 @@ class SlopePipeline:
         """Compute the slopes, and the stages where asked for."""
         frames = _kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
-        results = tuple(np.empty((n_frames, n), dtype) for dtype in _RESULT_TYPES)
+        results = tuple(np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES)
         stages = np.empty((fused.STAGE_ROWS if explain else 0, n_frames, n, self.layout.pixels), np.float32)
-        source = (frames, self.layout.corners, *self.layout.window, self._calibration)
-        saturation = self.calibration.saturation(array.dtype)
-        plan = self._preparation
-        variants = self._variants(source, saturation)
-        tables, constants, shape = plan.arguments()
-        if plan.estimator in METHODS:
-            kernel: Any = located.locate_groups
-            predicted = plan.no_prior if prior is None else _prior_slopes(prior, n_frames, n)
-            arguments: tuple[Any, ...] = (predicted, *constants)
-        else:
-            kernel, arguments = fused.slopes_of_groups, constants
+        variants = self._variants(frames, self.calibration.saturation(array.dtype))
+        kernel, before, shape = self.kernel_call(frames, array.dtype, variants, prior)
 
         def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
-            kernel(
-                self._lanes,
-                *source,
-                saturation,
-                tables,
-                variants,
-                *arguments,
-                start,
-                stop,
-                scratch,
-                results,
-                stages,
-            )
+            kernel(*before, start, stop, scratch, results, stages)
 
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, shape)
         shaped: Any = (result.reshape(*array.shape[:-2], n) for result in results)
         return Slopes(*shaped), stages
 
-    def _variants(self, source: tuple[Any, ...], saturation: float) -> NDArray[np.int64]:
+    def kernel_call(
+        self,
+        frames: NDArray[Any],
+        dtype: DTypeLike,
+        variants: NDArray[np.int64],
+        prior: ArrayLike | Slopes | None = None,
+    ) -> tuple[Any, tuple[Any, ...], tuple[int, int, int] | None]:
+        """Return the compiled function that measures frames, and its arguments before the range of groups.
+
+        For those who call it themselves, group by group; everybody else calls the pipeline.
+
+        Parameters
+        ----------
+        frames : (n, h, w) array, uint16 or float32
+        dtype : dtype
+            Of the camera's pixels, which says at what value they saturate.
+        variants : (n,) int64
+            Table of settings of each frame: 0 unless settings depend on the light.
+        prior : array or Slopes, optional
+            As when the pipeline is called.
+
+        Returns
+        -------
+        function, arguments, scratch shape (see `faintspot.kernels.parallel.run_groups`)
+        """
+        plan, n = self._preparation, len(self.layout)
+        saturation = self.calibration.saturation(np.dtype(dtype))
+        tables, constants, shape = plan.arguments()
+        source = (self._lanes, frames, self.layout.corners, *self.layout.window, self._calibration)
+        if plan.estimator in METHODS:
+            predicted = plan.no_prior if prior is None else _prior_slopes(prior, len(frames), n)
+            arguments = (*source, saturation, tables, variants, predicted, *constants)
+            return located.locate_groups, arguments, shape
+        return fused.slopes_of_groups, (*source, saturation, tables, variants, *constants), shape
+
+    def _variants(self, frames: NDArray[Any], saturation: float) -> NDArray[np.int64]:
         """Which table of settings every frame is measured with, by its light where that matters."""
-        n_frames, n = len(source[0]), len(self.layout)
+        n_frames, n = len(frames), len(self.layout)
         if not self._preparation.needs_light:
             return np.zeros(n_frames, np.int64)
         light = np.empty((n_frames, n), np.float32)
+        source = (self._lanes, frames, self.layout.corners, *self.layout.window, self._calibration)
 
         def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
-            fused.light_of_groups(self._lanes, *source, saturation, start, stop, scratch, light)
+            fused.light_of_groups(*source, saturation, start, stop, scratch, light)
 
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)

@@ -1,0 +1,134 @@
+"""Slopes of a frame while it arrives: every group of sub-apertures as soon as its last row is there.
+
+The camera's process writes rows into shared memory and then says how many are there. Waiting for them happens
+inside the compiled code, without Python: nothing lies between the arrival of a row and the work on it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import llvmlite.binding as llvm
+from llvmlite import ir
+from numba.core import types
+
+from faintspot.kernels.compiling import compiled
+from faintspot.kernels.fused import slopes_of_groups
+from faintspot.kernels.located import locate_groups
+from faintspot.kernels.simd import intrinsic
+
+LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
+
+
+@intrinsic
+def look_at(typing_context: Any, cells: Any, offset: Any) -> Any:
+    """One whole number that another process writes; what that process wrote before it is seen after it."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[1], sig.args[1], types.intp)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        return builder.load_atomic(builder.gep(data, [place]), "acquire", 8)
+
+    return types.int64(cells, offset), emit
+
+
+@intrinsic
+def breathe(typing_context: Any) -> Any:
+    """Leave the processor's other thread some room while waiting, where it has an instruction for that."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if "x86" in llvm.get_process_triple():
+            kind = ir.FunctionType(ir.VoidType(), [])
+            builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", fnty=kind), [])
+        return context.get_dummy_value()
+
+    return types.void(), emit
+
+
+@compiled
+def rows_are_there(progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, rows: Any) -> Any:
+    """Whether so many rows of a frame, or a later frame, have arrived."""
+    arriving = look_at(progress, frame_cell)
+    if arriving != frame:
+        return arriving > frame
+    there = look_at(progress, rows_cell)
+    # Between the two looks the next frame may have begun, with fewer rows.
+    now = look_at(progress, frame_cell)
+    return now > frame or (now == frame and there >= rows)
+
+
+@compiled
+def wait_for_rows(
+    progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, rows: Any, control: Any, stop_cell: Any
+) -> Any:
+    """Wait until the rows are there, or `control[stop_cell]` is not 0; return whether they are there."""
+    while True:
+        for _ in range(LOOKS_BETWEEN_STOPS):
+            if rows_are_there(progress, frame_cell, rows_cell, frame, rows):
+                return True
+            breathe()
+        if look_at(control, stop_cell) != 0:
+            return False
+
+
+@compiled
+def stream_gravity(
+    progress: Any,
+    frame_cell: Any,
+    rows_cell: Any,
+    frame: Any,
+    last_rows: Any,
+    control: Any,
+    stop_cell: Any,
+    start: Any,
+    stop: Any,
+    before: Any,
+    after: Any,
+) -> Any:
+    """Measure the groups [start, stop) of a frame as centres of gravity while it arrives.
+
+    Parameters
+    ----------
+    progress : int64 array
+        In shared memory: at `frame_cell` the frame that arrives, at `rows_cell` its rows so far.
+    frame : int
+        Number of the frame to measure.
+    last_rows : (n_groups,) int64
+        Rows of the frame that each group needs.
+    control : int64 array
+        Waiting ends when the number at `stop_cell` is not 0.
+    before, after : tuple
+        Arguments of `slopes_of_groups` before and after the range of groups.
+
+    Returns
+    -------
+    int
+        First group that was not measured: `stop` unless waiting was ended.
+    """
+    for item in range(start, stop):
+        if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
+            return item
+        slopes_of_groups(*before, item, item + 1, *after)
+    return stop
+
+
+@compiled
+def stream_located(
+    progress: Any,
+    frame_cell: Any,
+    rows_cell: Any,
+    frame: Any,
+    last_rows: Any,
+    control: Any,
+    stop_cell: Any,
+    start: Any,
+    stop: Any,
+    before: Any,
+    after: Any,
+) -> Any:
+    """As `stream_gravity`, with `locate_groups`."""
+    for item in range(start, stop):
+        if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
+            return item
+        locate_groups(*before, item, item + 1, *after)
+    return stop

@@ -1,0 +1,39 @@
+"""What a running engine answers on its control channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from faintspot.errors import InputError
+from faintspot.realtime.control import Handler
+from faintspot.realtime.engine import Engine
+
+_EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
+
+
+def handlers_of(engine: Engine) -> dict[str, Handler]:
+    """Return the commands: status, get, set, stop."""
+
+    def status(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return engine.status()
+
+    def get(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return {"settings": engine.live.get(fields.get("names"))}
+
+    def change(fields: dict[str, Any]) -> Mapping[str, Any]:
+        changes = fields.get("changes")
+        if not isinstance(changes, dict) or not changes:
+            raise InputError("changes: expected values by name, got none")
+        try:
+            proposed = engine.live.propose(changes, fields.get("where"))
+        except InputError:
+            engine.counters.settings_refused += 1
+            raise
+        return {"frame": engine.live.wait(proposed, _EFFECT_TIMEOUT_S)}
+
+    def stop(fields: dict[str, Any]) -> Mapping[str, Any]:
+        engine.stop()
+        return {}
+
+    return {"status": status, "get": get, "set": change, "stop": stop}

@@ -1,0 +1,310 @@
+"""Settings that change while the engine runs: checked and built beside it, taken between two frames."""
+
+from __future__ import annotations
+
+import copy
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+
+from faintspot.checks import number_between, numbers_between, one_of
+from faintspot.errors import InputError
+from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.settings import AUTO, PER_SUBAPERTURE, PerSubaperture, Settings
+
+NAMES = tuple(field.name for field in fields(Settings))
+"""The names of all settings."""
+HISTORY_LENGTH = 10_000
+_MOST_SUBAPERTURES = 1_000_000
+_POLL_S = 0.001
+_WORDS = {"none": None, "true": True, "false": False}
+
+
+@dataclass(slots=True, eq=False)
+class Change:
+    """A change of settings that was accepted."""
+
+    number: int
+    """Counts from 1."""
+    changes: dict[str, Any]
+    """New values by name."""
+    where: list[int] | None
+    """Sub-apertures that it is for; None: all."""
+    frame_number: int | None = None
+    """First frame measured with it; None while it waits, and where a later change overtook it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Version:
+    """A complete pipeline and the last change that is in it."""
+
+    pipeline: SlopePipeline
+    change: Change
+
+
+class LiveSettings:
+    """The pipeline that an engine runs, and the changes that wait for the next frame.
+
+    Any thread proposes changes; the pipeline is checked and built there. The engine's thread takes the
+    newest complete one between two frames: it reads one attribute and waits for nobody. No change is lost:
+    each builds on all before it, whether they are running already or not.
+
+    Parameters
+    ----------
+    make_pipeline : function
+        Makes the complete pipeline, ready for its first frame, from settings; raises InputError for
+        settings that do not fit. Called by one thread at a time.
+    settings : Settings
+        To begin with.
+    history_length : int
+        Number of changes to remember.
+
+    Raises
+    ------
+    InputError
+        When the first settings do not fit.
+    """
+
+    def __init__(
+        self,
+        make_pipeline: Callable[[Settings], SlopePipeline],
+        settings: Settings,
+        history_length: int = HISTORY_LENGTH,
+    ) -> None:
+        self._make_pipeline = make_pipeline
+        self._lock = threading.Lock()  # among those who propose or read the history; never taken by `take`
+        first = _Version(make_pipeline(settings), Change(0, {}, None, frame_number=-1))
+        # Written by those who propose, one at a time; read by the engine.
+        self._newest = first
+        # Written by the engine alone.
+        self._running = first
+        self._record: deque[Change] = deque(
+            maxlen=int(number_between("history_length", history_length, 1, integer=True))
+        )
+
+    # The engine's thread ----------------------------------------------------------------------------
+
+    def take(self, frame_number: int) -> SlopePipeline:
+        """Return the newest complete pipeline, with which frame `frame_number` is to be measured.
+
+        To be called by one thread, between two frames. Changes that it takes are stamped with that number.
+        """
+        newest = self._newest  # read once: a later one waits for the next frame
+        if newest is not self._running:
+            newest.change.frame_number = frame_number
+            self._running = newest
+        return newest.pipeline
+
+    # Any thread -------------------------------------------------------------------------------------
+
+    @property
+    def pipeline(self) -> SlopePipeline:
+        """The pipeline that runs."""
+        return self._running.pipeline
+
+    @property
+    def settings(self) -> Settings:
+        """The settings that run."""
+        return self._running.pipeline.settings
+
+    def propose(self, changes: Mapping[str, Any], where: Sequence[int] | None = None) -> Change:
+        """Check a change as a whole and build its pipeline, for the engine to take before its next frame.
+
+        Parameters
+        ----------
+        changes : mapping
+            New values by name.
+        where : sequence of int, optional
+            Sub-apertures to change, counted from 0. Default: all.
+
+        Returns
+        -------
+        Change
+            `frame_of` and `wait` tell when it took effect.
+
+        Raises
+        ------
+        InputError
+            When something does not fit; then nothing changes at all.
+        """
+        if not isinstance(changes, Mapping) or not changes:
+            raise InputError(
+                f"settings: expected new values by name, such as {NAMES[0]}, got {changes!r:.40}"
+            )
+        checked_names(list(changes))
+        with self._lock:
+            layout = self._newest.pipeline.layout
+            places = None if where is None else _checked_places(where, len(layout))
+            settings = self._newest.pipeline.settings.replace(where=places, **changes)
+            _check_every_value(settings, len(layout), layout.pixels)
+            pipeline = self._make_pipeline(settings)
+            change = Change(self._newest.change.number + 1, copy.deepcopy(dict(changes)), places)
+            self._record.append(change)
+            self._newest = _Version(pipeline, change)
+        return change
+
+    def frame_of(self, change: Change) -> int | None:
+        """Return the first frame that a change is in; None while it waits, or when it is forgotten."""
+        with self._lock:
+            if self._record and change.number < self._record[0].number:
+                return change.frame_number
+            later = takewhile(lambda each: each.number >= change.number, reversed(self._record))
+            frames = [each.frame_number for each in later if each.frame_number is not None]
+        return frames[-1] if frames else None
+
+    def wait(self, change: Change, timeout_s: float = 1.0) -> int | None:
+        """Wait until the engine has taken a change; return its frame, or None when the time is over."""
+        end = time.monotonic() + timeout_s
+        while (frame_number := self.frame_of(change)) is None and time.monotonic() < end:
+            time.sleep(_POLL_S)
+        return frame_number
+
+    def history(self) -> list[tuple[int, dict[str, Any], list[int] | None]]:
+        """Return the changes that took effect, oldest first: frame number, new values, sub-apertures.
+
+        Changes that came between the same two frames have the same frame number.
+        """
+        taken: list[tuple[int, dict[str, Any], list[int] | None]] = []
+        with self._lock:
+            frame_number = None
+            for change in reversed(self._record):
+                # One that was overtaken took effect with the next that was taken.
+                frame_number = frame_number if change.frame_number is None else change.frame_number
+                if frame_number is not None:
+                    taken.append((frame_number, copy.deepcopy(change.changes), copy.copy(change.where)))
+        return taken[::-1]
+
+    def waiting(self) -> int:
+        """Return the number of changes that wait for a frame."""
+        return self._newest.change.number - self._running.change.number
+
+    def get(self, names: Sequence[str] | None = None) -> dict[str, Any]:
+        """Return values that run, by name (default: all), as plain numbers, texts and lists.
+
+        A setting that differs between sub-apertures is a list with one value for each; what is not set
+        is None.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        pipeline = self.pipeline
+        n, pixels = len(pipeline.layout), pipeline.layout.pixels
+        return {name: _plain(pipeline.settings, name, n, pixels) for name in checked_names(names)}
+
+
+def checked_names(names: Sequence[str] | None) -> list[str]:
+    """Return the names of settings that are asked for; all when it is None or empty.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+    """
+    if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
+        raise InputError(f"names = {names!r}: expected a list of settings' names")
+    return [one_of("settings", name, NAMES) for name in names or NAMES]
+
+
+def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
+    """Return new values by name from texts such as "noise_std=2.5" and "keep_brightest=20".
+
+    Values are numbers, true, false, none, texts, or several of them between commas: one for each
+    sub-aperture.
+
+    Raises
+    ------
+    InputError
+        For a text that is not NAME=VALUE, an unknown or repeated name, an empty value.
+    """
+    changes: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals:
+            raise InputError(f"{text!r}: expected NAME=VALUE, such as {NAMES[0]}=2.5")
+        one_of("settings", name, NAMES)
+        if name in changes:
+            raise InputError(f"{name}: expected one new value, got two")
+        items = [item.strip() for item in value.split(",")]
+        if "" in items:
+            raise InputError(f"{text!r}: expected a value after '=', or several between commas")
+        parsed = [_parsed_value(item) for item in items]
+        changes[name] = parsed[0] if len(parsed) == 1 else parsed
+    if not changes:
+        raise InputError(f"settings: expected at least one NAME=VALUE, such as {NAMES[0]}=2.5, got none")
+    return changes
+
+
+def parse_subapertures(text: str) -> list[int]:
+    """Return sub-apertures' numbers from a text such as "4,5,10-20"; both ends of a range belong to it.
+
+    In the order given, each once.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    numbers: dict[int, None] = {}
+    for part in text.split(","):
+        ends = [end.strip() for end in part.split("-")]
+        if len(ends) > 2 or not all(end.isascii() and end.isdecimal() and len(end) < 10 for end in ends):
+            raise InputError(
+                f"sub-apertures {text!r}: expected numbers and ranges such as 4,5,10-20, got {part.strip()!r}"
+            )
+        first, last = int(ends[0]), int(ends[-1])
+        if last < first:
+            raise InputError(f"sub-apertures {text!r}: expected a range upwards, got {part.strip()!r}")
+        if last >= _MOST_SUBAPERTURES:
+            raise InputError(f"sub-apertures {text!r}: expected numbers below {_MOST_SUBAPERTURES}")
+        numbers.update(dict.fromkeys(range(first, last + 1)))
+    return list(numbers)
+
+
+def _parsed_value(text: str) -> Any:
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _checked_places(where: Sequence[int], n: int) -> list[int]:
+    """Sub-apertures' numbers as plain ints, all of them among the n that exist."""
+    array = numbers_between("where", where, 0, integer=True)
+    if array.ndim != 1:
+        raise InputError(f"where: expected a list of sub-apertures, got shape {array.shape}")
+    if array.max() >= n:
+        raise InputError(f"where: sub-aperture {array.max()} does not exist; there are {n}, counted from 0")
+    return [int(place) for place in array]
+
+
+def _check_every_value(settings: Settings, n: int, pixels: int) -> None:
+    """Check also the settings that the estimator does not use: they stay, and others may follow."""
+    for name in PER_SUBAPERTURE:
+        value = getattr(settings, name)
+        settings.values(name, n, pixels)
+        if isinstance(value, PerSubaperture) and AUTO in (value.default, *value.others.values()):
+            raise InputError(
+                f'{name}: expected "auto" for the whole sensor or numbers for all sub-apertures, got both'
+            )
+
+
+def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
+    """A setting as plain values."""
+    value = getattr(settings, name)
+    if not isinstance(value, PerSubaperture | np.ndarray):
+        return value
+    each = settings.values(name, n, pixels).tolist()
+    return [None if isinstance(item, float) and math.isnan(item) else item for item in each]

@@ -1,0 +1,89 @@
+"""Slopes out: streams of pyshmem, which pyRTC and, through its bridge, ImageStreamIO read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.pipeline import Slopes
+
+DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
+"""Rows of the stream of details."""
+
+
+class SlopeStreams:
+    """Two streams, each stamped with the frame's number as `frame_id`.
+
+    NAME_slopes holds all x, then all y, float32 px (2 n,): what a reconstructor multiplies. NAME_details
+    holds (6, n) float32, rows as `DETAILS`. The slopes are published first.
+
+    Parameters
+    ----------
+    name : str
+    n : int
+        Number of sub-apertures.
+
+    Raises
+    ------
+    MissingExtraError
+        Without pyshmem.
+    InputError
+        When a living process publishes under that name.
+    """
+
+    def __init__(self, name: str, n: int) -> None:
+        self._slopes = _created(f"{name}_slopes", (2 * n,))
+        self._details = _created(f"{name}_details", (len(DETAILS), n))
+        self._n = n
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep the streams' locks, which only writers need, while publishing: readers do not wait for them.
+
+        Taking a lock for every frame would take three times as long as publishing itself.
+        """
+        with self._slopes.locked(), self._details.locked():
+            yield
+
+    def publish_slopes(self, slopes: Slopes, frame: int) -> None:
+        """Publish the vector of slopes; by the thread that holds the streams."""
+        with self._slopes.write_view_locked(frame_id=frame) as vector:
+            vector[: self._n] = slopes.x
+            vector[self._n :] = slopes.y
+
+    def publish_details(self, slopes: Slopes, frame: int) -> None:
+        """Publish what else is known of each slope; by the thread that holds the streams."""
+        with self._details.write_view_locked(frame_id=frame) as table:
+            table[0], table[1] = slopes.flux, slopes.valid
+            table[2], table[3] = slopes.standard_error_x, slopes.standard_error_y
+            table[4], table[5] = slopes.iterations, slopes.flags
+
+    def close(self) -> None:
+        """Remove both streams."""
+        for stream in (self._slopes, self._details):
+            stream.unlink()
+
+
+def _created(name: str, shape: tuple[int, ...]) -> Any:
+    """Create a stream; one whose writer has died is replaced."""
+    try:
+        import pyshmem
+    except ImportError:
+        raise MissingExtraError("pyshmem", "realtime", "publishing slopes in shared memory") from None
+    # A living writer holds the stream's lock for good, which making one anew would wait for: so look first.
+    try:
+        old = pyshmem.open(name)
+    except FileNotFoundError:
+        return pyshmem.create(name, shape=shape, dtype=np.float32)
+    alive = old.producer_alive()
+    old.close()
+    if alive:
+        raise InputError(
+            f"{name}: a living process publishes under this name; stop it or choose another --name"
+        )
+    pyshmem.unlink(name)
+    return pyshmem.create(name, shape=shape, dtype=np.float32)

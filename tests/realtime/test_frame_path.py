@@ -1,0 +1,138 @@
+"""Slopes of frames that arrive row by row: those of the pipeline, bit for bit."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import faintspot as fs
+from faintspot.realtime.frame_path import FramePath, Progress, last_rows_of_groups
+
+LAYOUT = fs.Layout.grid((6, 6), pixels=8, pitch=(9, 8))
+NOISE = fs.Calibration(read_noise_e=1.0)
+SLOTS = 3
+SETTINGS = {
+    "tv": fs.Settings(noise_std=1.0, keep_brightest=9),
+    "plain": fs.Settings(denoise=False, keep_brightest=9),
+    "ml": fs.Settings(estimator="ml", search_range_px=1.5),
+    "map": fs.Settings(estimator="map", flux_e=200.0),
+}
+
+
+def frames(n: int, dtype: Any = np.uint16) -> NDArray[Any]:
+    detector = fs.simulate.Detector(1.0, offset_adu=100.0, bits=16)
+    simulated, _ = fs.simulate.sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        n,
+        flux_e=200.0,
+        detector=detector,
+        rng=np.random.default_rng(4),
+    )
+    return np.asarray(simulated).astype(dtype)
+
+
+def pipeline(name: str) -> fs.SlopePipeline:
+    return fs.SlopePipeline(
+        LAYOUT, SETTINGS[name], fs.Calibration(100.0, read_noise_e=1.0), psf=fs.PSF.analytic()
+    )
+
+
+class Source:
+    """Slots, and a writer that fills them row by row."""
+
+    def __init__(self, dtype: Any = np.uint16) -> None:
+        self.slots = np.zeros((SLOTS, *LAYOUT.frame_shape), dtype)
+        self.cells = np.array([-1, 0], np.int64)
+        self.progress = Progress(self.cells, 0, 1)
+
+    def write(self, number: int, frame: NDArray[Any], block: int = 5, pause_s: float = 0.0) -> None:
+        slot = self.slots[number % SLOTS]
+        self.cells[1] = 0
+        self.cells[0] = number
+        for row in range(0, len(frame), block):
+            slot[row : row + block] = frame[row : row + block]
+            self.cells[1] = min(row + block, len(frame))
+            time.sleep(pause_s)
+
+
+def assert_same(found: fs.Slopes, expected: fs.Slopes, index: int) -> None:
+    for name in vars(expected):
+        assert np.array_equal(getattr(found, name), getattr(expected, name)[index]), name
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("name", list(SETTINGS))
+def test_same_slopes_as_the_pipeline(name: str, threads: int) -> None:
+    data, source = frames(4), Source()
+    expected = pipeline(name)(data)
+    path = FramePath(pipeline(name), source.slots, source.progress, threads=threads)
+    path.warm_up()
+    for number, frame in enumerate(data):
+        writer = threading.Thread(target=source.write, args=(number, frame, 7, 0.0005))
+        writer.start()
+        assert path.measure(number)
+        writer.join()
+        assert_same(path.slopes, expected, number)
+    path.close()
+
+
+def test_float_frames() -> None:
+    data, source = frames(1, np.float32), Source(np.float32)
+    source.write(0, data[0])
+    path = FramePath(pipeline("tv"), source.slots, source.progress)
+    assert path.measure(0)
+    assert_same(path.slopes, pipeline("tv")(data), 0)
+
+
+def test_a_frame_that_has_passed_counts_as_there() -> None:
+    data, source = frames(2), Source()
+    source.write(0, data[0])
+    source.write(1, data[1])
+    path = FramePath(pipeline("plain"), source.slots, source.progress)
+    assert path.measure(0)
+    assert_same(path.slopes, pipeline("plain")(data), 0)
+
+
+def test_waiting_ends_when_told() -> None:
+    """Half of a frame arrives, and no more: the path stops, keeps what it has, and can go on."""
+    data, source = frames(1), Source()
+    path = FramePath(pipeline("plain"), source.slots, source.progress)
+    path.warm_up()
+    source.cells[:] = 0, LAYOUT.frame_shape[0] // 2
+    threading.Timer(0.05, path.stop).start()
+    assert not path.measure(0)
+    path.go_on()
+    source.write(0, data[0])
+    assert path.measure(0)
+    assert_same(path.slopes, pipeline("plain")(data), 0)
+
+
+def test_groups_wait_for_their_last_row_only() -> None:
+    rows = last_rows_of_groups(pipeline("plain"), 16)
+    assert rows.tolist() == [26, 53, 53]  # sub-apertures 0-15, 16-31, 32-35 in rows of 9 px
+
+
+@pytest.mark.parametrize(
+    ("slots", "message"),
+    [
+        (np.zeros((2, 10, 10), np.uint16), "expected contiguous frames"),
+        (np.zeros((2, *LAYOUT.frame_shape), np.int32), "uint16 or float32"),
+    ],
+)
+def test_wrong_slots(slots: NDArray[Any], message: str) -> None:
+    with pytest.raises(fs.InputError, match=message):
+        FramePath(pipeline("plain"), slots, Progress(np.zeros(2, np.int64), 0, 1))
+
+
+def test_light_must_be_known_beforehand() -> None:
+    source = Source()
+    automatic = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
+    with pytest.raises(fs.InputError, match=r"settings\.flux_e"):
+        FramePath(fs.SlopePipeline(LAYOUT, automatic, NOISE), source.slots, source.progress)
