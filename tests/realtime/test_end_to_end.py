@@ -56,8 +56,12 @@ def processes(name: str, tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes
             started.append(subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=log))
     yield started
     for process in started:
-        process.kill()
-        process.wait()
+        process.send_signal(signal.SIGINT)  # so that it removes its shared memory; nothing where it has ended
+        try:
+            process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def ask(name: str, *arguments: str) -> str:

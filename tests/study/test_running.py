@@ -98,7 +98,7 @@ def test_one_of_two_worker_processes_is_killed(
     scheduler: str, two_workers: list[subprocess.Popen[bytes]], tmp_path: Path, uninterrupted: Path
 ) -> None:
     distributed = pytest.importorskip("distributed")
-    with distributed.Client(scheduler) as client:
+    with distributed.Client(scheduler, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=60)
         at_work = set(client.run(os.getpid).values())
     assert at_work == {worker.pid for worker in two_workers}

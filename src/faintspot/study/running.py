@@ -144,13 +144,16 @@ def _measure_on_worker(cell: Cell, specification: StudySpecification, fingerprin
 
 @contextmanager
 def _client(scheduler: str | None, workers: int | None, n_cells: int) -> Iterator[Any]:
-    """Connect to a running scheduler, or start a cluster of this machine's processes."""
+    """Connect to a running scheduler, or start a cluster of this machine's processes.
+
+    Never as Dask's default: what else the process computes with Dask is not the study's.
+    """
     import dask
 
     distributed = _dask_distributed()
     if scheduler is not None:
         try:
-            client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S)
+            client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 f"scheduler = {scheduler!r}: cannot be reached, expected an address such as "
@@ -170,7 +173,7 @@ def _client(scheduler: str | None, workers: int | None, n_cells: int) -> Iterato
     with (
         dask.config.set(_SETTINGS),
         distributed.LocalCluster(**options) as cluster,
-        distributed.Client(cluster) as client,
+        distributed.Client(cluster, set_as_default=False) as client,
     ):
         yield client
 
