@@ -119,7 +119,7 @@ def _finished_cells(
             for index, cell in cells.items()
         }
         try:
-            for future in distributed.as_completed(list(futures)):
+            for future in distributed.as_completed(list(futures), loop=client.loop):
                 yield futures.pop(future), future.result()
         except distributed.KilledWorker as error:
             raise InputError(f"workers died repeatedly, perhaps of lack of memory: {error}") from None
