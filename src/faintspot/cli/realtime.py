@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from typing import Any
 
 import click
@@ -162,8 +161,7 @@ def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
 
 def _stop_when_set(stop: threading.Event, engine: Any) -> None:
     """Pass a signal on to the engine."""
-    while not stop.wait(60.0):
-        time.sleep(0)
+    stop.wait()
     engine.stop()
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
 from faintspot.pipeline import SlopePipeline
-from faintspot.realtime.frame_path import FramePath, Progress
+from faintspot.realtime.frame_path import FramePath, Progress, check_light_is_known
 from faintspot.realtime.live import LiveSettings
 from faintspot.realtime.outputs import SlopeStreams
 from faintspot.realtime.pixel_ring import PixelRing
@@ -188,11 +188,7 @@ class Engine:
     def _made(self, settings: Settings) -> SlopePipeline:
         """Make a pipeline, and where there is a source its way for frames, complete and warm."""
         pipeline = self._make_pipeline(settings)
-        if pipeline.needs_light:
-            raise InputError(
-                "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
-                'real time "map", "trained" and "auto" need it before the frame is there'
-            )
+        check_light_is_known(pipeline)
         ring = self._ring
         if ring is not None:
             self._paths[pipeline] = ring, self._new_path(pipeline, ring)

@@ -159,11 +159,16 @@ class FramePath:
                     f"stream: expected contiguous frames of {shape}, uint16 or float32, "
                     f"got {slot.shape} {slot.dtype}"
                 )
-        if self.pipeline.needs_light:
-            raise InputError(
-                "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
-                'real time "map", "trained" and "auto" need it before the frame is there'
-            )
+        check_light_is_known(self.pipeline)
+
+
+def check_light_is_known(pipeline: SlopePipeline) -> None:
+    """Refuse settings that follow the light of a frame, which is not known before its last row."""
+    if pipeline.needs_light:
+        raise InputError(
+            "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
+            'real time "map", "trained" and "auto" need it before the frame is there'
+        )
 
 
 def last_rows_of_groups(pipeline: SlopePipeline, width: int) -> NDArray[np.int64]:
