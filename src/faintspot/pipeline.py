@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -125,17 +126,38 @@ class SlopePipeline:
         )
         self._lanes = lanes_for(np.float32, width)
         self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
-        zero = layout.offsets + _reference_positions(reference, len(layout))
-        self._preparation = Preparation(
-            layout, settings, self.calibration, psf, score, zero, self._lanes.width
-        )
-        self._identity = _identity(zero, psf, score)
+        self._parts = psf, score, layout.offsets + _reference_positions(reference, len(layout))
+        self._preparation = self._prepared()
+        self._identity = _identity(*self._parts)
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
         """Make the pipeline that a configuration file (faintspot.toml) describes."""
         layout, settings, calibration, psf, score = configuration.load_all(path)
         return cls(layout, settings, calibration, psf=psf, score=score, **options)
+
+    def _prepared(self) -> Preparation:
+        """Make the tables for the SIMD lanes that are set."""
+        return Preparation(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
+
+    @property
+    def width(self) -> int:
+        """Sub-apertures that are measured at once."""
+        return self._lanes.width
+
+    def with_width(self, width: int) -> SlopePipeline:
+        """Return the same pipeline with another SIMD width: 4, 8 or 16. Slopes do not depend on it.
+
+        Raises
+        ------
+        InputError
+            For another width.
+        """
+        other = copy.copy(self)
+        other._lanes = lanes_for(np.float32, width)
+        other._calibration = packed_calibration(self.layout, self.calibration, width)
+        other._preparation = other._prepared()
+        return other
 
     @property
     def needs_light(self) -> bool:
@@ -295,7 +317,7 @@ def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, n: int) -> NDArray[n
     return np.ascontiguousarray(array.reshape(-1, 2, n), np.float32)
 
 
-def _identity(zero: NDArray[np.float64], psf: PSF | None, score: TrainedScore | None) -> bytes:
+def _identity(psf: PSF | None, score: TrainedScore | None, zero: NDArray[np.float64]) -> bytes:
     """A digest of what slopes depend on beside layout, settings and calibration."""
     digest = hashlib.sha256(zero.tobytes())
     for part in (psf, score):

@@ -1,15 +1,35 @@
-"""Frames in, slopes out: FITS, NumPy, Zarr, CSV."""
+"""Frames in, slopes and telemetry out: FITS, NumPy, Zarr, CSV, AOT."""
+
+from typing import TYPE_CHECKING
 
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.io.slopes import create_writer, read_slopes
 from faintspot.io.slopes_format import SlopeWriter, StoredSlopes
+from faintspot.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.io.aot import write_aot as write_aot
+    from faintspot.io.telemetry import Telemetry as Telemetry
+    from faintspot.io.telemetry import read_telemetry as read_telemetry
+
+# Imported at first use: they need zarr.
+_HOMES = {
+    "Telemetry": "faintspot.io.telemetry",
+    "read_telemetry": "faintspot.io.telemetry",
+    "write_aot": "faintspot.io.aot",
+}
 
 __all__ = [
     "FrameSource",
     "SlopeWriter",
     "StoredSlopes",
+    "Telemetry",
     "create_writer",
     "open_frames",
     "read_array",
     "read_slopes",
+    "read_telemetry",
+    "write_aot",
 ]
+
+__getattr__ = lazy_attributes(__name__, _HOMES)

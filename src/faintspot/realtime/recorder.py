@@ -1,0 +1,224 @@
+"""Recording: from the engine's telemetry to a Zarr store, in a process of its own.
+
+The engine does not know of it: a recorder that is too slow, or whose disk is full, loses records and nobody
+waits for it.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.io.telemetry import TelemetryStore
+from faintspot.realtime.camera import StopEvent
+from faintspot.realtime.telemetry import TelemetryReader
+
+_POLL_S = 0.01
+_FLUSH_S = 1.0
+_FLUSH_BYTES = 1 << 26  # what waits in memory is written when it is so much
+_STALE_S = 0.25  # between two questions whether the engine lives
+_MOST_RECORDS, _MOST_IMAGES = 1024, 4  # in one go
+
+
+@dataclass(frozen=True)
+class RecordingReport:
+    """What a recording has come to.
+
+    Attributes
+    ----------
+    frames, images, changes : int
+        In the store.
+    dropped, dropped_images, dropped_changes : int
+        Overwritten in shared memory before they were read: reading or writing was too slow.
+    seconds : float
+    longest_write_s : float
+        Of one writing to the disk, during which nothing is read.
+    ended_because : str
+        "frames", "seconds", "stopped" or "engine ended".
+    """
+
+    frames: int
+    images: int
+    changes: int
+    dropped: int
+    dropped_images: int
+    dropped_changes: int
+    seconds: float
+    longest_write_s: float
+    ended_because: str
+
+
+@dataclass
+class _Waiting:
+    """What was read and is not in the store yet, and how far reading has come."""
+
+    record_cursor: int
+    image_cursor: int
+    change_cursor: int = 0  # all that there are: they tell the settings at the start
+    records: list[NDArray[Any]] = field(default_factory=list)
+    images: list[NDArray[Any]] = field(default_factory=list)
+    changes: list[dict[str, Any]] = field(default_factory=list)
+    dropped: int = 0
+    dropped_images: int = 0
+    dropped_changes: int = 0
+    frames_read: int = 0
+    n_bytes: int = 0
+
+    def read(self, reader: TelemetryReader, limit: int) -> bool:
+        """Read what there is, up to so many frames in all; return whether there was anything."""
+        most = min(limit - self.frames_read, _MOST_RECORDS)
+        records, self.record_cursor, dropped = reader.records_since(self.record_cursor, most)
+        images, self.image_cursor, dropped_images = reader.images_since(self.image_cursor, _MOST_IMAGES)
+        changes, self.change_cursor, dropped_changes = reader.changes_since(self.change_cursor)
+        self.dropped += dropped
+        self.dropped_images += dropped_images
+        self.dropped_changes += dropped_changes
+        self.changes += changes
+        for items, kept in ((records, self.records), (images, self.images)):
+            if len(items):
+                kept.append(items)
+                self.n_bytes += items.nbytes
+        self.frames_read += len(records)
+        return bool(len(records) or len(images))
+
+    def taken(self, reader: TelemetryReader) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return records and images that wait, and forget them."""
+        records = np.concatenate([np.empty(0, reader.record_type), *self.records])
+        images = np.concatenate([np.empty(0, reader.image_type), *self.images])
+        self.records, self.images, self.n_bytes = [], [], 0
+        return records, images
+
+    def attributes(self) -> dict[str, Any]:
+        """What a store's attributes say of it."""
+        return {
+            "changes": self.changes,
+            "dropped_records": self.dropped,
+            "dropped_images": self.dropped_images,
+            "dropped_changes": self.dropped_changes,
+        }
+
+
+class Recorder:
+    """Records the telemetry of a running engine to a new Zarr store.
+
+    Parameters
+    ----------
+    name : str
+        The engine's.
+    path : path
+        Of the store, a directory that does not exist yet.
+
+    Raises
+    ------
+    InputError
+        When no such engine gives telemetry, or the store cannot be made.
+    """
+
+    def __init__(self, name: str, path: str | Path) -> None:
+        self._reader = reader = TelemetryReader.attach(name)
+        self._waiting = _Waiting(reader.newest, reader.newest_image)
+        attributes = {
+            "name": name,
+            "layout": reader.description["layout"],
+            "settings": reader.settings,
+            "arms": reader.description["arms"],
+            **self._waiting.attributes(),
+        }
+        self._store = TelemetryStore(path, reader.record_type, reader.image_type, attributes)
+        self._longest_write_s = self._written_at = self._asked_at = 0.0
+
+    def run(
+        self,
+        *,
+        n_frames: int | None = None,
+        seconds: float | None = None,
+        stop: StopEvent | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> RecordingReport:
+        """Record from now on, until one of the limits is reached, `stop` is set or the engine ends.
+
+        Everything that was read is in the store then; while it runs, all but the last second.
+
+        Parameters
+        ----------
+        n_frames : int, optional
+        seconds : float, optional
+        stop : event, optional
+        progress : function, optional
+            Called with the number of frames so far.
+
+        Raises
+        ------
+        InputError
+            When a limit is out of its range. When the disk is full or not writable: what was written
+            before can be read.
+        """
+        limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
+        duration = np.inf if seconds is None else number_between("seconds", seconds, 0, low_open=True)
+        start = self._written_at = time.monotonic()
+        waiting, ended, gone = self._waiting, "", False
+        while not ended:
+            something = waiting.read(self._reader, sys.maxsize if limit is None else limit)
+            if limit is not None and waiting.frames_read >= limit:
+                ended = "frames"
+            elif time.monotonic() - start >= duration:
+                ended = "seconds"
+            elif stop is not None and stop.is_set():
+                ended = "stopped"
+            elif gone and not something:  # all that it left behind has been read
+                ended = "engine ended"
+            if progress is not None:
+                progress(waiting.frames_read)
+            self._write_in_turn()
+            if not (something or ended):
+                gone = self._gone()
+                time.sleep(_POLL_S)
+        self._write({"complete": True, "ended_because": ended})
+        self._reader.close()
+        return self._report(time.monotonic() - start, ended)
+
+    def _gone(self) -> bool:
+        """Whether the engine has ended; asked now and then."""
+        if time.monotonic() - self._asked_at < _STALE_S:
+            return False
+        self._asked_at = time.monotonic()
+        return self._reader.stale
+
+    def _write_in_turn(self) -> None:
+        """Write what waits when it is time, or when it is much."""
+        if time.monotonic() - self._written_at > _FLUSH_S or self._waiting.n_bytes > _FLUSH_BYTES:
+            self._write({})
+            self._written_at = time.monotonic()
+
+    def _write(self, attributes: dict[str, Any]) -> None:
+        """Write what waits."""
+        start = time.monotonic()
+        records, images = self._waiting.taken(self._reader)
+        try:
+            self._store.append(records, images, {**self._waiting.attributes(), **attributes})
+        except InputError as error:
+            raise InputError(f"{error}; {self._store.frames} frames are in the store") from None
+        self._longest_write_s = max(self._longest_write_s, time.monotonic() - start)
+
+    def _report(self, seconds: float, ended: str) -> RecordingReport:
+        waiting, store = self._waiting, self._store
+        return RecordingReport(
+            store.frames,
+            store.images,
+            len(waiting.changes),
+            waiting.dropped,
+            waiting.dropped_images,
+            waiting.dropped_changes,
+            seconds,
+            self._longest_write_s,
+            ended,
+        )

@@ -1,0 +1,116 @@
+"""What lies where in a telemetry segment: the types of its three rings, and reading and writing them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.sensor.layout import Layout
+
+CHANGE_BYTES = 4096
+"""Bytes of one place in the ring of changes: the length of the text, 8 bytes, and the text."""
+CHANGE_SLOTS = 256
+PAGE = 4096
+_CELL_BYTES = 128  # counts are so far apart that no two share a cache line, or the pair fetched with it
+
+
+def record_type(n: int) -> np.dtype[np.void]:
+    """Return the type of a record of n sub-apertures; px and electrons as in `faintspot.Slopes`.
+
+    `sequence` counts the records from 0, `frame` is the camera's number, `arm` says which of interleaved
+    settings were used, `change` the last change of settings that is in them. Times are of CLOCK_MONOTONIC,
+    ns; `clock_offset_ns`, added to them, gives Unix time by the wall clock at that moment.
+    """
+    numbers = ("sequence", "frame", "arm", "change", "last_row_time_ns", "published_time_ns")
+    head = [(name, np.int64) for name in (*numbers, "clock_offset_ns")]
+    floats = ("x", "y", "flux", "standard_error_x", "standard_error_y")
+    body = [(name, np.float32, (n,)) for name in floats]
+    return np.dtype(
+        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,))],
+        align=True,
+    )
+
+
+def image_type(frame_shape: tuple[int, int], n: int, window: tuple[int, int]) -> np.dtype[np.void]:
+    """Return the type of an item of the ring of images: the frame, ADU, and denoised images, electrons."""
+    return np.dtype(
+        [
+            ("sequence", np.int64),
+            ("image_frame", np.int64),
+            ("raw", np.float32, frame_shape),
+            ("denoised", np.float32, (n, *window)),
+        ],
+        align=True,
+    )
+
+
+class Ring:
+    """One of the rings: a number of places, and the count of items ever written."""
+
+    def __init__(self, cells: NDArray[np.int64], row: int, items: NDArray[Any]) -> None:
+        self.items, self._cell = items, cells[row]
+
+    @property
+    def written(self) -> int:
+        """Items ever written."""
+        return int(self._cell[0])
+
+    def count(self, written: int) -> None:
+        """Say how many items have been written."""
+        self._cell[0] = written
+
+    def since(self, cursor: int, most: int | None) -> tuple[NDArray[Any], int, int]:
+        """Copies of the items from number `cursor` on, the next cursor, how many were lost."""
+        places, written = len(self.items), self.written
+        first = max(cursor, written - places + 1)  # one place is being written to at any time
+        last = max(first, written if most is None else min(written, first + most))
+        copies = self.items[np.arange(first, last) % places]
+        overwritten = min(max(self.written - places + 1 - first, 0), len(copies))
+        return copies[overwritten:], last, first - cursor + overwritten
+
+
+class Rings:
+    """The three rings as they lie in the segment's memory."""
+
+    def __init__(self, memory: NDArray[np.uint8], begin: int, description: Mapping[str, Any]) -> None:
+        cells = memory[begin : begin + PAGE].view(np.int64).reshape(-1, _CELL_BYTES // 8)
+        begin += PAGE
+        self.first_record = begin
+        rings = []
+        for row, (kind, places) in enumerate(kinds_of(description)):
+            size = kind.itemsize * places
+            rings.append(Ring(cells, row, memory[begin : begin + size].view(kind)))
+            begin += up_to_pages(size)
+        self.records, self.images, self.changes = rings
+
+
+def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], int]]:
+    """Type and number of places of the three rings."""
+    layout = description["layout"]
+    n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
+    change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
+    return [
+        (record_type(n), description["records"]),
+        (image_type(shape, n, window), description["image_slots"]),
+        (change, description["change_slots"]),
+    ]
+
+
+def layout_values(layout: Layout) -> dict[str, Any]:
+    """The layout as plain values, from which `Layout` makes it again."""
+    return {
+        name: plain(value) if isinstance(value, np.ndarray) else value for name, value in vars(layout).items()
+    }
+
+
+def plain(value: Any) -> Any:
+    """NumPy's numbers and arrays as plain ones, others as text."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
+
+
+def up_to_pages(size: int) -> int:
+    """Bytes rounded up to whole pages."""
+    return -(-size // PAGE) * PAGE

@@ -1,0 +1,206 @@
+"""Telemetry in files: what was written is read back, and what is not telemetry is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("zarr")
+
+from faintspot.errors import InputError
+from faintspot.io import Telemetry, read_telemetry, write_aot
+from faintspot.io.telemetry import TelemetryStore
+from faintspot.sensor.layout import Layout
+
+# A sensor alone has neither, of which the reader of AOT files complains.
+pytestmark = pytest.mark.filterwarnings("ignore:.AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data")
+
+N, SHAPE, WINDOW = 8, (24, 24), (8, 8)
+ATTRIBUTES: dict[str, Any] = {
+    "name": "bench",
+    "layout": {
+        "frame_shape": SHAPE,
+        "window": WINDOW,
+        "corners": [[row, column] for row in (0, 8, 16) for column in (0, 8, 16) if (row, column) != (8, 8)],
+        "centres": [
+            [column + 3.75, row + 3.5]
+            for row in (0, 8, 16)
+            for column in (0, 8, 16)
+            if (row, column) != (8, 8)
+        ],
+        "cells": [[row, column] for row in range(3) for column in range(3) if (row, column) != (1, 1)],
+    },
+    "settings": '[settings]\nestimator = "cog"\nnoise_std = 1.5\n',
+    "arms": ["none", "tv"],
+    "dropped_records": 2,
+}
+CHANGES = [
+    {"frame": 12, "number": 1, "changes": {"noise_std": 2.5, "rule": "it's"}, "where": [1, 2]},
+    {"frame": 20, "number": 2, "changes": {"noise_std": [i / 7 for i in range(200)]}, "where": None},
+]
+RECORD = np.dtype(
+    [
+        *[(name, np.int64) for name in ("sequence", "frame", "arm", "change")],
+        *[(name, np.int64) for name in ("last_row_time_ns", "published_time_ns", "clock_offset_ns")],
+        *[(name, np.float32, (N,)) for name in ("x", "y", "flux", "standard_error_x", "standard_error_y")],
+        ("iterations", np.int32, (N,)),
+        ("flags", np.uint8, (N,)),
+    ]
+)
+IMAGE = np.dtype(
+    [
+        ("sequence", np.int64),
+        ("image_frame", np.int64),
+        ("raw", np.float32, SHAPE),
+        ("denoised", np.float32, (N, *WINDOW)),
+    ]
+)
+START_NS = 1_700_000_000_000_000_000
+
+
+def records_of(first: int, count: int) -> np.ndarray:
+    """Records of frames at 1 kHz, some 1000 s after the machine was started."""
+    rng = np.random.default_rng(first)
+    records = np.zeros(count, RECORD)
+    records["frame"] = np.arange(first, first + count)
+    records["arm"], records["change"] = records["frame"] % 2, first
+    records["last_row_time_ns"] = 10**12 + records["frame"] * 10**6
+    records["published_time_ns"] = records["last_row_time_ns"] + 50_000
+    records["clock_offset_ns"] = START_NS - 10**12
+    for name in ("x", "y", "flux", "standard_error_x", "standard_error_y"):
+        records[name] = rng.normal(size=(count, N))
+    records["flags"][:, 3] = 1
+    return records
+
+
+def images_of(*frames: int) -> np.ndarray:
+    images = np.zeros(len(frames), IMAGE)
+    images["image_frame"] = frames
+    images["raw"] = np.arange(24)[:, None] * 100 + np.arange(24) + np.array(frames)[:, None, None]
+    images["denoised"] = np.array(frames)[:, None, None, None]
+    return images
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> TelemetryStore:
+    """15 frames in two parts, with a gap, and two images."""
+    store = TelemetryStore(tmp_path / "night.zarr", RECORD, IMAGE, ATTRIBUTES)
+    store.append(records_of(10, 5), images_of(10), {})
+    store.append(records_of(20, 10), images_of(25), {"changes": CHANGES, "complete": True})
+    return store
+
+
+def test_what_was_appended_is_read(store: TelemetryStore) -> None:
+    telemetry = read_telemetry(store.path)
+    written = np.concatenate([records_of(10, 5), records_of(20, 10)])
+    for name in written.dtype.names or ():
+        if name != "sequence":
+            values = getattr(telemetry, name)
+            assert np.array_equal(values, written[name])
+            assert values.dtype == written[name].dtype
+    assert np.array_equal(telemetry.raw, images_of(10, 25)["raw"])
+    assert np.array_equal(telemetry.denoised, images_of(10, 25)["denoised"])
+    assert telemetry.changes == CHANGES
+    assert np.array_equal(telemetry.slopes, np.hstack([written["x"], written["y"]]))
+    assert np.array_equal(telemetry.valid, written["flags"] == 0)
+    assert np.all(telemetry.latency_s == 50e-6)
+    # Unix time in float64 is good to a quarter of a microsecond.
+    expected = START_NS / 1e9 + telemetry.frame / 1e3
+    assert np.allclose(telemetry.unix_time_s, expected, rtol=0, atol=1e-6)
+    assert Layout(**telemetry.attributes["layout"]).corners.shape == (N, 2)
+    assert telemetry.attributes["complete"]
+    without = read_telemetry(store.path, images=False)
+    assert len(without.frame) == 15
+    assert without.raw.shape == (0, *SHAPE)
+
+
+def test_a_wall_clock_that_is_set_back_does_not_matter(tmp_path: Path) -> None:
+    records = records_of(0, 4)
+    records["clock_offset_ns"][2:] -= 3600 * 10**9
+    store = TelemetryStore(tmp_path / "night.zarr", RECORD, IMAGE, ATTRIBUTES)
+    store.append(records, images_of(), {})
+    assert np.all(np.diff(read_telemetry(store.path).unix_time_s) > 0)
+
+
+def test_xarray_reads_it(store: TelemetryStore) -> None:
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_zarr(store.path, consolidated=False) as data:
+        assert data.x.dims == ("frame", "subaperture")
+        assert data.x.attrs["units"] == "px"
+        assert np.array_equal(data.x.sel(frame=25), records_of(20, 10)["x"][5])
+
+
+def test_what_is_not_telemetry_is_refused(store: TelemetryStore, tmp_path: Path) -> None:
+    import zarr
+
+    with pytest.raises(InputError, match="no such file"):
+        read_telemetry(tmp_path / "absent.zarr")
+    (tmp_path / "empty.zarr").mkdir()
+    zarr.create_group(str(tmp_path / "other.zarr"), zarr_format=3)
+    (tmp_path / "file.zarr").write_text("?")
+    for other in ("empty.zarr", "other.zarr", "file.zarr"):
+        with pytest.raises(InputError, match="expected a Zarr store of telemetry"):
+            read_telemetry(tmp_path / other)
+    shutil.rmtree(store.path / "flux")
+    with pytest.raises(InputError, match="damaged"):
+        read_telemetry(store.path)
+
+
+def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> None:
+    aotpy = pytest.importorskip("aotpy")
+    telemetry = read_telemetry(store.path)
+    write_aot(tmp_path / "night.fits", telemetry, ao_mode="MOAO")
+    assert not list(tmp_path.glob(".*"))
+    system = aotpy.AOSystem.read_from_file(
+        tmp_path / "night.fits"
+    )  # complains, as a warning, of anything odd
+    assert (system.name, system.ao_mode) == ("bench", "MOAO")
+    assert abs(system.date_beginning.timestamp() - telemetry.unix_time_s[0]) < 1e-3  # written to ms
+    assert json.loads(system.config) == {"estimator": "cog", "noise_std": 1.5}
+    metadata = {each.key: each.value for each in system.metadata}
+    assert [json.loads(metadata[key]) for key in ("CHG1", "CHG2")] == CHANGES
+    assert (metadata["DROPPED"], metadata["ARMS"]) == (2, "none, tv")
+
+    (sensor,) = system.wavefront_sensors
+    assert (sensor.n_valid_subapertures, sensor.subaperture_size) == (N, 8)
+    assert sensor.centroiding_algorithm == "cog"
+    slopes = sensor.measurements
+    assert (slopes.data.shape, slopes.unit) == ((15, 2, N), "pix")
+    assert np.array_equal(slopes.data[:, 0], telemetry.x)
+    assert np.array_equal(slopes.data[:, 1], telemetry.y)
+    assert list(slopes.time.frame_numbers) == list(telemetry.frame)
+    assert np.array_equal(slopes.time.timestamps, telemetry.unix_time_s)
+    assert np.array_equal(sensor.subaperture_intensities.data, telemetry.flux)
+    assert sensor.subaperture_intensities.unit == "electron"
+    assert np.array_equal(sensor.subaperture_mask.data, [[0, 1, 2], [3, -1, 4], [5, 6, 7]])
+    corners = json.loads(sensor.subaperture_mask.metadata_to_dict()["CORNERS"])
+    assert corners == ATTRIBUTES["layout"]["corners"]
+    assert np.allclose(sensor.ref_measurements.data, [[0.25] * N, [0.0] * N])
+    pixels = sensor.detector.pixel_intensities
+    assert np.array_equal(pixels.data, telemetry.raw)
+    assert list(pixels.time.frame_numbers) == [10, 25]
+    assert np.allclose(pixels.time.timestamps, telemetry.unix_time_s[[0, 10]])
+
+
+def test_aot_without_images_and_what_cannot_be_written(tmp_path: Path) -> None:
+    aotpy = pytest.importorskip("aotpy")
+    store = TelemetryStore(tmp_path / "night.zarr", RECORD, IMAGE, ATTRIBUTES)
+    nothing: Telemetry = read_telemetry(store.path)
+    with pytest.raises(InputError, match="at least one frame"):
+        write_aot(tmp_path / "nothing.fits", nothing)
+    store.append(records_of(0, 2), images_of(), {})
+    telemetry = read_telemetry(store.path)
+    write_aot(tmp_path / "night.fits", telemetry)
+    system = aotpy.AOSystem.read_from_file(tmp_path / "night.fits")
+    assert system.wavefront_sensors[0].detector.pixel_intensities is None
+    with pytest.raises(InputError, match="exists already"):
+        write_aot(tmp_path / "night.fits", telemetry)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_aot(tmp_path / "no" / "night.fits", telemetry)
+    with pytest.raises(InputError, match="ao_mode"):
+        write_aot(tmp_path / "mode.fits", telemetry, ao_mode="scao")
