@@ -10,7 +10,16 @@ import click
 
 from benchmarks import measuring
 
-NAMES = ("rivals", "estimators", "realtime", "roofline", "startup", "breakdown", "study")
+NAMES = (
+    "rivals",
+    "estimators",
+    "realtime",
+    "realtime_sustained",
+    "roofline",
+    "startup",
+    "breakdown",
+    "study",
+)
 
 
 @click.command()

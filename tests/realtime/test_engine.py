@@ -2,99 +2,15 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Iterator
-from typing import Any
-from uuid import uuid4
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.interleaving import Interleaving
 
 pyshmem = pytest.importorskip("pyshmem")
-
-LAYOUT = fs.Layout.grid((4, 4), pixels=8)
-CALIBRATION = fs.Calibration(100.0, read_noise_e=1.0)
-SETTINGS = fs.Settings(noise_std=1.0, keep_brightest=9)
-PATIENCE_S = 20.0
-
-
-def make(settings: fs.Settings) -> fs.SlopePipeline:
-    return fs.SlopePipeline(LAYOUT, settings, CALIBRATION)
-
-
-def simulated(n: int) -> NDArray[np.uint16]:
-    frames, _ = fs.simulate.sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
-        n,
-        flux_e=300.0,
-        detector=fs.simulate.Detector(1.0, offset_adu=100.0, bits=16),
-        rng=np.random.default_rng(8),
-    )
-    return np.asarray(frames, np.uint16)
-
-
-class Bench:
-    """An engine that runs in a thread, with what it publishes."""
-
-    def __init__(self) -> None:
-        self.name = f"fs_test_{uuid4().hex[:12]}"
-        self.engine = Engine(self.name, make, SETTINGS)
-        self.slopes: dict[int, NDArray[np.float32]] = {}
-        self._thread = threading.Thread(target=self.engine.run)
-        self._stream = pyshmem.open(f"{self.name}_slopes")
-        self._thread.start()
-
-    def ring(self) -> PixelRing:
-        return PixelRing.create(self.name, LAYOUT.frame_shape, np.uint16)
-
-    def until(self, condition: Any) -> None:
-        end = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert time.monotonic() < end, self.engine.status()
-            time.sleep(0.001)
-
-    def attached(self) -> None:
-        self.until(lambda: self.engine._waiting_for >= 0)
-
-    def send(self, ring: PixelRing, number: int, frame: NDArray[Any], rows: int = 5) -> None:
-        """Send a frame row by row and collect its slopes."""
-        slot = ring.begin(number)
-        for row in range(0, len(frame), rows):
-            slot[row : row + rows] = frame[row : row + rows]
-            ring.rows_ready(min(row + rows, len(frame)))
-        ring.end()
-        self.collect(number)
-
-    def collect(self, number: int) -> None:
-        def there() -> bool:
-            if self._stream.count == 0:
-                return False
-            publication = self._stream.read_publication()
-            self.slopes[publication.frame_id] = np.array(publication.payload)
-            return bool(publication.frame_id == number)
-
-        self.until(there)
-
-    def close(self) -> None:
-        self.engine.stop()
-        self._thread.join(PATIENCE_S)
-        assert not self._thread.is_alive()
-        self._stream.close()
-
-
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    bench = Bench()
-    yield bench
-    bench.close()
 
 
 def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
@@ -108,6 +24,44 @@ def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     counters = bench.engine.counters
     assert (counters.processed, counters.dropped, counters.skipped) == (6, 0, 0)
     assert bench.engine.latencies.count == 6
+
+
+def test_what_is_published(bench: Bench) -> None:
+    """Slopes, details and marks, stamped with the frame's number."""
+    data = simulated(1)
+    expected = make(SETTINGS)(data[0])
+    streams = {name: pyshmem.open(f"{bench.name}_{name}") for name in ("slopes", "details", "marks")}
+    with bench.ring() as ring:
+        bench.attached()
+        bench.send(ring, 17, data[0])
+    found = {name: stream.read_publication() for name, stream in streams.items()}
+    assert [publication.frame_id for publication in found.values()] == [17] * 3
+    assert np.array_equal(found["slopes"].payload, expected.vector)
+    assert np.array_equal(found["details"].payload[0], expected.flux)
+    assert np.array_equal(found["details"].payload[4], expected.iterations)
+    frame, arm, change, last_row_ns, published_ns = found["marks"].payload.tolist()
+    assert (frame, arm, change) == (17, 0, 0)
+    assert 0 < published_ns - last_row_ns < 60e9
+    for stream in streams.values():
+        stream.close()
+
+
+def test_arms_take_turns() -> None:
+    """Two frames not denoised, two denoised, and again; every frame says which."""
+    data = simulated(8)
+    bench = Bench(interleaving=Interleaving.parse("none,tv", 2))
+    try:
+        with bench.ring() as ring:
+            bench.attached()
+            for number, frame in enumerate(data):
+                bench.send(ring, number, frame)
+        records = bench.records
+    finally:
+        bench.close()
+    assert records["arm"].tolist() == [0, 0, 1, 1, 0, 0, 1, 1]
+    for record, frame in zip(records, data, strict=True):
+        settings = SETTINGS.replace(denoise=bool(record["arm"]))
+        assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
 
 
 def test_settings_change_between_two_frames(bench: Bench) -> None:
@@ -141,7 +95,7 @@ def test_source_restarts(bench: Bench) -> None:
             bench.attached()
             bench.send(ring, start, data[0])
             bench.send(ring, start + 1, data[1])
-        bench.until(lambda: bench.engine._waiting_for < 0)
+        bench.detached()
     for start in (0, 100):
         assert np.array_equal(bench.slopes[start + 1], expected[1])
     assert bench.engine.counters.source_restarts == 2
@@ -154,13 +108,12 @@ def test_numbers_are_skipped_and_begin_anew(bench: Bench) -> None:
         bench.attached()
         bench.send(ring, 10, data[0])
         bench.send(ring, 12, data[1])  # 11 never comes
-        assert bench.engine.counters.skipped >= 1
-        ring.begin(0)[:] = data[2]
-        ring.end()
-        bench.until(lambda: bench.engine._waiting_for == 1)
+        bench.send(ring, 0, data[0])
         bench.send(ring, 1, data[2])
     assert np.array_equal(bench.slopes[12], expected[1])
     assert np.array_equal(bench.slopes[1], expected[2])
+    counters = bench.engine.counters
+    assert (counters.processed, counters.skipped, counters.repeated, counters.dropped) == (4, 1, 1, 0)
 
 
 def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
 from faintspot.pipeline import SlopePipeline
-from faintspot.realtime.frame_path import FramePath, Progress, check_light_is_known
+from faintspot.realtime.engine_modules import EngineModules
+from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.live import LiveSettings
 from faintspot.realtime.outputs import SlopeStreams
 from faintspot.realtime.pixel_ring import PixelRing
-from faintspot.realtime.pixel_segment import FRAME, ROWS
+from faintspot.realtime.programme import Path, Programmes
+from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
+from faintspot.realtime.workers import Workers
+from faintspot.sensor.configuration import to_text
 from faintspot.sensor.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher
 _LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer
+DEADLINE_S = 1e-3
+IMAGES_EVERY = 100
 
 
 class Engine:
@@ -38,7 +42,15 @@ class Engine:
     settings : Settings
         To begin with.
     threads : int
-        Workers.
+        That measure.
+    cpus : sequence of int, optional
+        Processors to pin threads to, the first one for the thread that calls `run`.
+    interleaving : Interleaving, optional
+        Several states of the settings, in turn.
+    deadline_s : float
+        From a frame's last row; slopes that come later count as late.
+    images_every : int
+        Of so many frames of an arm, telemetry keeps one's images; 0: of none.
 
     Raises
     ------
@@ -53,19 +65,35 @@ class Engine:
         settings: Settings,
         *,
         threads: int = 1,
+        cpus: Sequence[int] | None = None,
+        interleaving: Interleaving | None = None,
+        deadline_s: float = DEADLINE_S,
+        images_every: int = IMAGES_EVERY,
     ) -> None:
-        self.name, self._threads = name, threads
+        self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
+        self.interleaving = Interleaving() if interleaving is None else interleaving
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
         """What of the real-time manners was not permitted."""
-        self._ring: PixelRing | None = None
-        self._paths: WeakKeyDictionary[SlopePipeline, tuple[PixelRing, FramePath]] = WeakKeyDictionary()
-        self._running: FramePath | None = None
-        self._waiting_for = -1
+        self._unfit: str | None = None
+        self._path: Path | None = None
+        self._waiting = False
+        self._arrival, self._number = 0, -1  # of the frame that was measured last
+        self._measured = [0 for _ in self.interleaving.arms]
         self._stopping = threading.Event()
-        self._make_pipeline = make_pipeline
-        self.live = LiveSettings(self._made, settings)
-        self._streams = SlopeStreams(name, len(self.live.pipeline.layout))
+        self._workers = Workers(threads - 1, cpus) if threads > 1 else None
+        self.programmes = Programmes(make_pipeline, self.interleaving, self._workers, deadline_s)
+        self.live = LiveSettings(self.programmes.make, settings)
+        self.modules = EngineModules(self.live, self.programmes)
+        layout = self.live.pipeline.layout
+        self._streams = SlopeStreams(name, len(layout))
+        try:
+            self._telemetry = TelemetryRing.create(
+                name, layout, settings=to_text(settings), arms=self.interleaving.labels
+            )
+        except InputError:
+            self._streams.close()
+            raise
 
     # Any thread -------------------------------------------------------------------------------------
 
@@ -75,13 +103,17 @@ class Engine:
 
     def status(self) -> dict[str, Any]:
         """Return counters and latencies as plain values."""
-        ring = self._ring
+        ring = self.programmes.ring
         return {
             "name": self.name,
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
+            "source_refused": self._unfit,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator,
+            "arms": self.interleaving.labels,
+            "modules": {stage: module.name for stage, module in self.modules.modules().items()},
+            "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
         }
 
@@ -98,13 +130,16 @@ class Engine:
                     if ring is None:
                         self._stopping.wait(_WATCH_S)
                         continue
-                    self._ring = ring
+                    self.programmes.ring = ring
                     self._follow(ring, n_frames)
-                    self._ring = None
+                    self.programmes.ring = None
         finally:
             self._stopping.set()
             watcher.join()
+            if self._workers is not None:
+                self._workers.close()
             self._streams.close()
+            self._telemetry.close()
 
     def _done(self, n_frames: int | None) -> bool:
         return self._stopping.is_set() or (n_frames is not None and self.counters.processed >= n_frames)
@@ -114,67 +149,99 @@ class Engine:
         try:
             ring = PixelRing.attach(self.name)
         except InputError:
+            self._unfit = None
             return None
-        fits = ring.shape == self.live.pipeline.layout.frame_shape and ring.dtype in (np.uint16, np.float32)
-        return ring if fits and not (ring.stale or ring.closed) else None
+        if ring.stale or ring.closed:
+            return None
+        shape, wanted = ring.shape, self.live.pipeline.layout.frame_shape
+        fits = shape == wanted and ring.dtype in (np.uint16, np.float32)
+        self._unfit = None
+        if not fits:
+            self._unfit = (
+                f"frames of {shape[0]} x {shape[1]} pixels, {ring.dtype}; "
+                f"expected {wanted[0]} x {wanted[1]}, uint16 or float32"
+            )
+        return ring if fits else None
 
     def _follow(self, ring: PixelRing, n_frames: int | None) -> None:
         """Measure the frames of a ring until it ends."""
-        self._path(ring, -1)  # made before the first frame is waited for
-        frame = ring.progress()[0] + 1
-        first_is_known = frame > 0  # a source may begin with any number
+        self._take(ring)  # made before the first frame is waited for
+        if self._workers is not None:
+            self._workers.wake()
+        self._arrival, self._number = ring.arrivals, ring.progress()[0]
         while not self._done(n_frames):
-            path = self._path(ring, frame)
-            self._running, self._waiting_for = path, frame
-            whole = path.measure(frame)
-            self._waiting_for = -1
-            if not whole:
+            path, arm = self._take(ring)
+            self._path, self._waiting = path, True
+            arrival = self._arrival + 1
+            explain = self._images_every > 0 and self._measured[arm] % self._images_every == 0
+            whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
+            number = ring.number_of(arrival)
+            if whole and number >= 0 and number != self._number + 1:  # it lies in another slot than expected
+                whole = path.measure(arrival, number % ring.slots, explain=explain)
+            self._waiting = False
+            if not whole and path.stopped:
                 if self._stopping.is_set() or ring.closed or ring.stale:
                     self.counters.source_restarts += not self._stopping.is_set()
-                    return
+                    break
                 path.go_on()
-                frame = ring.progress()[0] + 1  # the source has begun to count anew
-                self.counters.repeated += 1
-                continue
-            if not first_is_known and not ring.intact(frame):
-                frame = ring.progress()[0]
             else:
-                frame = self._published(ring, path, frame)
-            first_is_known = True
+                self._end_frame(ring, path, arm, arrival, number if whole else -1, explain)
+        if self._workers is not None:
+            self._workers.park()
 
-    def _path(self, ring: PixelRing, frame: int) -> FramePath:
-        """Return the way of the next frame; changes of settings take effect here.
+    def _take(self, ring: PixelRing) -> tuple[Path, int]:
+        """Return the way of the next frame, and whose turn it is; changes of settings take effect here."""
+        pipeline = self.live.take(self._number + 1)
+        arm = self.interleaving.arm_of(self.counters.processed)
+        return self.programmes.of(pipeline).paths(ring)[arm], arm
 
-        It was made when they were proposed, unless that was for another ring.
-        """
-        pipeline = self.live.take(frame)
-        made_for, path = self._paths.get(pipeline, (None, None))
-        if path is None or made_for is not ring:
-            path = self._new_path(pipeline, ring)
-            self._paths[pipeline] = ring, path
-        if self._running is not None and path is not self._running:
-            self.counters.settings_changes += self._running.pipeline is not pipeline
-        return path
+    def _end_frame(
+        self, ring: PixelRing, path: Path, arm: int, arrival: int, number: int, explained: bool
+    ) -> None:
+        """Publish what was measured, unless it was not that frame."""
+        counters = self.counters
+        moment = ring.last_row_time_ns(number) if number >= 0 else 0
+        if not (moment and ring.intact(number, arrival)):
+            self._lose(ring, arrival, number)
+            return
+        self._streams.publish_slopes(path.slopes, number)
+        published = time.monotonic_ns()
+        self.latencies.add(published - moment)
+        self._streams.publish_details(path.slopes, number)
+        change = self.live.change_number
+        self._streams.publish_marks((number, arm, change, moment, published))
+        self._telemetry.write(number, arm, change, moment, published, path.slopes)
+        if explained:
+            self._telemetry.write_images(number, ring.slot(number), path.denoised)
+        if self._arrival:
+            counters.skipped += max(number - self._number - 1, 0)
+            counters.repeated += number <= self._number
+        counters.late += published - moment > self._deadline_ns
+        self._count(path)
+        self._measured[arm] += 1
+        self._arrival, self._number = arrival, number
 
-    def _published(self, ring: PixelRing, path: FramePath, frame: int) -> int:
-        """Publish what was measured, unless it was not that frame; return the next one to wait for."""
-        moment = ring.last_row_time_ns(frame)
-        if moment and ring.intact(frame):
-            self._streams.publish_slopes(path.slopes, frame)
-            self.latencies.add(time.monotonic_ns() - moment)
-            self._streams.publish_details(path.slopes, frame)
-            self._count(path)
-            return frame + 1
-        self.counters.frames_in += 1
-        newest = ring.progress()[0]
-        if newest - frame >= ring.slots - 1:  # overtaken: go on with the newest
-            self.counters.torn += 1
-            self.counters.dropped += newest - frame
-            return newest
-        self.counters.skipped += 1  # the source left out this number, or did not end the frame
-        return frame + 1
+    def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:
+        """Count a frame that cannot be published, and where to go on."""
+        counters = self.counters
+        counters.frames_in += 1
+        counters.dropped += 1
+        self._arrival = arrival
+        if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row was there
+            counters.short += 1
+            self._number = number
+            return
+        if ring.number_of(arrival) >= 0:  # it is there, but a worker died: its share is missing
+            self._number = ring.number_of(arrival)
+            return
+        counters.torn += 1  # overtaken: go on with the newest that is arriving
+        newest = ring.arrivals
+        counters.dropped += max(newest - 1 - arrival, 0)
+        counters.frames_in += max(newest - 1 - arrival, 0)
+        self._arrival = max(newest - 1, arrival)
+        self._number = ring.number_of(newest) - 1
 
-    def _count(self, path: FramePath) -> None:
+    def _count(self, path: Path) -> None:
         """Count what was published."""
         slopes, counters = path.slopes, self.counters
         counters.frames_in += 1
@@ -183,56 +250,29 @@ class Engine:
         limited = slopes.flags & SubapertureFlag.NOT_CONVERGED
         counters.at_iteration_limit += int(np.count_nonzero(limited))
 
-    # Making paths -----------------------------------------------------------------------------------
-
-    def _made(self, settings: Settings) -> SlopePipeline:
-        """Make a pipeline, and where there is a source its way for frames, complete and warm."""
-        pipeline = self._make_pipeline(settings)
-        check_light_is_known(pipeline)
-        ring = self._ring
-        if ring is not None:
-            self._paths[pipeline] = ring, self._new_path(pipeline, ring)
-        return pipeline
-
-    def _new_path(self, pipeline: SlopePipeline, ring: PixelRing) -> FramePath:
-        cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
-        columns = ring.cells.shape[1]
-        path = FramePath(
-            pipeline, pixels, Progress(cells, FRAME * columns, ROWS * columns), threads=self._threads
-        )
-        path.warm_up()
-        return path
-
     # The watcher's thread ---------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """End the engine's waiting when it is to stop, or when what it waits for will not come."""
-        looks = 0
+        """End the engine's waiting when it is to stop, or when what it waits for will not come.
+
+        And do all that takes time: tell telemetry what was changed, replace workers, take out modules.
+        """
+        looks = told = 0
         while True:
             stopping = self._stopping.wait(_WATCH_S)
             looks += 1
-            ring, path, frame = self._ring, self._running, self._waiting_for
-            if ring is not None and path is not None and frame >= 0:
+            ring, path = self.programmes.ring, self._path
+            if ring is not None and path is not None and self._waiting:
                 gone = ring.closed or (looks % _LOOKS_BETWEEN_STALE == 0 and ring.stale)
-                # The frame before the one that is waited for has been there: numbers have begun anew.
-                anew = ring.progress()[0] < frame - 1
-                if stopping or gone or anew:
+                if stopping or gone:
                     path.stop()
-            if stopping and (frame < 0 or ring is None):
+            if self._workers is not None:
+                self.counters.worker_restarts += self._workers.replace_dead()
+            if path is not None:
+                self.modules.take_out(path)
+            self.counters.settings_changes = self.live.change_number
+            for change in self.live.taken(after=told):
+                self._telemetry.write_change(*change)
+                told = change[1]
+            if stopping and (ring is None or not self._waiting):
                 return
-
-
-def writable_view(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the same memory as an array of the kind that kernels are compiled for, which may be written to.
-
-    Nobody writes: it spares compiling every kernel once more for memory that is read-only.
-    """
-
-    class _Memory:
-        __array_interface__ = {  # noqa: RUF012 (what NumPy looks for)
-            **array.__array_interface__,
-            "data": (array.__array_interface__["data"][0], False),
-        }
-        owner = array
-
-    return np.asarray(_Memory())

@@ -7,7 +7,6 @@ another one beside the running system and takes it between two frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.kernels import located, streaming
-from faintspot.kernels.host import lanes_for
+from faintspot.kernels import fused, located, streaming
+from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
+from faintspot.preparation import METHODS
+from faintspot.realtime.workers import Workers
 
 STOP_CELL = 0
 
@@ -40,6 +41,69 @@ class Progress:
     rows_cell: int
 
 
+class _Groups:
+    """A range of a frame's groups, and all that the kernel takes to measure them.
+
+    Parameters
+    ----------
+    pipeline, slots
+        As for `FramePath`.
+    groups : (int, int)
+        First group, and the one after the last.
+    shares : int
+        Into how many they are shared.
+    """
+
+    def __init__(
+        self,
+        pipeline: SlopePipeline,
+        slots: Sequence[NDArray[Any]] | NDArray[Any],
+        groups: tuple[int, int],
+        shares: int,
+    ) -> None:
+        self._groups, self._shares = groups, shares
+        self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
+        variants = np.zeros(1, np.int64)
+        made = [pipeline.kernel_call(slot[None], slot.dtype, variants) for slot in slots]
+        self._before = [arguments for _, arguments, _ in made]
+        kernel, _, shape = made[0]
+        gravity = kernel is not located.locate_groups
+        self._kernel = streaming.stream_gravity if gravity else streaming.stream_located
+        lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
+        self._scratch = [
+            new_scratch(lanes, *window) if shape is None else new_spot_scratch(lanes, *window, *shape)
+            for _ in range(shares)
+        ]
+
+    def measure(
+        self,
+        share: int,
+        frame: tuple[int, int],
+        progress: Progress,
+        control: NDArray[np.int64],
+        after: tuple[Any, ...],
+    ) -> bool:
+        """Measure one share of a frame (number, slot); return whether it was measured to its end."""
+        number, slot = frame
+        first, last = self._groups
+        start = first + (last - first) * share // self._shares
+        stop = first + (last - first) * (share + 1) // self._shares
+        done: int = self._kernel(
+            progress.cells,
+            progress.frame_cell,
+            progress.rows_cell,
+            number,
+            self._last_rows,
+            control,
+            STOP_CELL,
+            start,
+            stop,
+            self._before[slot],
+            (self._scratch[share], *after),
+        )
+        return done == stop
+
+
 class FramePath:
     """Measures frames while they arrive, with one state of the settings.
 
@@ -49,8 +113,8 @@ class FramePath:
     slots : sequence of (h, w) arrays
         Where frames arrive: frame k in slot k % len(slots). uint16 or float32, contiguous.
     progress : Progress
-    threads : int
-        Workers, the caller's thread included.
+    workers : Workers, optional
+        Who else measures. Default: the caller's thread alone.
 
     Raises
     ------
@@ -65,33 +129,42 @@ class FramePath:
         slots: Sequence[NDArray[Any]] | NDArray[Any],
         progress: Progress,
         *,
-        threads: int = 1,
+        workers: Workers | None = None,
     ) -> None:
-        self.pipeline, self._progress = pipeline, progress
+        self.pipeline, self._progress, self._workers = pipeline, progress, workers
         self._check(slots)
-        lanes, layout = lanes_for(np.float32), pipeline.layout
-        self._last_rows = last_rows_of_groups(pipeline, lanes.width)
-        self._threads = max(1, min(threads, len(self._last_rows)))
-        self._results = tuple(np.zeros((1, len(layout)), dtype) for dtype in RESULT_TYPES)
-        self.slopes = Slopes(*(result[0] for result in self._results))
+        self._slots = len(slots)
+        self._shares = 1 + (0 if workers is None else workers.count)
+        n, pixels = len(pipeline.layout), pipeline.layout.pixels
+        results = tuple(np.zeros((1, n), dtype) for dtype in RESULT_TYPES)
+        self.slopes = Slopes(*(result[0] for result in results))
         """Of the frame measured last; overwritten by the next one."""
+        self._stages = np.zeros((fused.STAGE_ROWS, 1, n, pixels), np.float32)
+        self.fault: str | None = None
+        """Nothing of its own can fail; see `ModularPath`."""
         self._control = np.zeros(1, np.int64)
-        variants = np.zeros(1, np.int64)
-        made = [pipeline.kernel_call(slot[None], slot.dtype, variants) for slot in slots]
-        self._before = [arguments for _, arguments, _ in made]
-        kernel, _, shape = made[0]
-        gravity = kernel is not located.locate_groups
-        self._kernel = streaming.stream_gravity if gravity else streaming.stream_located
-        stages = np.empty((0, 1, len(layout), layout.pixels), np.float32)
-        self._after = []
-        for _ in range(self._threads):
-            scratch = (
-                new_scratch(lanes, *layout.window)
-                if shape is None
-                else new_spot_scratch(lanes, *layout.window, *shape)
-            )
-            self._after.append((scratch, self._results, stages))
-        self._pool = ThreadPoolExecutor(self._threads - 1) if self._threads > 1 else None
+        wide, rest = pipeline.width, n % pipeline.width
+        full = n // wide
+        # What is left over is measured in narrower groups where that is faster: its rows come last.
+        narrow = 0 < rest <= wide // 2 and wide // 2 in WIDTHS and pipeline.settings.estimator not in METHODS
+        self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares)
+        self._narrow = None
+        if narrow:
+            groups = full * 2, full * 2 + 1
+            self._narrow = _Groups(pipeline.with_width(wide // 2), slots, groups, 1)
+        self._plain = results, self._stages[:0]
+        self._explaining = results, self._stages
+
+    @property
+    def denoised(self) -> NDArray[np.float32]:
+        """Denoised images of the frame that was measured last with its stages, (n, ny, nx)."""
+        images: NDArray[np.float32] = self._stages[fused.DENOISED, 0]
+        return images.reshape(-1, *self.pipeline.layout.window)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether waiting for rows has been ended."""
+        return bool(self._control[STOP_CELL])
 
     def warm_up(self) -> None:
         """Measure whatever the first slot holds, so that everything is compiled and in the caches."""
@@ -99,22 +172,30 @@ class FramePath:
         cells = np.zeros_like(progress.cells)  # of the same kind, so that nothing is compiled for it alone
         cells.flat[progress.frame_cell] = 1
         there = Progress(cells, progress.frame_cell, progress.rows_cell)
-        for share in range(self._threads):
-            self._work(share, 0, there)
+        for share in range(self._shares):
+            self._work(share, (0, 0), there, self._explaining)
 
-    def measure(self, frame: int) -> bool:
+    def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
         """Measure a frame, waiting for its rows; return whether it was measured to its end.
 
-        Where not, `stop` was called meanwhile.
+        Where not, `stop` was called meanwhile, or a worker died.
+
+        Parameters
+        ----------
+        number : int
+            Of the frame, as the progress counts.
+        slot : int, optional
+            Where it arrives. Default: number % slots.
+        explain : bool
+            Whether to keep its images.
         """
-        futures: list[Future[bool]] = []
-        if self._pool is not None:
-            shares = range(1, self._threads)
-            futures = [self._pool.submit(self._work, share, frame, self._progress) for share in shares]
-        whole = self._work(0, frame, self._progress)
-        for future in futures:
-            whole = future.result() and whole
-        return whole
+        frame = number, number % self._slots if slot is None else slot
+        after = self._explaining if explain else self._plain
+        if self._workers is None:
+            return self._work(0, frame, self._progress, after)
+        self._workers.post(lambda share: self._work(share, frame, self._progress, after))
+        whole = self._work(0, frame, self._progress, after)
+        return self._workers.wait() and whole
 
     def stop(self) -> None:
         """End all waiting for rows, now and in future; from any thread."""
@@ -124,30 +205,12 @@ class FramePath:
         """Wait for rows again."""
         self._control[STOP_CELL] = 0
 
-    def close(self) -> None:
-        """End the workers."""
-        self.stop()
-        if self._pool is not None:
-            self._pool.shutdown()
-
-    def _work(self, share: int, frame: int, progress: Progress) -> bool:
-        """Measure one share of a frame's groups."""
-        groups = len(self._last_rows)
-        start, stop = groups * share // self._threads, groups * (share + 1) // self._threads
-        done: int = self._kernel(
-            progress.cells,
-            progress.frame_cell,
-            progress.rows_cell,
-            frame,
-            self._last_rows,
-            self._control,
-            STOP_CELL,
-            start,
-            stop,
-            self._before[frame % len(self._before)],
-            self._after[share],
-        )
-        return done == stop
+    def _work(self, share: int, frame: tuple[int, int], progress: Progress, after: tuple[Any, ...]) -> bool:
+        """Measure one share of a frame's groups; the last one has those that come last."""
+        whole = self._wide.measure(share, frame, progress, self._control, after)
+        if self._narrow is None or share < self._shares - 1:
+            return whole
+        return whole and self._narrow.measure(0, frame, progress, self._control, after)
 
     def _check(self, slots: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
         """Refuse slots that the kernels cannot read, and settings that are not known in time."""

@@ -8,12 +8,13 @@ from typing import Any
 from faintspot.errors import InputError
 from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
+from faintspot.realtime.modules import module_handlers
 
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
 def handlers_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, stop."""
+    """Return the commands: status, get, set, stop, and those for modules."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return engine.status()
@@ -36,4 +37,5 @@ def handlers_of(engine: Engine) -> dict[str, Handler]:
         engine.stop()
         return {}
 
-    return {"status": status, "get": get, "set": change, "stop": stop}
+    own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
+    return own | module_handlers(engine.modules)

@@ -144,10 +144,25 @@ class LiveSettings:
             places = None if where is None else _checked_places(where, len(layout))
             settings = self._newest.pipeline.settings.replace(where=places, **changes)
             _check_every_value(settings, len(layout), layout.pixels)
-            pipeline = self._make_pipeline(settings)
-            change = Change(self._newest.change.number + 1, copy.deepcopy(dict(changes)), places)
-            self._record.append(change)
-            self._newest = _Version(pipeline, change)
+            return self._offered(settings, copy.deepcopy(dict(changes)), places)
+
+    def renew(self, changes: Mapping[str, Any]) -> Change:
+        """Make the pipeline anew with the same settings, because something else has changed, which is named.
+
+        Raises
+        ------
+        InputError
+            When it cannot be made; then nothing changes.
+        """
+        with self._lock:
+            return self._offered(self._newest.pipeline.settings, dict(changes), None)
+
+    def _offered(self, settings: Settings, changes: dict[str, Any], places: list[int] | None) -> Change:
+        """Make a pipeline and let the engine take it; by the thread that holds the lock."""
+        pipeline = self._make_pipeline(settings)
+        change = Change(self._newest.change.number + 1, changes, places)
+        self._record.append(change)
+        self._newest = _Version(pipeline, change)
         return change
 
     def frame_of(self, change: Change) -> int | None:
@@ -171,15 +186,30 @@ class LiveSettings:
 
         Changes that came between the same two frames have the same frame number.
         """
-        taken: list[tuple[int, dict[str, Any], list[int] | None]] = []
+        return [(frame_number, values, where) for frame_number, _, values, where in self.taken()]
+
+    def taken(self, after: int = 0) -> list[tuple[int, int, dict[str, Any], list[int] | None]]:
+        """Return the changes that took effect: frame number, number, new values, sub-apertures.
+
+        Oldest first, those whose number is larger than `after`.
+        """
+        if after == self.change_number:
+            return []
+        taken: list[tuple[int, int, dict[str, Any], list[int] | None]] = []
         with self._lock:
             frame_number = None
-            for change in reversed(self._record):
+            for change in takewhile(lambda each: each.number > after, reversed(self._record)):
                 # One that was overtaken took effect with the next that was taken.
                 frame_number = frame_number if change.frame_number is None else change.frame_number
                 if frame_number is not None:
-                    taken.append((frame_number, copy.deepcopy(change.changes), copy.copy(change.where)))
+                    values, where = copy.deepcopy(change.changes), copy.copy(change.where)
+                    taken.append((frame_number, change.number, values, where))
         return taken[::-1]
+
+    @property
+    def change_number(self) -> int:
+        """Number of the last change that is in the pipeline that runs; 0 before the first."""
+        return self._running.change.number
 
     def waiting(self) -> int:
         """Return the number of changes that wait for a frame."""

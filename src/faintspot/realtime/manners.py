@@ -5,10 +5,12 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 _LOCK_CURRENT_AND_FUTURE = 3  # MCL_CURRENT | MCL_FUTURE
+_SWITCH_S = 20e-6
 
 
 @contextmanager
@@ -42,6 +44,9 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
             refused.append(f"real-time priority {priority}: {error.strerror}")
         if ctypes.CDLL(None, use_errno=True).mlockall(_LOCK_CURRENT_AND_FUTURE):
             refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
+    # What is compiled or checked beside the loop holds the interpreter's lock no longer than that.
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
     collecting = gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -49,6 +54,7 @@ def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[
     try:
         yield refused
     finally:
+        sys.setswitchinterval(interval)
         if collecting:
             gc.enable()
         gc.unfreeze()

@@ -13,13 +13,16 @@ from faintspot.pipeline import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""
+MARKS = ("frame", "arm", "settings_change", "last_row_ns", "published_ns")
+"""What the stream of marks holds; times are those of CLOCK_MONOTONIC."""
 
 
 class SlopeStreams:
-    """Two streams, each stamped with the frame's number as `frame_id`.
+    """Three streams, each stamped with the frame's number as `frame_id`.
 
     NAME_slopes holds all x, then all y, float32 px (2 n,): what a reconstructor multiplies. NAME_details
-    holds (6, n) float32, rows as `DETAILS`. The slopes are published first.
+    holds (6, n) float32, rows as `DETAILS`; NAME_marks holds with what and when it was measured, int64, as
+    `MARKS`. The slopes are published first.
 
     Parameters
     ----------
@@ -38,6 +41,7 @@ class SlopeStreams:
     def __init__(self, name: str, n: int) -> None:
         self._slopes = _created(f"{name}_slopes", (2 * n,))
         self._details = _created(f"{name}_details", (len(DETAILS), n))
+        self._marks = _created(f"{name}_marks", (len(MARKS),), np.int64)
         self._n = n
 
     @contextmanager
@@ -46,7 +50,7 @@ class SlopeStreams:
 
         Taking a lock for every frame would take three times as long as publishing itself.
         """
-        with self._slopes.locked(), self._details.locked():
+        with self._slopes.locked(), self._details.locked(), self._marks.locked():
             yield
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
@@ -62,13 +66,18 @@ class SlopeStreams:
             table[2], table[3] = slopes.standard_error_x, slopes.standard_error_y
             table[4], table[5] = slopes.iterations, slopes.flags
 
+    def publish_marks(self, marks: tuple[int, ...]) -> None:
+        """Publish with what and when a frame was measured; by the thread that holds the streams."""
+        with self._marks.write_view_locked(frame_id=marks[0]) as row:
+            row[:] = marks
+
     def close(self) -> None:
-        """Remove both streams."""
-        for stream in (self._slopes, self._details):
+        """Remove all streams."""
+        for stream in (self._slopes, self._details, self._marks):
             stream.unlink()
 
 
-def _created(name: str, shape: tuple[int, ...]) -> Any:
+def _created(name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> Any:
     """Create a stream; one whose writer has died is replaced."""
     try:
         import pyshmem
@@ -78,7 +87,7 @@ def _created(name: str, shape: tuple[int, ...]) -> Any:
     try:
         old = pyshmem.open(name)
     except FileNotFoundError:
-        return pyshmem.create(name, shape=shape, dtype=np.float32)
+        return pyshmem.create(name, shape=shape, dtype=dtype)
     alive = old.producer_alive()
     old.close()
     if alive:
@@ -86,4 +95,4 @@ def _created(name: str, shape: tuple[int, ...]) -> Any:
             f"{name}: a living process publishes under this name; stop it or choose another --name"
         )
     pyshmem.unlink(name)
-    return pyshmem.create(name, shape=shape, dtype=np.float32)
+    return pyshmem.create(name, shape=shape, dtype=dtype)

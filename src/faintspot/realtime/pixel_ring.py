@@ -260,6 +260,14 @@ class PixelRing:
         arrival = int(cell[SLOT_ARRIVAL])
         return arrival if cell[SLOT_FRAME] == frame else -1
 
+    def number_of(self, arrival: int) -> int:
+        """Return the number of the frame that arrived as this one, from 1; -1 when no slot holds it."""
+        for cell in self.cells[FIRST_SLOT:]:
+            if cell[SLOT_ARRIVAL] == arrival:
+                number = int(cell[SLOT_FRAME])
+                return number if cell[SLOT_ARRIVAL] == arrival else -1
+        return -1
+
     def last_row_time_ns(self, frame: int) -> int:
         """Return when its last row was complete (CLOCK_MONOTONIC), 0 for incomplete or not held."""
         cell = self.cells[FIRST_SLOT + frame % self.slots]

@@ -174,8 +174,6 @@ class Counters:
     """How often the source went away and came back."""
     worker_restarts: int = 0
     """Worker threads that died and were replaced."""
-    telemetry_dropped: int = 0
-    """Records that telemetry had no room for."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the numbers by name."""

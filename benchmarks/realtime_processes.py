@@ -1,0 +1,99 @@
+"""An engine and a simulated camera as processes of their own, and what they say of a run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from faintspot.errors import InputError
+from faintspot.realtime.control import request
+from faintspot.realtime.private_socket import socket_path
+
+CONFIGURATION = """
+[layout.grid]
+shape = [{across}, {across}]
+pixels = {pixels}
+outer_radius = {outer_radius}
+inner_radius = {inner_radius}
+
+[settings]
+noise_std = {noise_std}
+keep_brightest = 12
+tolerance = {tolerance}
+max_iterations = {iterations}
+
+[calibration]
+read_noise_e = 1.0
+"""
+SMALL = {"across": 7, "pixels": 16, "outer_radius": 3.5, "inner_radius": 0.5}
+"""36 sub-apertures of 16 x 16 pixels."""
+USUAL = {"noise_std": 1.0, "tolerance": 0.0, "iterations": 10}
+_COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
+PATIENCE_S = 120.0
+
+
+class Processes:
+    """An engine and a camera that run."""
+
+    def __init__(self, name: str, engine: subprocess.Popen[bytes], camera: subprocess.Popen[bytes]) -> None:
+        self.name, self.engine, self.camera = name, engine, camera
+
+    def status(self) -> dict[str, Any]:
+        """Return the engine's own status."""
+        return request(socket_path(self.name), "status")
+
+    def until_processed(self, frames: int) -> dict[str, Any]:
+        """Wait until so many frames have been measured; return the status."""
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            time.sleep(0.5)
+            try:
+                status = self.status()
+            except InputError:
+                continue  # not there yet
+            if status["counters"]["processed"] >= frames:
+                return status
+        raise TimeoutError(f"{frames} frames were not measured within {PATIENCE_S} s")
+
+
+@contextmanager
+def engine_and_camera(
+    values: dict[str, Any], camera: Sequence[str], engine: Sequence[str] = ()
+) -> Iterator[Processes]:
+    """Start both with a configuration of these values; end them."""
+    name = f"faintspot_benchmark_{uuid4().hex[:8]}"
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "faintspot.toml").write_text(CONFIGURATION.format(**values))
+        started = [
+            subprocess.Popen([*_COMMAND, *arguments, "--name", name], cwd=folder, stdout=subprocess.DEVNULL)
+            for arguments in (["run", *engine], ["camera", "--seed", "1", *camera])
+        ]
+        try:
+            yield Processes(name, *started)
+        finally:
+            for process in reversed(started):
+                process.terminate()
+                process.wait()
+
+
+def involuntary_switches(pid: int) -> int:
+    """How often the scheduler took a processor away from any thread of a process."""
+    total = 0
+    for status in Path(f"/proc/{pid}/task").glob("*/status"):
+        for line in status.read_text().splitlines():
+            if line.startswith("nonvoluntary_ctxt_switches"):
+                total += int(line.split()[1])
+    return total
+
+
+def resident_bytes(pid: int) -> int:
+    """Memory that a process holds."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * 4096

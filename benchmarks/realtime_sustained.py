@@ -1,0 +1,79 @@
+"""Does the engine keep up, for minutes, and does its memory stay the same for a million frames?
+
+Engine and camera run as processes of their own. Frames that are lost are told beside how often the scheduler
+took the processor away from engine and camera; on a machine that others use, that explains them or does not.
+FAINTSPOT_SUSTAINED_S sets how long each run takes, by default 300 s.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+from benchmarks.measuring import Row, Table
+from benchmarks.realtime_processes import (
+    SMALL,
+    USUAL,
+    engine_and_camera,
+    involuntary_switches,
+    resident_bytes,
+)
+
+SECONDS = float(os.environ.get("FAINTSPOT_SUSTAINED_S", "300"))
+LARGE = {"across": 40, "pixels": 8, "outer_radius": 19.9, "inner_radius": 3.4}
+"""1208 sub-apertures of 8 x 8 pixels."""
+LONG_FRAMES, LONG_RATE_HZ = 1_000_000, 10_000
+_TINY = {"across": 3, "pixels": 4, "outer_radius": 9, "inner_radius": 0}
+
+
+def _sustained(name: str, values: dict[str, Any], rate_hz: int) -> Row:
+    """Run for SECONDS and count."""
+    camera = ["--rate", str(rate_hz), "--rows-per-block", "8"]
+    with engine_and_camera({**values, **USUAL}, camera) as processes:
+        first = processes.until_processed(rate_hz // 2)["counters"]
+        pids = processes.engine.pid, processes.camera.pid
+        switches = [involuntary_switches(pid) for pid in pids]
+        time.sleep(SECONDS)
+        last = processes.status()
+        switches = [involuntary_switches(pid) - before for pid, before in zip(pids, switches, strict=True)]
+    counters, latency = last["counters"], last["latency"]
+    lost = counters["dropped"] - first["dropped"]
+    columns = {
+        "frames/s": (counters["processed"] - first["processed"]) / SECONDS,
+        "measured": counters["processed"] - first["processed"],
+        "lost": lost,
+        "late (1 ms)": counters["late"] - first["late"],
+        "p50 us": latency["p50_us"],
+        "p99 us": latency["p99_us"],
+        "p99.9 us": latency["p99_9_us"],
+        "max us": latency["max_us"],
+        "engine switched out": switches[0],
+        "camera switched out": switches[1],
+    }
+    return Row(f"{name}, {rate_hz} frames/s", columns, "0 lost, or switched out", lost <= sum(switches))
+
+
+def _long() -> Row:
+    """Measure a million frames of a small sensor and compare memory."""
+    with engine_and_camera({**_TINY, **USUAL, "iterations": 2}, ["--rate", str(LONG_RATE_HZ)]) as processes:
+        processes.until_processed(LONG_FRAMES // 100)
+        before = resident_bytes(processes.engine.pid)
+        while (counters := processes.status()["counters"])["processed"] < LONG_FRAMES:
+            time.sleep(1.0)
+        grown = resident_bytes(processes.engine.pid) - before
+    columns = {
+        "measured": counters["processed"],
+        "lost": counters["dropped"],
+        "memory grown, kB": grown / 1024,
+    }
+    return Row(f"{LONG_FRAMES} frames of 9 x 4x4 pixels", columns, "< 1 MB", grown < 1e6)
+
+
+def run() -> list[Table]:
+    """Run both sensors, and the long one."""
+    rows = [_sustained("36 x 16x16", SMALL, 1000), _sustained("1208 x 8x8", LARGE, 300)]
+    return [
+        Table("realtime-sustained", f"For {SECONDS:.0f} s, TV with 10 iterations", rows),
+        Table("realtime-long", "Constant memory", [_long()]),
+    ]

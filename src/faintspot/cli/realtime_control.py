@@ -1,0 +1,118 @@
+"""faintspot realtime status, get, set, stop, top: talking to a running engine."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.realtime.control import request
+from faintspot.realtime.private_socket import socket_path
+
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+_REFRESH_S = 0.5
+
+
+@click.command("status")
+@_NAME
+@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+def status(name: str, as_json: bool) -> None:
+    """Say what a running engine has seen and how fast it is."""
+    reply = _asked(name, "status")
+    click.echo(json.dumps(reply, indent=1) if as_json else summary(reply))
+
+
+@click.command("get")
+@_NAME
+@click.argument("settings", nargs=-1)
+def get(name: str, settings: tuple[str, ...]) -> None:
+    """Show settings of a running engine: all, or those named."""
+    for key, value in _asked(name, "get", names=list(settings) or None)["settings"].items():
+        click.echo(f"{key} = {json.dumps(value)}")
+
+
+@click.command("set")
+@_NAME
+@click.option("--subapertures", metavar="LIST", help="Which, such as 4,5,10-20. Default: all.")
+@click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
+def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) -> None:
+    """Change settings of a running engine between two frames, all at once or not at all.
+
+    \b
+    Example:
+      faintspot realtime set noise_std=2.5 keep_brightest=20 --subapertures 4,5,10-20
+    """
+    from faintspot.realtime.live import parse_changes, parse_subapertures
+
+    where = None if subapertures is None else parse_subapertures(subapertures)
+    reply = _asked(name, "set", changes=parse_changes(changes), where=where)
+    frame = reply["frame"]
+    click.echo("taken at the next frame" if frame is None else f"in effect from frame {frame}")
+
+
+@click.command("stop")
+@_NAME
+def stop_engine(name: str) -> None:
+    """End a running engine."""
+    _asked(name, "stop")
+
+
+@click.command("top")
+@_NAME
+def top(name: str) -> None:
+    """Watch a running engine in the terminal; Ctrl-C ends watching."""
+    from rich.live import Live
+
+    with Live(_table(name), refresh_per_second=1 / _REFRESH_S) as live, stop_on_signal() as stop:
+        while not stop.wait(_REFRESH_S):
+            live.update(_table(name))
+
+
+def _table(name: str) -> Any:
+    """Everything that an engine says of itself, for the terminal."""
+    from rich.table import Table
+
+    reply = _asked(name, "status")
+    source, latency = reply["source"], reply["latency"]
+    grid = Table(title=f"{name}: {reply['estimator']}", title_justify="left")
+    grid.add_column("")
+    grid.add_column("", justify="right")
+    grid.add_row("source", "none" if source is None else f"process {source['pid']}, frame {source['frame']}")
+    for words in ("source_refused", "module_fault"):
+        if reply[words]:
+            grid.add_row(words.replace("_", " "), f"[bold red]{reply[words]}")
+    if len(reply["arms"]) > 1:
+        grid.add_row("arms in turn", ", ".join(reply["arms"]))
+    for stage, module in reply["modules"].items():
+        grid.add_row(f"{stage} by module", module)
+    grid.add_section()
+    for key, value in reply["counters"].items():
+        grid.add_row(key.replace("_", " "), f"{value}")
+    grid.add_section()
+    for key in ("min", "p50", "p99", "p99_9", "max"):
+        value = latency[f"{key}_us"]
+        grid.add_row(f"latency {key.replace('_', '.')}, us", "-" if value is None else f"{value:.1f}")
+    return grid
+
+
+def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
+    """Ask the engine of that name."""
+    return request(socket_path(name), what, **fields)
+
+
+def summary(reply: dict[str, Any]) -> str:
+    """Say in two lines how an engine is doing."""
+    counters, latency = reply["counters"], reply["latency"]
+    lost = counters["dropped"] + counters["skipped"]
+    lines = f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"
+    for words in ("source_refused", "module_fault"):
+        if reply[words]:
+            lines += f"\n  {words.replace('_', ' ')}: {reply[words]}"
+    if latency["count"]:
+        lines += (
+            f"\n  from the last row to the slopes: p50 {latency['p50_us']:.0f} us, "
+            f"p99 {latency['p99_us']:.0f}, p99.9 {latency['p99_9_us']:.0f}, largest {latency['max_us']:.0f}"
+        )
+    return lines

@@ -1,0 +1,96 @@
+"""faintspot realtime load, swap, unload, modules: algorithms of others in a running engine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from faintspot.realtime.control import request
+from faintspot.realtime.private_socket import socket_path
+
+_TIMEOUT_S = 180.0  # the module is imported, made and tried, and may compile
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+
+
+@click.command("load")
+@_NAME
+@click.argument("module", metavar="NAME_OR_PATH")
+def load(name: str, module: str) -> None:
+    """Put a module in place of a stage of a running engine.
+
+    A module is a Python file, or one that is installed under that name, which replaces one of the stages
+    calibrate, denoise, background and centroid. It is made and tried beside the running engine, and refused
+    where it fails, does not return what it must, or takes too long. It runs with all rights of the engine.
+
+    \b
+    Example:
+      faintspot realtime load examples/median_module.py
+    """
+    _show(_asked(name, "load", source=_source(module)))
+
+
+@click.command("swap")
+@_NAME
+@click.argument("module", metavar="NAME_OR_PATH")
+def swap(name: str, module: str) -> None:
+    """Put a module in the place of the one that is loaded in its stage, between two frames.
+
+    A file is read anew: this also takes a changed version of a file that is loaded.
+    """
+    _show(_asked(name, "swap", source=_source(module)))
+
+
+@click.command("unload")
+@_NAME
+@click.argument("stage", metavar="STAGE_OR_NAME")
+def unload(name: str, stage: str) -> None:
+    """Put a built-in stage back in place of a module."""
+    reply = _asked(name, "unload", stage=stage)
+    click.echo(f"{reply['stage']}: built in {_since(reply['frame'])}")
+
+
+@click.command("modules")
+@_NAME
+@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+def modules(name: str, as_json: bool) -> None:
+    """List the modules that are installed and loaded, and the last fault."""
+    reply = _asked(name, "modules")
+    if as_json:
+        click.echo(json.dumps(reply, indent=1))
+        return
+    for module in reply["loaded"]:
+        click.echo(f"loaded     {_line(module)}")
+    for installed, value in reply["installed"].items():
+        click.echo(f"installed  {installed} ({value})")
+    if not reply["loaded"] and not reply["installed"]:
+        click.echo("no module is loaded, none is installed; faintspot realtime load takes a Python file")
+    if reply["fault"]:
+        click.echo(f"fault      {reply['fault']}")
+
+
+COMMANDS = (load, swap, unload, modules)
+
+
+def _source(name_or_path: str) -> str:
+    """A path as the engine finds it, whose working directory is another one; a name as it is."""
+    is_path = name_or_path.endswith(".py") or "/" in name_or_path
+    return str(Path(name_or_path).expanduser().resolve()) if is_path else name_or_path
+
+
+def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
+    return request(socket_path(name), what, timeout_s=_TIMEOUT_S, **fields)
+
+
+def _show(reply: dict[str, Any]) -> None:
+    click.echo(f"{_line(reply['module'])}: {_since(reply['frame'])}")
+
+
+def _line(module: dict[str, str]) -> str:
+    return f"{module['stage']}: {module['name']} ({module['source']}, {module['digest'][:12]})"
+
+
+def _since(frame: int | None) -> str:
+    return "taken at the next frame" if frame is None else f"in effect from frame {frame}"

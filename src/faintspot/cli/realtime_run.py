@@ -1,0 +1,117 @@
+"""faintspot realtime run: the engine itself."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import click
+
+from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.cli.realtime_control import summary
+from faintspot.realtime.private_socket import socket_path
+
+
+@click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
+@click.option(
+    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Configuration."
+)
+@click.option(
+    "--name", default="faintspot", show_default=True, help="Of the pixel ring, the streams and the engine."
+)
+@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Workers.")
+@click.option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
+@click.option(
+    "--priority",
+    type=click.IntRange(0, 99),
+    default=0,
+    help="Of SCHED_FIFO, with locked memory. Default: the ordinary scheduler.",
+)
+@click.option(
+    "--interleave", metavar="ARMS", help="Settings that take turns, such as none,tv or ml,noise_std=2."
+)
+@click.option(
+    "--every", type=click.IntRange(1), default=50, show_default=True, help="Frames until the next one's turn."
+)
+@click.option(
+    "--deadline",
+    type=click.FloatRange(0, min_open=True),
+    default=1000.0,
+    show_default=True,
+    help="From the last row, us; slopes that come later count as late.",
+)
+@click.option(
+    "--images-every",
+    type=click.IntRange(0),
+    default=100,
+    show_default=True,
+    help="Of so many frames, telemetry keeps one's images; 0: of none.",
+)
+@click.option("--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="To begin with; see load.")
+@click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
+def run(
+    config: str,
+    name: str,
+    threads: int,
+    cpus: str | None,
+    priority: int,
+    interleave: str | None,
+    every: int,
+    deadline: float,
+    images_every: int,
+    modules: tuple[str, ...],
+    frames: int | None,
+) -> None:
+    """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
+
+    Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row; the
+    engine waits for it, and for its return. Each group of sub-apertures is measured as soon as its last row
+    is there. Slopes go out as the pyshmem streams NAME_slopes (all x, then all y, px), NAME_details and
+    NAME_marks, each stamped with the frame's number; `faintspot realtime record` keeps them in a file.
+
+    \b
+    On sky, with and without, 50 frames each (NAME_marks says which):
+      faintspot realtime run --interleave none,tv --every 50
+    """
+    from faintspot.pipeline import SlopePipeline
+    from faintspot.realtime.control import ControlServer
+    from faintspot.realtime.engine import Engine
+    from faintspot.realtime.handlers import handlers_of
+    from faintspot.realtime.interleaving import Interleaving
+    from faintspot.realtime.live import parse_subapertures
+    from faintspot.realtime.manners import real_time
+    from faintspot.realtime.module_loading import load_module
+    from faintspot.sensor import configuration
+
+    layout, settings, calibration, psf, score = configuration.load_all(config)
+    processors = parse_subapertures(cpus) if cpus else None
+    engine = Engine(
+        name,
+        lambda chosen: SlopePipeline(layout, chosen, calibration, psf=psf, score=score),
+        settings,
+        threads=threads,
+        cpus=processors,
+        interleaving=None if interleave is None else Interleaving.parse(interleave, every),
+        deadline_s=deadline * 1e-6,
+        images_every=images_every,
+    )
+    for source in modules:
+        engine.modules.load(load_module(source))
+    with ControlServer(socket_path(name), handlers_of(engine)), real_time(processors, priority) as refused:
+        engine.refused = refused
+        for line in refused:
+            click.echo(f"not permitted, going on without: {line}", err=True)
+        click.echo(
+            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator}; waiting for frames, "
+            "Ctrl-C stops"
+        )
+        with stop_on_signal() as stop:
+            threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
+            engine.run(frames)
+    click.echo(summary(engine.status()))
+
+
+def _stop_when_set(stop: threading.Event, engine: Any) -> None:
+    """Pass a signal on to the engine."""
+    stop.wait()
+    engine.stop()

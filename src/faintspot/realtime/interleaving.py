@@ -1,0 +1,75 @@
+"""Several states of the settings, in turn: comparisons on sky, where nothing stays the same for long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.realtime.live import parse_changes
+from faintspot.sensor.settings import ESTIMATORS
+
+_WORDS: dict[str, dict[str, Any]] = {"set": {}, "none": {"denoise": False}, "tv": {"denoise": True}}
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What differs from the settings that are set, and its name."""
+
+    label: str
+    changes: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Interleaving:
+    """Arms that take turns.
+
+    Parameters
+    ----------
+    arms : tuple of Arm
+    every : int
+        Frames until the next one's turn.
+    """
+
+    arms: tuple[Arm, ...] = (Arm("set", {}),)
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        number_between("every", self.every, 1, integer=True)
+        if not self.arms:
+            raise InputError("interleave: expected at least one arm, got none")
+
+    def arm_of(self, count: int) -> int:
+        """Return whose turn it is, by its place, when so many frames have been measured."""
+        return count // self.every % len(self.arms)
+
+    @property
+    def labels(self) -> list[str]:
+        """The arms' names."""
+        return [arm.label for arm in self.arms]
+
+    @classmethod
+    def parse(cls, text: str, every: int = 1) -> Interleaving:
+        """Return what a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml" says.
+
+        Each arm is "set" (the settings as they are set), "none" (not denoised), "tv" (denoised), the name of
+        an estimator, or new values of settings, NAME=VALUE, with "+" between them.
+
+        Raises
+        ------
+        InputError
+            For anything else.
+        """
+        return cls(tuple(_parsed_arm(part.strip()) for part in text.split(",")), every)
+
+
+def _parsed_arm(text: str) -> Arm:
+    if text in _WORDS:
+        return Arm(text, _WORDS[text])
+    if text in ESTIMATORS:
+        return Arm(text, {"estimator": text})
+    if "=" in text:
+        return Arm(text, parse_changes(text.split("+")))
+    known = ", ".join([*_WORDS, *ESTIMATORS])
+    raise InputError(f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several")

@@ -1,0 +1,180 @@
+"""What an engine does with the frames of one ring, in one state of the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.realtime.frame_path import FramePath, Progress, check_light_is_known
+from faintspot.realtime.interleaving import Interleaving
+from faintspot.realtime.modular import ModularPipeline
+from faintspot.realtime.modular_path import ModularPath
+from faintspot.realtime.module_loading import Module
+from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.pixel_segment import ARRIVALS, ROWS
+from faintspot.realtime.workers import Workers
+from faintspot.sensor.settings import Settings
+
+
+class Path(Protocol):
+    """The way of a frame: `FramePath`, or one with modules in it."""
+
+    slopes: Slopes
+    fault: str | None
+
+    def warm_up(self) -> None:
+        """Have everything compiled."""
+        ...
+
+    @property
+    def denoised(self) -> NDArray[np.float32]:
+        """Images of the frame that was measured last, where they were asked for."""
+        ...
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called."""
+        ...
+
+    def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
+        """Measure a frame; see `FramePath.measure`."""
+        ...
+
+    def stop(self) -> None:
+        """End waiting for rows."""
+        ...
+
+    def go_on(self) -> None:
+        """Wait for rows again."""
+        ...
+
+
+class Programme:
+    """What is done to frames in one state of the settings: a pipeline for every arm, and their ways.
+
+    Parameters
+    ----------
+    pipelines : sequence of SlopePipeline
+        One for every arm.
+    modules : mapping of str to Module
+        In place of built-in stages, by stage.
+    workers : Workers, optional
+    budget_s : float
+        For modules, from a frame's last row.
+
+    Raises
+    ------
+    InputError
+        When a module is refused.
+    """
+
+    def __init__(
+        self,
+        pipelines: Sequence[SlopePipeline],
+        modules: Mapping[str, Module],
+        workers: Workers | None,
+        budget_s: float,
+    ) -> None:
+        self._pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
+        self._modular = [
+            ModularPipeline(pipeline, modules, budget_s=budget_s) if modules else None
+            for pipeline in self._pipelines
+        ]
+        self._ring: PixelRing | None = None
+        self._paths: tuple[Path, ...] = ()
+
+    def paths(self, ring: PixelRing) -> tuple[Path, ...]:
+        """Return the ways of a ring's frames, one for every arm, complete and warm."""
+        if ring is not self._ring:
+            made = zip(self._pipelines, self._modular, strict=True)
+            self._paths = tuple(self._new_path(pipeline, modular, ring) for pipeline, modular in made)
+            self._ring = ring
+        return self._paths
+
+    def _new_path(self, pipeline: SlopePipeline, modular: ModularPipeline | None, ring: PixelRing) -> Path:
+        cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
+        columns = ring.cells.shape[1]
+        # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
+        progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
+        built_in = FramePath(pipeline, pixels, progress, workers=self._workers)
+        path: Path = built_in
+        if modular is not None:
+            path = ModularPath(modular, pixels, progress, built_in, budget_s=self._budget_s)
+        path.warm_up()
+        return path
+
+
+class Programmes:
+    """Makes programmes beside the running system, and remembers those that may still be taken.
+
+    Parameters
+    ----------
+    make_pipeline : function
+        Makes a pipeline from settings.
+    interleaving : Interleaving
+    workers : Workers, optional
+    budget_s : float
+        For modules, from a frame's last row.
+    """
+
+    def __init__(
+        self,
+        make_pipeline: Callable[[Settings], SlopePipeline],
+        interleaving: Interleaving,
+        workers: Workers | None,
+        budget_s: float,
+    ) -> None:
+        self._make_pipeline, self._interleaving = make_pipeline, interleaving
+        self._workers, self._budget_s = workers, budget_s
+        self._made: WeakKeyDictionary[SlopePipeline, Programme] = WeakKeyDictionary()
+        self.ring: PixelRing | None = None
+        """Whose frames are being measured, if any."""
+        self.modules: Mapping[str, Module] = {}
+        """That new programmes have in place of built-in stages, by stage."""
+
+    def make(self, settings: Settings) -> SlopePipeline:
+        """Make the pipeline of these settings, and a programme for it; where there is a ring, for its frames.
+
+        Raises
+        ------
+        InputError
+            When the settings do not fit, or what an arm makes of them, or a module is refused.
+        """
+        pipeline = self._make_pipeline(settings)
+        pipelines = [
+            self._make_pipeline(settings.replace(**arm.changes)) if arm.changes else pipeline
+            for arm in self._interleaving.arms
+        ]
+        for each in pipelines:
+            check_light_is_known(each)
+        programme = Programme(pipelines, self.modules, self._workers, self._budget_s)
+        ring = self.ring
+        if ring is not None:
+            programme.paths(ring)
+        self._made[pipeline] = programme
+        return pipeline
+
+    def of(self, pipeline: SlopePipeline) -> Programme:
+        """Return what was made with a pipeline."""
+        return self._made[pipeline]
+
+
+def writable_view(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the same memory as an array of the kind that kernels are compiled for, which may be written to.
+
+    Nobody writes: it spares compiling every kernel once more for memory that is read-only.
+    """
+
+    class _Memory:
+        __array_interface__ = {  # noqa: RUF012 (what NumPy looks for)
+            **array.__array_interface__,
+            "data": (array.__array_interface__["data"][0], False),
+        }
+        owner = array
+
+    return np.asarray(_Memory())

@@ -1,0 +1,88 @@
+"""An engine that runs in a thread of the test, a camera that the test plays, and what is published."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+import faintspot as fs
+from faintspot.realtime.engine import Engine
+from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.telemetry import TelemetryReader
+
+LAYOUT = fs.Layout.grid((4, 4), pixels=8)
+CALIBRATION = fs.Calibration(100.0, read_noise_e=1.0)
+SETTINGS = fs.Settings(noise_std=1.0, keep_brightest=9)
+PATIENCE_S = 20.0
+
+
+def make(settings: fs.Settings) -> fs.SlopePipeline:
+    return fs.SlopePipeline(LAYOUT, settings, CALIBRATION)
+
+
+def simulated(n: int) -> NDArray[np.uint16]:
+    frames, _ = fs.simulate.sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        n,
+        flux_e=300.0,
+        detector=fs.simulate.Detector(1.0, offset_adu=100.0, bits=16),
+        rng=np.random.default_rng(8),
+    )
+    return np.asarray(frames, np.uint16)
+
+
+class Bench:
+    """Every frame that the engine measures is in `records`, in the order in which it was measured."""
+
+    def __init__(self, **options: Any) -> None:
+        self.name = f"fs_test_{uuid4().hex[:12]}"
+        self.engine = Engine(self.name, make, SETTINGS, **options)
+        self._thread = threading.Thread(target=self.engine.run)
+        self.telemetry = TelemetryReader.attach(self.name)
+        self._thread.start()
+
+    def ring(self, dtype: Any = np.uint16, shape: tuple[int, int] = LAYOUT.frame_shape) -> PixelRing:
+        return PixelRing.create(self.name, shape, dtype)
+
+    def until(self, condition: Any) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end, self.engine.status()
+            time.sleep(0.001)
+
+    def attached(self) -> None:
+        self.until(lambda: self.engine._waiting)
+
+    def detached(self) -> None:
+        self.until(lambda: self.engine.programmes.ring is None)
+
+    def send(self, ring: PixelRing, number: int, frame: NDArray[Any], rows: int = 5) -> None:
+        """Send a frame row by row, and wait until it has been measured."""
+        before = self.engine.counters.frames_in
+        slot = ring.begin(number)
+        for row in range(0, len(frame), rows):
+            slot[row : row + rows] = frame[row : row + rows]
+            ring.rows_ready(min(row + rows, len(frame)))
+        ring.end()
+        self.until(lambda: self.engine.counters.frames_in > before)
+
+    @property
+    def records(self) -> NDArray[Any]:
+        return self.telemetry.records_since(0)[0]
+
+    @property
+    def slopes(self) -> dict[int, NDArray[np.float32]]:
+        """Of every frame number, as measured last."""
+        return {int(each["frame"]): np.concatenate([each["x"], each["y"]]) for each in self.records}
+
+    def close(self) -> None:
+        self.engine.stop()
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
