@@ -34,7 +34,7 @@ Candidate = Callable[[], Any]
 Times = dict[str, NDArray[np.float64]]
 
 _SHORTEST_SAMPLE_S = 0.005  # far above the clock's resolution, short enough to fall between disturbances
-_PACKAGES = ("faintspot", "numpy", "numba", "llvmlite", "jax", "scikit-image")
+_PACKAGES = ("faintspot", "numpy", "numba", "llvmlite", "jax", "pyrtcao", "scikit-image")
 
 
 @dataclass(frozen=True)

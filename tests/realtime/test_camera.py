@@ -133,7 +133,7 @@ def test_overruns_are_counted_and_left_behind(ring: PixelRing, monkeypatch: pyte
     """On a clock of its own, where each frame takes 2.5 frame times."""
     now = [0]
 
-    def publish(self: Camera, moment: int) -> None:
+    def publish(self: Camera, moment: int, frame: object) -> None:
         assert now[0] >= moment
         starts.append(now[0])
         now[0] += 25_000_000 if len(starts) <= 3 else 1_000_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -108,12 +109,25 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C, or a request to end, sets: the frame under way is completed."""
+    """Give an event that Ctrl-C, or a request to end, sets: the frame under way is completed.
+
+    Python's own handlers run in the main thread, between two of its steps; where that thread waits in
+    compiled code, only the system's bytes into a socket, and a thread that reads them, come through.
+    """
     stop = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
+    reading, writing = socket.socketpair()
+    writing.setblocking(False)
     before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    wakeup = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
+    listener = threading.Thread(target=lambda: reading.recv(1) and stop.set(), daemon=True)
+    listener.start()
     try:
         yield stop
     finally:
+        signal.set_wakeup_fd(wakeup)
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
+        writing.close()  # ends the listener
+        listener.join()
+        reading.close()

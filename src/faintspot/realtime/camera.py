@@ -1,11 +1,13 @@
-"""A simulated camera: frames of moving spots, read out row by row at the pace of a real one."""
+"""Frames read out row by row at the pace of a camera, and a simulated one: frames of moving spots."""
 
 from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +20,9 @@ from faintspot.simulate import Detector, sensor_frames
 from faintspot.simulate.generators import spawn
 
 _SPIN_NS = 150_000  # a sleep wakes up later than asked for by up to this; the rest is spun
+_BETWEEN_REPORTS_NS = 100_000_000
+LATE = 0.1
+"""A frame that starts later than its moment by this part of the frame time counts as late."""
 
 
 class StopEvent(Protocol):
@@ -82,11 +87,14 @@ class CameraReport:
         Frame times of the schedule that went by without a frame, because the one before came too late.
     seconds : float
         From the start of the first frame to the end of the last one's frame time.
+    late : int
+        Frames that started later than their moment by more than `LATE` of the frame time.
     """
 
     frames: int
     overruns: int
     seconds: float
+    late: int = 0
 
     @property
     def frame_rate_hz(self) -> float:
@@ -94,7 +102,105 @@ class CameraReport:
         return self.frames / self.seconds if self.seconds else 0.0
 
 
-class Camera:
+class Readout(ABC):
+    """Publishes frames in a ring on a fixed schedule, row by row, at the pace of a camera.
+
+    Parameters
+    ----------
+    ring : PixelRing
+        Created by this process.
+    frame_rate_hz : float
+        Frames a second, up to 100,000.
+    readout_fraction : float
+        Part of the frame time in which the rows arrive, one after the other, 0 to 1. 0: all at once.
+    rows_per_block : int
+        Rows that are published together.
+    first_number : int
+        Number of the first frame.
+
+    Raises
+    ------
+    InputError
+        When a value is out of its range.
+    """
+
+    def __init__(
+        self,
+        ring: PixelRing,
+        *,
+        frame_rate_hz: float,
+        readout_fraction: float = 0.8,
+        rows_per_block: int = 4,
+        first_number: int = 0,
+    ) -> None:
+        rate = number_between("frame_rate_hz", frame_rate_hz, 0, 1e5, low_open=True)
+        fraction = number_between("readout_fraction", readout_fraction, 0, 1)
+        rows = ring.shape[0]
+        block = int(number_between("rows_per_block", rows_per_block, 1, rows, integer=True))
+        self._ring, self._period_ns, self._next = ring, 1e9 / rate, first_number
+        ends = [*range(block, rows, block), rows]
+        # First row, last row and, from the start of the frame, the moment of each block.
+        self._blocks = [
+            (first, last, round(fraction * self._period_ns * last / rows))
+            for first, last in zip([0, *ends[:-1]], ends, strict=True)
+        ]
+
+    @abstractmethod
+    def _frame(self) -> NDArray[Any] | None:
+        """Return frame number `_next`, None when there are no more."""
+
+    def run(
+        self,
+        n_frames: int | None = None,
+        stop: StopEvent | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> CameraReport:
+        """Publish frames until there are `n_frames`, none are left or `stop` is set; a later run goes on.
+
+        Frames start on a fixed schedule, which does not drift. A frame that is late is published as fast as
+        possible; when it leaves no time for the next one, that frame time is left out and counted as an
+        overrun. Frame numbers have no gaps then. `progress` is told the number of frames, ten times a second.
+
+        Raises
+        ------
+        InputError
+            When `n_frames` is not a whole number of at least 1.
+        """
+        limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
+        start, tick, published, late, told = time.monotonic_ns(), 0, 0, 0, 0
+        while (limit is None or published < limit) and not (stop is not None and stop.is_set()):
+            frame = self._frame()  # before its moment: it may have to be fetched
+            if frame is None:
+                break
+            moment = start + round(tick * self._period_ns)
+            _wait_until(moment)
+            now = time.monotonic_ns()
+            late += now - moment > LATE * self._period_ns
+            self._publish(moment, frame)
+            published += 1
+            tick = max(tick + 1, int((time.monotonic_ns() - start) // self._period_ns))
+            if progress is not None and now - told > _BETWEEN_REPORTS_NS:
+                progress(published)
+                told = now
+        if published:
+            # The last frame has its frame time, too, so that rates come out right.
+            _wait_until(start + round(tick * self._period_ns))
+        if progress is not None:
+            progress(published)
+        return CameraReport(published, tick - published, (time.monotonic_ns() - start) / 1e9, late)
+
+    def _publish(self, moment: int, frame: NDArray[Any]) -> None:
+        """Read out one frame that starts at that moment."""
+        ring = self._ring
+        slot = ring.begin(self._next)
+        for first, last, delay in self._blocks:
+            _wait_until(moment + delay)
+            slot[first:last] = frame[first:last]
+            ring.rows_ready(last)
+        self._next += 1
+
+
+class Camera(Readout):
     """Publishes simulated frames of a Shack-Hartmann sensor, row by row.
 
     The frames are simulated beforehand and shown in turn, for ever: frame number n is
@@ -159,11 +265,13 @@ class Camera:
                 f"ring: expected frames of {layout.frame_shape} and {readout_type(camera)}, "
                 f"got {ring.shape} and {ring.dtype}"
             )
-        rate = number_between("frame_rate_hz", frame_rate_hz, 0, 1e5, low_open=True)
-        fraction = number_between("readout_fraction", readout_fraction, 0, 1)
+        super().__init__(
+            ring,
+            frame_rate_hz=frame_rate_hz,
+            readout_fraction=readout_fraction,
+            rows_per_block=rows_per_block,
+        )
         count = int(number_between("n_distinct", n_distinct, 1, integer=True))
-        rows = layout.frame_shape[0]
-        block = int(number_between("rows_per_block", rows_per_block, 1, rows, integer=True))
         motion_rng, noise_rng = spawn(rng, 2)
         moving = SpotMotion() if motion is None else motion
         self.frames, self.truth = sensor_frames(
@@ -174,53 +282,16 @@ class Camera:
             flux_e=flux_e,
             profile=profile,
             size=size,
-            positions=moving.positions(count, len(layout), rate, motion_rng),
+            positions=moving.positions(count, len(layout), frame_rate_hz, motion_rng),
             detector=camera,
             rng=noise_rng,
         )
         self.frames.flags.writeable = self.truth.flags.writeable = False
-        self._ring, self._period_ns, self._next = ring, 1e9 / rate, 0
-        ends = [*range(block, rows, block), rows]
-        # First row, last row and, from the start of the frame, the moment of each block.
-        self._blocks = [
-            (first, last, round(fraction * self._period_ns * last / rows))
-            for first, last in zip([0, *ends[:-1]], ends, strict=True)
-        ]
 
-    def run(self, n_frames: int | None = None, stop: StopEvent | None = None) -> CameraReport:
-        """Publish frames until there are `n_frames` of them or `stop` is set; a later run goes on.
-
-        Frames start on a fixed schedule, which does not drift. A frame that is late is published as fast as
-        possible; when it leaves no time for the next one, that frame time is left out and counted as an
-        overrun. Frame numbers have no gaps then.
-
-        Raises
-        ------
-        InputError
-            When `n_frames` is not a whole number of at least 1.
-        """
-        limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
-        start, tick, published = time.monotonic_ns(), 0, 0
-        while (limit is None or published < limit) and not (stop is not None and stop.is_set()):
-            moment = start + round(tick * self._period_ns)
-            _wait_until(moment)
-            self._publish(moment)
-            published += 1
-            tick = max(tick + 1, int((time.monotonic_ns() - start) // self._period_ns))
-        if published:
-            # The last frame has its frame time, too, so that rates come out right.
-            _wait_until(start + round(tick * self._period_ns))
-        return CameraReport(published, tick - published, (time.monotonic_ns() - start) / 1e9)
-
-    def _publish(self, moment: int) -> None:
-        """Read out one frame that starts at that moment."""
-        frame, ring = self.frames[self._next % len(self.frames)], self._ring
-        slot = ring.begin(self._next)
-        for first, last, delay in self._blocks:
-            _wait_until(moment + delay)
-            slot[first:last] = frame[first:last]
-            ring.rows_ready(last)
-        self._next += 1
+    def _frame(self) -> NDArray[Any]:
+        """Return frame number `_next`."""
+        frame: NDArray[Any] = self.frames[self._next % len(self.frames)]
+        return frame
 
 
 def readout_type(detector: Detector) -> np.dtype[np.generic]:

@@ -6,7 +6,7 @@ another one beside the running system and takes it between two frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +69,7 @@ class _Groups:
         kernel, _, shape = made[0]
         gravity = kernel is not located.locate_groups
         self._kernel = streaming.stream_gravity if gravity else streaming.stream_located
+        self._direct: Callable[..., int] | None = None
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
         self._scratch = [
             new_scratch(lanes, *window) if shape is None else new_spot_scratch(lanes, *window, *shape)
@@ -88,7 +89,7 @@ class _Groups:
         first, last = self._groups
         start = first + (last - first) * share // self._shares
         stop = first + (last - first) * (share + 1) // self._shares
-        done: int = self._kernel(
+        arguments = (
             progress.cells,
             progress.frame_cell,
             progress.rows_cell,
@@ -101,7 +102,12 @@ class _Groups:
             self._before[slot],
             (self._scratch[share], *after),
         )
-        return done == stop
+        if self._direct is None:
+            # Finding out which types it was compiled for takes several times as long as a frame: done once.
+            self._kernel(*arguments)
+            types = tuple(self._kernel.typeof_pyval(argument) for argument in arguments)
+            self._direct = self._kernel.overloads[types].entry_point
+        return self._direct(*arguments) == stop
 
 
 class FramePath:

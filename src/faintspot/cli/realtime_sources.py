@@ -1,0 +1,120 @@
+"""faintspot realtime replay and bridge: recorded frames, and other software's, take the camera's place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+
+import click
+
+from faintspot.cli.progress import progress_bar
+from faintspot.cli.realtime_camera import stop_on_signal
+
+_HEAD_START_S = 0.5
+_RING = click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring.")
+_SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
+
+
+@click.command("replay", short_help="Publish recorded frames as a camera would.")
+@click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
+@_RING
+@click.option("--rate", type=float, metavar="HZ", default=500.0, show_default=True, help="Frames a second.")
+@click.option("--repeat", is_flag=True, help="Begin again at the end, until Ctrl-C.")
+@click.option(
+    "--rows-per-block", type=int, metavar="K", help="Row by row, K at a time. Default: whole frames."
+)
+@click.option("--first", type=int, default=0, show_default=True, help="Where to begin, counted from 0.")
+@click.option("--frames", "count", type=int, metavar="N", help="How many from there on. Default: all.")
+@click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@_SLOTS
+def replay(
+    frames: tuple[str, ...],
+    name: str,
+    rate: float,
+    repeat: bool,
+    rows_per_block: int | None,
+    first: int,
+    count: int | None,
+    key: str | None,
+    slots: int,
+) -> None:
+    """Publish recorded frames in the pixel ring NAME at a given rate, for `faintspot realtime run`.
+
+    FRAMES are FITS files (plain, .gz, .fz; images or cubes), .npy, .npz or Zarr, in the order given, as for
+    `faintspot slopes`; they are read ahead in blocks. Frames start on a fixed schedule, half a second after
+    the ring is there, so that an engine that waits for it misses none; a frame's number is its place in
+    the sequence. With --rows-per-block rows arrive at the pace of a read-out that takes 80 % of the frame
+    time. Ctrl-C ends it.
+
+    \b
+    Examples:
+      faintspot realtime replay night1.fits night2.fits.gz --rate 300
+      faintspot realtime replay cube.npy --rate 1000 --rows-per-block 4 --first 500 --frames 1000 --repeat
+    """
+    from faintspot.io import open_frames
+    from faintspot.realtime.pixel_ring import PixelRing
+    from faintspot.realtime.replay import Replay, quick_switching, ring_type
+
+    with (
+        stop_on_signal() as stop,
+        quick_switching(),
+        open_frames(frames, key=key) as source,
+        PixelRing.create(name, source.shape, ring_type(source.dtype), slots=slots) as ring,
+        Replay(
+            source,
+            ring,
+            frame_rate_hz=rate,
+            first=first,
+            n_frames=count,
+            repeat=repeat,
+            rows_per_block=rows_per_block,
+        ) as player,
+    ):
+        rows, columns = source.shape
+        often = "repeatedly" if repeat else "once"
+        played = count or source.n_frames - first
+        click.echo(
+            f"{name}: {rows} x {columns} pixels ({source.dtype} as {ring.dtype}), {played} frames of "
+            f"{source.description} {often}, {rate:g} frames/s; Ctrl-C stops"
+        )
+        stop.wait(_HEAD_START_S)
+        with progress_bar("replay") if not repeat else nullcontext() as advance:
+            report = player.run(None, stop, _telling(advance, played))
+    click.echo(
+        f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.late} started late, "
+        f"{report.overruns} frame times without a frame"
+    )
+
+
+def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable[[int], None] | None:
+    """Return what tells a progress bar the number of frames."""
+    return None if advance is None else lambda published: advance(published, total)
+
+
+@click.command("bridge", short_help="Follow the frames of a pyshmem stream.")
+@click.argument("stream")
+@_RING
+@click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
+@_SLOTS
+def bridge(stream: str, name: str, frames: int | None, slots: int) -> None:
+    """Pass the frames of the pyshmem stream STREAM on to the pixel ring NAME, for `faintspot realtime run`.
+
+    The stream may come later, go away and come back, also with frames of another size. Frames keep the
+    number that their producer gave them (frame_id); where it gives none they are counted, from 0. uint16
+    frames stay so, other real ones become float32. Ctrl-C ends it.
+
+    \b
+    Example, for the raw frames of pyRTC's wavefront sensor:
+      faintspot realtime bridge wfs_raw
+    """
+    from faintspot.realtime.bridge import StreamBridge
+
+    with stop_on_signal() as stop:
+        counters = StreamBridge(
+            stream, name, say=lambda line: click.echo(f"{name}: {line}"), slots=slots
+        ).run(frames, stop)
+    click.echo(
+        f"{name}: {counters.frames} frames, {counters.missed} missed, {counters.incomplete} incomplete, "
+        f"{counters.not_ahead} with a number not ahead; {counters.stalls} stalls, "
+        f"{counters.restarts} restarts of the stream"
+    )

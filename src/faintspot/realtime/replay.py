@@ -1,0 +1,184 @@
+"""Recorded frames as a source: read ahead from files, published in a pixel ring at the pace of a camera."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import chain
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.io import FrameSource
+from faintspot.realtime.camera import CameraReport, Readout, StopEvent
+from faintspot.realtime.pixel_ring import PixelRing
+
+_BLOCK_BYTES, _BLOCKS_AHEAD = 4 << 20, 8
+_LOOK_S = 0.05  # between two looks at whether to stop, while waiting for the disk or for room
+_SWITCH_S = 50e-6  # the thread that reads must not hold up the one that publishes for longer
+
+
+def ring_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type in which frames of that type travel to the engine: uint16 stays, others become float32.
+
+    Raises
+    ------
+    InputError
+        For what is not a real number.
+    """
+    if dtype.kind not in "iuf":
+        raise InputError(f"frames: expected real numbers, got dtype {dtype}")
+    return np.dtype(np.uint16 if dtype == np.uint16 else np.float32)
+
+
+class Replay(Readout):
+    """Publishes recorded frames; as a context manager it reads ahead meanwhile.
+
+    The first frame's number is its place in the sequence, and numbers have no gaps: with `repeat`, number
+    n is frame first + (n - first) % n_frames. A thread reads blocks of 4 MiB ahead, eight at most, so that
+    the size of the files does not matter.
+
+    Parameters
+    ----------
+    source : FrameSource
+        Of `faintspot.io.open_frames`.
+    ring : PixelRing
+        Created by this process, of the frames' shape and `ring_type`.
+    frame_rate_hz : float
+    first : int
+        Where to begin, counted from 0.
+    n_frames : int, optional
+        How many frames from there on. Default: all.
+    repeat : bool
+        Begin again at the end, for ever.
+    rows_per_block : int, optional
+        Rows that are published together, at the pace of a read-out that takes 80 % of the frame time.
+        Default: whole frames.
+
+    Attributes
+    ----------
+    n_frames : int or None
+        How many frames there are to publish; None with `repeat`.
+
+    Raises
+    ------
+    InputError
+        When a value is out of its range, or the ring does not fit; while it runs, when a file is damaged.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        ring: PixelRing,
+        *,
+        frame_rate_hz: float,
+        first: int = 0,
+        n_frames: int | None = None,
+        repeat: bool = False,
+        rows_per_block: int | None = None,
+    ) -> None:
+        expected = source.shape, ring_type(source.dtype)
+        if (ring.shape, ring.dtype) != expected:
+            raise InputError(f"ring: expected frames of {expected}, got {ring.shape} and {ring.dtype}")
+        begin = int(number_between("first", first, 0, source.n_frames - 1, integer=True))
+        left = source.n_frames - begin
+        count = left if n_frames is None else int(number_between("n_frames", n_frames, 1, left, integer=True))
+        super().__init__(
+            ring,
+            frame_rate_hz=frame_rate_hz,
+            readout_fraction=0.0 if rows_per_block is None else 0.8,
+            rows_per_block=ring.shape[0] if rows_per_block is None else rows_per_block,
+            first_number=begin,
+        )
+        self.n_frames = None if repeat else count
+        self._source, self._range = source, (begin, begin + count)
+        self._ahead: queue.Queue[NDArray[Any] | InputError | None] = queue.Queue(_BLOCKS_AHEAD)
+        self._block: Iterator[NDArray[Any]] = iter(())
+        self._ending = threading.Event()
+        self._stop: StopEvent = self._ending
+        self._reader = threading.Thread(target=self._read, name="faintspot-reader", daemon=True)
+
+    def run(
+        self,
+        n_frames: int | None = None,
+        stop: StopEvent | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> CameraReport:
+        """Publish frames as `Readout.run` does; the schedule starts when the first one has been read."""
+        self._stop = self._ending if stop is None else stop
+        frame = self._frame()
+        if frame is not None:
+            self._block = chain([frame], self._block)
+        return super().run(n_frames, stop, progress)
+
+    def __enter__(self) -> Self:
+        self._reader.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._reader.join()
+
+    def _frame(self) -> NDArray[Any] | None:
+        """Return the next frame; None at the end."""
+        while (frame := next(self._block, None)) is None:
+            try:
+                block = self._ahead.get(timeout=_LOOK_S)
+            except queue.Empty:
+                if self._stop.is_set():
+                    return None
+                continue
+            if block is None or isinstance(block, InputError):
+                self._ahead.put(block)  # a later call finds it again
+                if block is not None:
+                    raise block
+                return None
+            self._block = iter(block)
+        return frame
+
+    def _read(self) -> None:
+        """Read blocks ahead until the end, or until nobody wants them any more; in a thread of its own."""
+        source, dtype = self._source, self._ring.dtype
+        size = max(1, _BLOCK_BYTES // (source.shape[0] * source.shape[1] * source.dtype.itemsize))
+        going = True
+        try:
+            while going:
+                for _, block in source.blocks(*self._range, size):
+                    with np.errstate(over="ignore"):  # what float32 cannot hold is infinite: a bad pixel
+                        going = self._handed_over(block.astype(dtype, copy=False))
+                    if not going:
+                        return
+                going = self.n_frames is None
+            self._handed_over(None)
+        except InputError as error:
+            self._handed_over(error)
+
+    def _handed_over(self, block: NDArray[Any] | InputError | None) -> bool:
+        """Wait for room, and put it there; return False when it is not wanted any more."""
+        while not self._ending.is_set():
+            try:
+                self._ahead.put(block, timeout=_LOOK_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+
+@contextmanager
+def quick_switching() -> Iterator[None]:
+    """Let threads of this process take turns after 50 us instead of 5 ms, for as long as it lasts."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)

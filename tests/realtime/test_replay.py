@@ -1,0 +1,256 @@
+"""Recorded frames as a source: the frames of the files, in order, at the rate, and an end in order."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import faintspot
+from faintspot.cli import realtime_sources
+from faintspot.cli.realtime_sources import replay
+from faintspot.errors import InputError
+from faintspot.io import FrameSource, open_frames
+from faintspot.realtime import replay as replay_module
+from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.pixel_segment import FOLDER
+from faintspot.realtime.replay import Replay, quick_switching, ring_type
+
+pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+SHAPE = (6, 5)
+
+
+@pytest.fixture
+def name() -> Iterator[str]:
+    chosen = f"fs_test_{uuid4().hex[:12]}"
+    yield chosen
+    (FOLDER / chosen).unlink(missing_ok=True)
+
+
+def cube(n: int, dtype: str = "uint16") -> np.ndarray:
+    return np.random.default_rng(n).integers(0, 250, (n, *SHAPE)).astype(dtype)
+
+
+def stored(folder: Path, frames: np.ndarray) -> Path:
+    path = folder / "frames.npy"
+    np.save(path, frames)
+    return path
+
+
+def played(name: str, path: Path, *, slots: int = 64, n_frames: int | None = None, **options: Any) -> Any:
+    """Play files at speed; the report, and what lies in the ring afterwards, by number."""
+    with (
+        open_frames([path]) as source,
+        PixelRing.create(name, source.shape, ring_type(source.dtype), slots=slots) as ring,
+        Replay(source, ring, frame_rate_hz=5e3, **options) as player,
+    ):
+        report = player.run(n_frames)
+        newest = ring.progress()[0]
+        numbers = range(max(0, newest - slots + 1), newest + 1)
+        return report, {number: ring.slot(number).copy() for number in numbers if ring.intact(number)}
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "int32", "float32", "float64", ">i2"])
+@pytest.mark.parametrize("block_bytes", [1, 10_000_000])
+def test_frames_are_those_of_the_file(
+    name: str, tmp_path: Path, dtype: str, block_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replay_module, "_BLOCK_BYTES", block_bytes)
+    frames = cube(20, dtype)
+    report, seen = played(name, stored(tmp_path, frames))
+    assert report.frames == 20
+    assert list(seen) == list(range(20))
+    for number, frame in seen.items():
+        assert frame.dtype == (np.uint16 if dtype == "uint16" else np.float32)
+        np.testing.assert_array_equal(frame, frames[number])
+
+
+def test_a_part_of_it_repeatedly(name: str, tmp_path: Path) -> None:
+    frames = cube(20)
+    report, seen = played(name, stored(tmp_path, frames), first=5, n_frames=None, repeat=False)
+    assert report.frames == 15
+    assert list(seen) == list(range(5, 20))
+    with (
+        open_frames([stored(tmp_path, frames)]) as source,
+        PixelRing.create(name, SHAPE, np.uint16, slots=64) as ring,
+        Replay(source, ring, frame_rate_hz=5e3, first=5, n_frames=4, repeat=True) as player,
+    ):
+        assert player.n_frames is None
+        assert player.run(10).frames == 10
+        assert player.run(1).frames == 1
+        for number in range(5, 16):
+            np.testing.assert_array_equal(ring.slot(number), frames[5 + (number - 5) % 4])
+
+
+def test_nan_and_what_float32_cannot_hold(name: str, tmp_path: Path) -> None:
+    frames = cube(2, "float64")
+    frames[0, 1, 2], frames[1, 0, 0] = np.nan, 1e300
+    _, seen = played(name, stored(tmp_path, frames))
+    assert np.isnan(seen[0][1, 2])
+    assert np.isinf(seen[1][0, 0])
+
+
+def test_rows_in_blocks(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said, seen = PixelRing.rows_ready, []
+
+    def watched(self: PixelRing, rows: int) -> None:
+        said(self, rows)
+        seen.append(self.progress())
+
+    monkeypatch.setattr(PixelRing, "rows_ready", watched)
+    played(name, stored(tmp_path, cube(2)), rows_per_block=4)
+    assert seen == [(0, 4), (0, 6), (1, 4), (1, 6)]
+    seen.clear()
+    played(name, stored(tmp_path, cube(2)))
+    assert seen == [(0, 6), (1, 6)]
+
+
+def test_a_damaged_file(name: str, tmp_path: Path) -> None:
+    """What comes before the damage is played; then one line says which frame is lost."""
+    frames, path = cube(2000), tmp_path / "frames.fits.gz"
+    fits = pytest.importorskip("astropy.io.fits")
+    fits.writeto(tmp_path / "frames.fits", frames.astype(np.int16))
+    whole = gzip.compress((tmp_path / "frames.fits").read_bytes())
+    path.write_bytes(whole[: len(whole) * 3 // 4])
+    with pytest.raises(InputError, match="cannot be read: the file is damaged") as caught:
+        played(name, path, rows_per_block=None)
+    assert "\n" not in str(caught.value)
+    assert not (FOLDER / name).exists()
+
+
+def test_stop_while_the_disk_is_slow(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stop, released = threading.Event(), threading.Event()
+    read = FrameSource.block
+
+    def slow(self: Any, start: int, end: int) -> Any:
+        released.wait(30.0)
+        return read(self, start, end)
+
+    monkeypatch.setattr(FrameSource, "block", slow)
+    with (
+        open_frames([stored(tmp_path, cube(4))]) as source,
+        PixelRing.create(name, SHAPE, np.uint16) as ring,
+    ):
+        player = Replay(source, ring, frame_rate_hz=100.0)
+        with player:
+            threading.Timer(0.1, stop.set).start()
+            assert player.run(None, stop).frames == 0
+            released.set()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"first": -1}, "first = -1"),
+        ({"first": 4}, "first = 4"),
+        ({"first": 2, "n_frames": 3}, "n_frames = 3"),
+        ({"n_frames": 0}, "n_frames = 0"),
+        ({"frame_rate_hz": 0.0}, "frame_rate_hz = 0"),
+        ({"rows_per_block": 7}, "rows_per_block = 7"),
+    ],
+)
+def test_bad_options(name: str, tmp_path: Path, options: dict[str, Any], text: str) -> None:
+    with (
+        open_frames([stored(tmp_path, cube(4))]) as source,
+        PixelRing.create(name, SHAPE, np.uint16) as ring,
+        pytest.raises(InputError, match=text) as caught,
+    ):
+        Replay(source, ring, **{"frame_rate_hz": 100.0, **options})
+    assert "\n" not in str(caught.value)
+
+
+def test_the_ring_must_fit(name: str, tmp_path: Path) -> None:
+    with (
+        open_frames([stored(tmp_path, cube(4))]) as source,
+        PixelRing.create(name, SHAPE, np.float32) as ring,
+        pytest.raises(InputError, match="ring: expected"),
+    ):
+        Replay(source, ring, frame_rate_hz=100.0)
+    with pytest.raises(InputError, match="real numbers"):
+        ring_type(np.dtype(complex))
+
+
+def test_switching_is_put_back() -> None:
+    before = sys.getswitchinterval()
+    with quick_switching():
+        assert sys.getswitchinterval() < before
+    assert sys.getswitchinterval() == before
+
+
+# ---- the command
+
+
+@pytest.fixture
+def no_head_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realtime_sources, "_HEAD_START_S", 0.0)
+
+
+@pytest.mark.usefixtures("no_head_start")
+def test_command(name: str, tmp_path: Path) -> None:
+    path = stored(tmp_path, cube(30))
+    options = [str(path), "--name", name, "--rate", "2000", "--first", "5", "--frames", "20"]
+    result = CliRunner().invoke(replay, options)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    for text in (name, "6 x 5 pixels", "uint16", "20 frames of", "once", "2000 frames/s"):
+        assert text in lines[0]
+    assert "20 frames, " in lines[-1]
+    assert "started late" in lines[-1]
+    assert not (FOLDER / name).exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("no_head_start")
+def test_command_refuses(name: str, tmp_path: Path) -> None:
+    path = str(stored(tmp_path, cube(4)))
+    for more, text in (
+        ([path, "--rate", "-5"], "frame_rate_hz = -5"),
+        ([path, "--first", "9"], "first = 9"),
+        ([str(tmp_path / "none.npy")], "none.npy"),
+    ):
+        result = CliRunner().invoke(replay, [*more, "--name", name])
+        assert isinstance(result.exception, InputError)
+        assert text in str(result.exception)
+        assert not (FOLDER / name).exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_command_ends_in_order(name: str, tmp_path: Path, number: signal.Signals) -> None:
+    path = stored(tmp_path, cube(30))
+    code = "from faintspot.cli.realtime_sources import replay; replay()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path), "--name", name, "--rate", "200", "--repeat"],
+        env={**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    reader = None
+    for _ in range(3000):
+        try:
+            reader = PixelRing.attach(name)
+            break
+        except InputError:
+            time.sleep(0.01)
+    assert reader is not None
+    while reader.progress()[0] < 40:  # more than there are in the file
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(number)
+    out, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert len(out.splitlines()) == 2
+    assert reader.closed
+    assert not (FOLDER / name).exists()
