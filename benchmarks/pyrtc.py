@@ -11,14 +11,11 @@ iterations; its time includes dark, bad and saturated pixels, standard errors an
 - Functions alone, one thread, candidates in turn. pyRTC: its compiled function, called as its `SlopesProcess`
   calls it; and what `SlopesProcess` does with a frame in all, which adds gathering the valid slopes and their
   two-dimensional map. faintspot: the compiled code (a frame's part of a call with 64 frames), the offline
-  pipeline called with one frame, and the real-time path called for one frame whose rows are all there. That
-  call takes long because Numba looks at the types of all arguments; in real time that is before the frame.
+  pipeline called with one frame, and the real-time path called for one frame whose rows are all there.
 - Stream to stream: a frame is published in a pyshmem stream (with `notify`, as pyRTC's are), the slopes come
   out in another; the time is between the stamps of the two publications (`write_time`). pyRTC: one process,
-  `SlopesProcess` with its worker thread. faintspot: bridge and engine, two processes. 300 frames/s, blocks of
-  frames in turn; the engine, which never sleeps, is halted (SIGSTOP) while pyRTC has its turn. With two
-  processors in all the bridge waits as pyRTC does, to be woken; with more it looks at the stream always.
-  Other work on the machine displaces faintspot's two processes more often than pyRTC's one: look at the load.
+  `SlopesProcess` with its worker thread. faintspot: one process, `faintspot realtime run --stream`. 300
+  frames/s, blocks of frames in turn; the engine is halted (SIGSTOP) while pyRTC has its turn.
 """
 
 from __future__ import annotations
@@ -221,8 +218,7 @@ class _Systems:
         self._started = [
             subprocess.Popen(arguments, cwd=where, stdout=subprocess.DEVNULL)
             for arguments, where in (
-                ([*command, "run", "--name", name], folder),
-                ([*command, "bridge", f"{name}_wfs_raw", "--name", name], folder),
+                ([*command, "run", "--stream", f"{name}_wfs_raw", "--name", name], folder),
                 ([sys.executable, "-m", "benchmarks.pyrtc", name], None),
             )
         ]

@@ -41,8 +41,8 @@ def simulated(n: int) -> NDArray[np.uint16]:
 class Bench:
     """Every frame that the engine measures is in `records`, in the order in which it was measured."""
 
-    def __init__(self, **options: Any) -> None:
-        self.name = f"fs_test_{uuid4().hex[:12]}"
+    def __init__(self, name: str | None = None, **options: Any) -> None:
+        self.name = name or f"fs_test_{uuid4().hex[:12]}"
         self.engine = Engine(self.name, make, SETTINGS, **options)
         self._thread = threading.Thread(target=self.engine.run)
         self.telemetry = TelemetryReader.attach(self.name)

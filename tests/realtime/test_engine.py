@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from uuid import uuid4
+
 import numpy as np
 import pytest
 from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
+from faintspot.realtime.bridge import StreamBridge
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.interleaving import Interleaving
 
@@ -119,3 +122,29 @@ def test_numbers_are_skipped_and_begin_anew(bench: Bench) -> None:
 def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:
     with pytest.raises(fs.InputError, match="a living process publishes under this name"):
         Engine(bench.name, make, SETTINGS)
+
+
+def test_frames_of_a_stream() -> None:
+    """The engine follows a pyshmem stream itself, also when it comes back with another size."""
+    data = simulated(4)
+    expected = make(SETTINGS)(data).vector
+    name = f"fs_test_{uuid4().hex[:12]}"
+    bench = Bench(f"{name}_ring", source=StreamBridge(name, f"{name}_ring"))
+    try:
+        for shape in (data.shape[1:], (64, 64), data.shape[1:]):
+            stream = pyshmem.create(name, shape=shape, dtype=np.uint16)
+            if shape != data.shape[1:]:
+                bench.until(lambda: bench.engine.status()["source_refused"] is not None)
+            else:
+                sent = bench.engine.counters.processed
+                for number in (1, 2, 3):
+                    while bench.engine.counters.processed == sent:  # the first ones come before it looks
+                        stream.write(data[number], frame_id=number)
+                        bench.until(lambda: True)
+                    sent = bench.engine.counters.processed
+            stream.close()
+            pyshmem.unlink(name)
+        assert bench.engine.counters.processed >= 6
+        assert np.array_equal(bench.slopes[3], expected[3])
+    finally:
+        bench.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from typing import Any
 
 import click
@@ -19,6 +20,7 @@ from faintspot.realtime.private_socket import socket_path
 @click.option(
     "--name", default="faintspot", show_default=True, help="Of the pixel ring, the streams and the engine."
 )
+@click.option("--stream", metavar="NAME", help="Take whole frames from this pyshmem stream.")
 @click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Workers.")
 @click.option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
 @click.option(
@@ -52,6 +54,7 @@ from faintspot.realtime.private_socket import socket_path
 def run(
     config: str,
     name: str,
+    stream: str | None,
     threads: int,
     cpus: str | None,
     priority: int,
@@ -64,9 +67,9 @@ def run(
 ) -> None:
     """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
 
-    Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row; the
-    engine waits for it, and for its return. Each group of sub-apertures is measured as soon as its last row
-    is there. Slopes go out as the pyshmem streams NAME_slopes (all x, then all y, px), NAME_details and
+    Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row, or whole
+    from a pyshmem stream; the engine waits for it, and for its return. Each group of sub-apertures is measured
+    as soon as its last row is there. Slopes go out as the pyshmem streams NAME_slopes (all x, then all y, px), NAME_details and
     NAME_marks, each stamped with the frame's number; `faintspot realtime record` keeps them in a file.
 
     \b
@@ -74,6 +77,7 @@ def run(
       faintspot realtime run --interleave none,tv --every 50
     """
     from faintspot.pipeline import SlopePipeline
+    from faintspot.realtime.bridge import StreamBridge
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.handlers import handlers_of
@@ -91,6 +95,7 @@ def run(
         settings,
         threads=threads,
         cpus=processors,
+        source=None if stream is None else StreamBridge(stream, name, say=partial(click.echo, err=True)),
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
         deadline_s=deadline * 1e-6,
         images_every=images_every,

@@ -100,7 +100,7 @@ class StreamBridge:
         self._source: Any = None
         self._ring: PixelRing | None = None
         self._seen, self._last_number = 0, -1
-        self._arrived, self._silent = -math.inf, True
+        self._arrived, self._silent, self._told = -math.inf, True, ""
 
     def run(self, n_frames: int | None = None, stop: StopEvent | None = None) -> BridgeCounters:
         """Follow the stream until so many frames have passed or `stop` is set.
@@ -111,26 +111,41 @@ class StreamBridge:
             When somebody else writes into the ring, or shared memory is short.
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
-        counters, told = self.counters, ""
+        counters = self.counters
         try:
             while not (stop is not None and stop.is_set()) and (limit is None or counters.frames < limit):
-                if self._source is None:
-                    obstacle = self._open()
-                    if obstacle and obstacle != told:
-                        self._say(f"stream {self.stream}: {obstacle}; waiting")
-                    told = obstacle
-                    if obstacle:
-                        time.sleep(_LOOK_S)
-                elif self._new_one():
-                    self._pass_on()
-                else:
-                    self._look_after()
+                self.step()
         finally:
-            self._let_go()
-            if self._ring is not None:
-                self._ring.close()
-                self._ring = None
+            self.close()
         return counters
+
+    def step(self) -> bool:
+        """Follow the stream for a moment, 0.1 s at most; return whether a frame has come through.
+
+        Raises
+        ------
+        InputError
+            As `run`.
+        """
+        if self._source is None:
+            obstacle = self._open()
+            if obstacle and obstacle != self._told:
+                self._say(f"stream {self.stream}: {obstacle}; waiting")
+            self._told = obstacle
+            if obstacle:
+                time.sleep(_LOOK_S)
+        elif self._new_one():
+            return self._pass_on()
+        else:
+            self._look_after()
+        return False
+
+    def close(self) -> None:
+        """Let go of the stream and remove the ring."""
+        self._let_go()
+        if self._ring is not None:
+            self._ring.close()
+            self._ring = None
 
     # ---- one frame
 
@@ -152,8 +167,8 @@ class StreamBridge:
             return bool(source.count != seen)
         return True
 
-    def _pass_on(self) -> None:
-        """Copy the newest publication into the ring, straight from the stream."""
+    def _pass_on(self) -> bool:
+        """Copy the newest publication into the ring; return whether it was whole."""
         source, ring, counters = self._source, self._ring, self.counters
         assert ring is not None
         expected = _number(source.frame_id, source.count)
@@ -164,7 +179,7 @@ class StreamBridge:
         except (TimeoutError, self._pyshmem.InconsistentStreamError):
             counters.incomplete += 1
             self._seen = source.count
-            return
+            return False
         number = _number(publication.frame_id, publication.count)
         if number != expected:  # a newer one came meanwhile
             ring.begin(number)[...] = slot.copy()
@@ -176,6 +191,7 @@ class StreamBridge:
             self._say(f"stream {self.stream}: goes on")
         self._seen, self._last_number = publication.count, number
         self._arrived, self._silent = time.monotonic(), False
+        return True
 
     # ---- the stream
 

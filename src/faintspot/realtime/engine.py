@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -30,6 +30,18 @@ DEADLINE_S = 1e-3
 IMAGES_EVERY = 100
 
 
+class FrameSource(Protocol):
+    """What brings frames into the ring in the engine's own thread."""
+
+    def step(self) -> bool:
+        """Wait a moment for a frame; return whether one has come."""
+        ...
+
+    def close(self) -> None:
+        """Let go of everything."""
+        ...
+
+
 class Engine:
     """Measures the frames of a pixel ring and publishes their slopes, until it is told to stop.
 
@@ -49,6 +61,9 @@ class Engine:
         Several states of the settings, in turn.
     deadline_s : float
         From a frame's last row; slopes that come later count as late.
+    source : FrameSource, optional
+        Brings frames into the ring when it is asked to, by the thread that measures them: a `StreamBridge`.
+        Default: another process writes into the ring.
     images_every : int
         Of so many frames of an arm, telemetry keeps one's images; 0: of none.
 
@@ -67,6 +82,7 @@ class Engine:
         threads: int = 1,
         cpus: Sequence[int] | None = None,
         interleaving: Interleaving | None = None,
+        source: FrameSource | None = None,
         deadline_s: float = DEADLINE_S,
         images_every: int = IMAGES_EVERY,
     ) -> None:
@@ -75,7 +91,7 @@ class Engine:
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
         """What of the real-time manners was not permitted."""
-        self._unfit: str | None = None
+        self._source, self._unfit = source, ""
         self._path: Path | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the frame that was measured last
@@ -107,7 +123,7 @@ class Engine:
         return {
             "name": self.name,
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
-            "source_refused": self._unfit,
+            "source_refused": self._unfit or None,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator,
@@ -128,7 +144,7 @@ class Engine:
                 while not self._done(n_frames):
                     ring = self._attached()
                     if ring is None:
-                        self._stopping.wait(_WATCH_S)
+                        self._await_ring()
                         continue
                     self.programmes.ring = ring
                     self._follow(ring, n_frames)
@@ -138,24 +154,33 @@ class Engine:
             watcher.join()
             if self._workers is not None:
                 self._workers.close()
+            if self._source is not None:
+                self._source.close()
             self._streams.close()
             self._telemetry.close()
 
     def _done(self, n_frames: int | None) -> bool:
         return self._stopping.is_set() or (n_frames is not None and self.counters.processed >= n_frames)
 
+    def _await_ring(self) -> None:
+        """Give the source time to make one."""
+        if self._source is None:
+            self._stopping.wait(_WATCH_S)
+        else:
+            self._source.step()
+
     def _attached(self) -> PixelRing | None:
         """Return the source's ring, None where there is none that lives and fits."""
         try:
             ring = PixelRing.attach(self.name)
         except InputError:
-            self._unfit = None
+            self._unfit = ""
             return None
         if ring.stale or ring.closed:
             return None
         shape, wanted = ring.shape, self.live.pipeline.layout.frame_shape
         fits = shape == wanted and ring.dtype in (np.uint16, np.float32)
-        self._unfit = None
+        self._unfit = ""
         if not fits:
             self._unfit = (
                 f"frames of {shape[0]} x {shape[1]} pixels, {ring.dtype}; "
@@ -170,6 +195,11 @@ class Engine:
             self._workers.wake()
         self._arrival, self._number = ring.arrivals, ring.progress()[0]
         while not self._done(n_frames):
+            if self._source is not None and not self._source.step():
+                if ring.closed:
+                    self.counters.source_restarts += 1
+                    break
+                continue
             path, arm = self._take(ring)
             self._path, self._waiting = path, True
             arrival = self._arrival + 1
