@@ -8,10 +8,11 @@ import click
 
 from faintspot.errors import InputError
 from faintspot.io.locations import split_location
+from faintspot.loop.recognise import holds_loop_results
 from faintspot.study.recognise import study_attributes
 
 
-@click.command(short_help="Make a web page of pictures and tables from slopes or a study.")
+@click.command(short_help="Make a web page of pictures and tables from slopes, a study or a loop.")
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER_ARM]")
 @click.option(
     "--output", "-o", metavar="HTML", help="Page to write. Default: the first file's name with .html."
@@ -20,19 +21,21 @@ from faintspot.study.recognise import study_attributes
     "--frames", multiple=True, metavar="FILE", help="The frames, if they are no longer where they were."
 )
 def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]) -> None:
-    """Make a web page of pictures and tables from slopes or a study.
+    """Make a web page of pictures and tables from slopes, a study or a closed loop.
 
     SLOPES is what `faintspot slopes` wrote; with a second one of the same frames (say, without denoising) the
     page compares the two. It holds the frame raw, calibrated, denoised and after the background subtraction,
     flux and validity maps, slope arrows, iterations and slope jitter, in one file without any links outside.
 
-    The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
+    The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts; so does
+    the folder of a closed-loop experiment (`faintspot loop`).
 
     \b
     Examples:
       faintspot report slopes.zarr
       faintspot report slopes.zarr plain.zarr -o comparison.html
       faintspot report paper.zarr
+      faintspot report canary -o canary.html
     """
     from faintspot.report import report_of_stored, report_of_study, write_report
 
@@ -45,6 +48,13 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
         )
     for name in frames:
         split_location(name)  # refuses what is not there
+    if len(paths) == 1 and holds_loop_results(paths[0]):
+        from faintspot.report.loop_page import write_loop_report
+
+        page = Path(output) if output is not None else paths[0] / "report.html"
+        write_loop_report(paths[0], page)
+        click.echo(f"{page}: open it in a browser")
+        return
     if len(paths) == 1 and study_attributes(paths[0]) is not None:
         html = report_of_study(paths[0])
     else:

@@ -195,7 +195,9 @@ class Engine:
             self._workers.wake()
         self._arrival, self._number = ring.arrivals, ring.progress()[0]
         while not self._done(n_frames):
-            if self._source is not None and not self._source.step():
+            # What is in the ring already comes first: else every later frame would wait for its successor.
+            behind = ring.arrivals > self._arrival
+            if self._source is not None and not behind and not self._source.step():
                 if ring.closed:
                     self.counters.source_restarts += 1
                     break
