@@ -1,0 +1,103 @@
+"""The deformable mirror and the tip-tilt mirror: from commands to the wavefront they add."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.telescope import Pupil, pupil_grid, require_hcipy
+
+_LEAST_POWER = 0.1  # of an influence function, that must be in the pupil for the actuator to be used
+_CUTOFF = 2.5  # actuators, at which an influence function ends: below 1e-5 of its height
+
+
+@dataclass(frozen=True, eq=False)
+class DeformableMirror:
+    """Influence functions of the used actuators, then tip and tilt where there is a mirror for them."""
+
+    influence: Any
+    """Sparse (points^2, actuators): wavefront in nm for a command of 1 nm."""
+    tilts: NDArray[np.float32]
+    """(0 or 2, points, points): wavefront of tip and tilt, 1 nm rms over the pupil for a command of 1 nm."""
+    points: int
+
+    @property
+    def commands(self) -> int:
+        """Number of commands."""
+        return int(self.influence.shape[1]) + len(self.tilts)
+
+    def wavefront_nm(self, commands: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the wavefront that the mirror adds, (points, points)."""
+        actuators = self.influence.shape[1]
+        command = np.asarray(commands, np.float32)
+        surface: NDArray[np.float32] = (self.influence @ command[:actuators]).reshape(
+            self.points, self.points
+        )
+        for tilt, amount in zip(self.tilts, command[actuators:], strict=True):
+            surface = surface + amount * tilt
+        return surface
+
+    def matrix(self) -> NDArray[np.float32]:
+        """Return the wavefronts of all commands, (points^2, commands)."""
+        columns: NDArray[np.float32] = np.hstack(
+            [self.influence.toarray(), self.tilts.reshape(len(self.tilts), self.points**2).T]
+        )
+        return columns
+
+
+@dataclass(frozen=True, eq=False)
+class BestFit:
+    """The best that a mirror can do to a wavefront that is known: the fitting error is what it leaves."""
+
+    basis: NDArray[np.float32]
+    """Orthonormal wavefronts of the mirror and piston, weighted by the pupil, (points^2, n)."""
+    weight: NDArray[np.float32]
+    """Square root of the pupil's amplitude, (points^2,)."""
+
+    @classmethod
+    def of(cls, mirror: DeformableMirror, pupil: Pupil) -> BestFit:
+        """Make the fit of a mirror in a pupil; it needs its full matrix, (points^2, commands)."""
+        weight = np.sqrt(pupil.amplitude.ravel())
+        columns = np.hstack([mirror.matrix(), np.ones((len(weight), 1), np.float32)]) * weight[:, None]
+        left, size, _ = np.linalg.svd(columns.astype(np.float64), full_matrices=False)
+        return cls(left[:, size > 1e-6 * size[0]].astype(np.float32), weight)
+
+    def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return a wavefront (points, points) without what the mirror can take off; 0 outside the pupil."""
+        seen = wavefront.ravel() * self.weight
+        left = seen - self.basis @ (self.basis.T @ seen)
+        inside = self.weight > 0
+        residual = np.where(inside, left / np.where(inside, self.weight, 1), 0)
+        return residual.reshape(wavefront.shape).astype(np.float32)
+
+
+def make_mirror(configuration: LoopConfiguration, pupil: Pupil) -> DeformableMirror:
+    """Return the mirror of a configuration: Gaussian influence functions of HCIPy, one for each actuator.
+
+    Actuators with less than a tenth of their influence function's power in the pupil are left out.
+    """
+    hcipy = require_hcipy("the closed loop")
+    across = configuration.mirror.actuators or configuration.sensor.subapertures + 1
+    pitch = configuration.width_m / (across - 1)
+    basis = hcipy.make_gaussian_influence_functions(
+        pupil_grid(configuration), across, pitch, configuration.mirror.crosstalk, _CUTOFF
+    )
+    influence = basis.transformation_matrix.tocsc()
+    # Power relative to a whole influence function's: half of that of an actuator at the edge is off the grid.
+    power = influence.multiply(influence)
+    inside = pupil.amplitude.ravel() @ power
+    used = inside >= _LEAST_POWER * np.asarray(power.sum(axis=0)).max()
+    line = (np.arange(pupil.points) + 0.5) / pupil.points - 0.5
+    tilts = np.array(
+        [np.broadcast_to(line, (pupil.points,) * 2), np.broadcast_to(line[:, None], (pupil.points,) * 2)]
+    )
+    tilts = np.stack([tilt / pupil.rms(tilt) for tilt in tilts]).astype(np.float32)
+    return DeformableMirror(
+        influence[:, np.flatnonzero(used)].astype(np.float32).tocsr(),
+        tilts if configuration.mirror.tip_tilt else tilts[:0],
+        pupil.points,
+    )

@@ -1,0 +1,192 @@
+"""What a closed-loop run leaves: the telemetry, and the truth that a simulation knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.settings import Settings
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One way to measure slopes and to use them, of those that are compared.
+
+    Parameters
+    ----------
+    label : str
+    settings : Settings
+    gain : float, optional
+        Loop gain, 0 to 2. Default: the configuration's.
+    window_pixels : int, optional
+        Side of the middle part of each sub-aperture's window that is used. Default: all.
+    weighted_reconstructor : bool
+        Whether slopes count by their standard errors.
+    predict_prior : bool
+        Whether the loop's own prediction of the slopes is the prior of "map" and where "trained" begins.
+    correct_gain : bool
+        Whether slopes are divided by the centroid gain measured at the run's flux.
+    true_slopes : bool
+        Whether slopes are the wavefront's true mean gradients instead of measured ones, for error budgets.
+    psf, score : PSF, TrainedScore, optional
+        For the estimators that need them. Default PSF: that of a flat wavefront.
+
+    Raises
+    ------
+    InputError
+        For an empty label, a gain or window out of range.
+    """
+
+    label: str
+    settings: Settings
+    gain: float | None = None
+    window_pixels: int | None = None
+    weighted_reconstructor: bool = False
+    predict_prior: bool = False
+    correct_gain: bool = True
+    true_slopes: bool = False
+    psf: PSF | None = None
+    score: TrainedScore | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.label, str) or not self.label:
+            raise InputError(f"arm.label: expected a text, got {self.label!r}")
+        if not isinstance(self.settings, Settings):
+            raise InputError(f"arm.settings: expected Settings, got {type(self.settings).__name__}")
+        if self.gain is not None:
+            number_between("arm.gain", self.gain, 0, 2)
+        if self.window_pixels is not None:
+            number_between("arm.window_pixels", self.window_pixels, 4, 64, integer=True)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRecord:
+    """One run of the loop, n sub-apertures and m commands."""
+
+    slopes_px: NDArray[np.float32]
+    """(frames, 2 n): all x, then all y, from the reference; not divided by the centroid gain."""
+    valid: NDArray[np.bool_]
+    """(frames, n)"""
+    standard_error_px: NDArray[np.float32]
+    """(frames, 2 n); infinite where invalid or unknown."""
+    commands: NDArray[np.float32]
+    """(frames, m): what the mirror held during each frame, nm."""
+    strehl: NDArray[np.float64]
+    """(frames,): of each frame at the science wavelength, on axis."""
+    residual_nm: NDArray[np.float64]
+    """(frames,): rms of the wavefront after the mirror."""
+    r0_m: NDArray[np.float64]
+    """(frames,): true Fried parameter at 500 nm."""
+    arm: NDArray[np.int8]
+    """(frames,): number of the arm that measured the frame."""
+    interaction_matrix: NDArray[np.float64]
+    """(2 n, m): displacements of the spots, true px, for a command of 1 nm."""
+    centroid_gain: NDArray[np.float64]
+    """(arms,): slope measured for a displacement of 1 px, at the run's flux."""
+    corrected: NDArray[np.bool_]
+    """(arms,): whether the loop divided the slopes by that gain."""
+    psf: NDArray[np.float32]
+    """(arms, pixels, pixels): mean image of the frames after settling; a flat wavefront's peak is 1."""
+    labels: tuple[str, ...]
+    """Of the arms."""
+    arm_settings: tuple[str, ...]
+    """TOML text of each arm's settings."""
+    cells: NDArray[np.int64]
+    """(n, 2): row and column of each sub-aperture in the lenslet array."""
+    illumination: NDArray[np.float64]
+    """(n,): part of each sub-aperture that is in the pupil."""
+    frame_rate_hz: float
+    delay_frames: int
+    """The command computed from frame k acted first during frame k + delay_frames."""
+    settle_frames: int
+    closed: bool
+    """Whether the sensor saw the mirror."""
+    subaperture_m: float
+    pixel_scale_rad: float
+    wavelength_m: float
+    science_wavelength_m: float
+    psf_pixel_rad: float
+    configuration: str
+    """TOML text."""
+    seed: int
+    realisation: int
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.strehl)
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """(frames,): whether a frame comes after settling."""
+        return np.arange(self.frames) >= self.settle_frames
+
+    def mean_strehl(self, arm: int = 0) -> float:
+        """Return the long-exposure Strehl ratio of an arm: the mean of its frames after settling.
+
+        Raises
+        ------
+        InputError
+            When the arm has no such frame.
+        """
+        chosen = self.scored & (self.arm == arm)
+        if not chosen.any():
+            raise InputError(f"arm = {arm}: no frame after the {self.settle_frames} settling ones")
+        return float(self.strehl[chosen].mean())
+
+    def save(self, path: str | Path) -> None:
+        """Write the record to a compressed NumPy file (.npz).
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        path = Path(path)
+        values: dict[str, Any] = {item.name: np.asarray(getattr(self, item.name)) for item in fields(self)}
+        partial = path.with_name(f".{path.name}.partial")
+        try:
+            with partial.open("wb") as file:
+                np.savez_compressed(file, format=_FORMAT, **values)
+            partial.replace(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+    @classmethod
+    def load(cls, path: str | Path) -> LoopRecord:
+        """Read a record that `save` wrote.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, or is something else.
+        """
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                values = {name: stored[name] for name in stored.files}
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file") from None
+        except Exception as error:  # a damaged archive raises whatever its reader meets
+            raise InputError(f"{path}: not a record of a loop ({error})".splitlines()[0]) from None
+        found = values.pop("format", None)
+        if found is None or int(found) != _FORMAT or set(values) != {item.name for item in fields(cls)}:
+            raise InputError(f"{path}: not a record of a loop of format {_FORMAT}")
+        return cls(**{name: _restored(value) for name, value in values.items()})
+
+
+def _restored(value: NDArray[Any]) -> Any:
+    """Return an array as what it was: arrays of text are tuples, those without axes plain numbers or text."""
+    if value.ndim == 0:
+        return value.item()
+    return tuple(value.tolist()) if value.dtype.kind == "U" else value

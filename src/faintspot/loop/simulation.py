@@ -1,0 +1,287 @@
+"""The closed loop, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import number_between, numbers_between
+from faintspot.errors import InputError
+from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
+from faintspot.loop.calibration import (
+    centroid_gain,
+    interaction_matrix,
+    make_detector,
+    make_pipeline,
+    typical_spots,
+)
+from faintspot.loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
+from faintspot.loop.control import Integrator, Reconstructor, check_controllable, make_reconstructor
+from faintspot.loop.mirror import DeformableMirror, make_mirror
+from faintspot.loop.record import Arm, LoopRecord
+from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pupil
+from faintspot.loop.wavefront_sensor import ShackHartmann, make_sensor
+from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.sensor import configuration as configuration_file
+
+_MOST_ARMS = 127
+
+
+@dataclass(frozen=True, eq=False)
+class LoopOptics:
+    """Everything that is the same in all runs of a configuration."""
+
+    pupil: Pupil
+    sensor: ShackHartmann
+    mirror: DeformableMirror
+    interaction: NDArray[np.float64]
+    """(2 n, commands) px for 1 nm."""
+    reconstructor: Reconstructor
+    science: ScienceCamera
+
+
+def simulate_loop(
+    configuration: LoopConfiguration,
+    arms: Sequence[Arm],
+    schedule: ArrayLike | None = None,
+    *,
+    seed: int | None = None,
+    realisation: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> LoopRecord:
+    """Run the loop once.
+
+    In every frame the sensor sees, for the whole exposure, the wavefront of its middle after the mirror; the
+    command computed from frame k acts first during the exposure of frame k + delay_frames. Air and noise
+    depend on seed, realisation and frame alone: runs with other arms see the same.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    arms : sequence of Arm
+    schedule : (frames,) array of int, optional
+        Which arm measures each frame. Default: the configuration's number of frames with the first arm.
+    seed : int, optional
+        Default: the configuration's.
+    realisation : int
+        Other realisations have other air and other noise.
+    progress : callable, optional
+        Called with the number of frames done and that of all, after every frame.
+
+    Returns
+    -------
+    LoopRecord
+
+    Raises
+    ------
+    InputError
+        For a schedule that names arms that are not there, no arms, or parts that do not fit together.
+    MissingExtraError
+        When HCIPy is not installed.
+    """
+    which = _checked_schedule(configuration, arms, schedule)
+    start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
+    loop = _Loop(
+        configuration, arms, which, start, int(number_between("realisation", realisation, 0, integer=True))
+    )
+    for frame in range(len(which)):
+        loop.step(frame)
+        if progress is not None:
+            progress(frame + 1, len(which))
+    return loop.record()
+
+
+def prepare(configuration: LoopConfiguration) -> LoopOptics:
+    """Return telescope, sensor, mirror and their calibration; the last ones made are kept.
+
+    Raises
+    ------
+    InputError
+        When no sub-aperture is lit, or there are more commands than slopes can control.
+    MissingExtraError
+        When HCIPy is not installed.
+    """
+    control = Control(largest_condition=configuration.control.largest_condition)
+    camera = Camera(photons_per_subaperture=1.0)
+    return _prepared(
+        replace(configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=control, run=Run())
+    )
+
+
+def measure_gains(
+    configuration: LoopConfiguration,
+    pipelines: Sequence[SlopePipeline],
+    *,
+    seed: int,
+    realisation: int = 0,
+) -> NDArray[np.float64]:
+    """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
+    optics, detector = prepare(configuration), make_detector(configuration)
+    spots = _typical_spots(_without_light(configuration), seed, realisation)
+    return np.array(
+        [
+            centroid_gain(pipeline, optics.sensor, detector, configuration.photons, spots, seed)
+            for pipeline in pipelines
+        ]
+    )
+
+
+class _Loop:
+    """One run: its parts, its state and what it has written down."""
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        arms: Sequence[Arm],
+        which: NDArray[np.int64],
+        seed: int,
+        realisation: int,
+    ) -> None:
+        self.configuration, self.arms, self.which = configuration, tuple(arms), which
+        self.seed, self.realisation = seed, realisation
+        self.optics = optics = prepare(configuration)
+        self.air = _air(_without_light(configuration), seed, realisation)
+        self.detector = make_detector(configuration)
+        self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
+        gains = measure_gains(configuration, self.pipelines, seed=seed, realisation=realisation)
+        self.gains = np.where([arm.true_slopes for arm in arms], 1.0, gains)
+        self.controller = Integrator(configuration.control, optics.mirror.commands)
+        frames, n = len(which), len(optics.sensor.layout)
+        self.slopes = np.zeros((frames, 2 * n), np.float32)
+        self.valid = np.zeros((frames, n), np.bool_)
+        self.errors = np.zeros((frames, 2 * n), np.float32)
+        self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
+        self.truth = np.zeros((3, frames))
+        pixels = len(optics.science.transform)
+        self.images = np.zeros((len(arms), pixels, pixels))
+
+    def step(self, frame: int) -> None:
+        """Simulate one frame."""
+        control, number = self.configuration.control, int(self.which[frame])
+        commands = self.controller.acting
+        time = (frame + 0.5) / control.frame_rate_hz
+        air = self.air.wavefront_nm(time)
+        after = air + self.optics.mirror.wavefront_nm(commands)
+        self._observe(frame, time, after)
+        slopes = self._measure(frame, after if control.mode == CLOSED else air)
+        arm, divisor = self.arms[number], self.gains[number] if self.arms[number].correct_gain else 1.0
+        measured = slopes.vector.astype(np.float64) / divisor
+        error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
+        if arm.weighted_reconstructor:
+            wavefront = self.optics.reconstructor.weighted(measured, error.astype(np.float64))
+        else:
+            wavefront = self.optics.reconstructor(measured)
+        self.controller.update(wavefront, control.gain if arm.gain is None else arm.gain)
+        self.slopes[frame], self.errors[frame] = slopes.vector, error
+        self.valid[frame], self.commands[frame] = slopes.valid, commands
+
+    def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
+        """Take the science image and write down the truth."""
+        optics = self.optics
+        field = optics.pupil.field(wavefront, self.configuration.science.wavelength_m)
+        self.truth[:, frame] = optics.pupil.strehl(field), optics.pupil.rms(wavefront), self.air.r0_m(time)
+        if frame >= self.configuration.run.settle_frames:
+            self.images[self.which[frame]] += optics.science.image(field)
+
+    def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
+        """Measure the slopes of the frame that the sensor's camera takes."""
+        number, sensor = int(self.which[frame]), self.optics.sensor
+        if self.arms[number].true_slopes:
+            return _true_slopes(sensor.mean_slopes_px(wavefront))
+        light = sensor.frame(sensor.spots(wavefront)) * self.configuration.photons
+        rng = np.random.default_rng([self.seed, self.realisation, frame, 2])
+        prior = None
+        if self.arms[number].predict_prior:
+            prior = self.optics.interaction @ self.controller.expected()
+        return self.pipelines[number](self.detector.expose(light, rng), prior)
+
+    def record(self) -> LoopRecord:
+        """Return what was written down."""
+        configuration, sensor = self.configuration, self.optics.sensor
+        scored = self.which[configuration.run.settle_frames :]
+        exposures = np.maximum(1, np.bincount(scored, minlength=len(self.arms)))
+        strehl, residual, r0 = self.truth
+        return LoopRecord(
+            self.slopes,
+            self.valid,
+            self.errors,
+            self.commands,
+            strehl,
+            residual,
+            r0,
+            self.which.astype(np.int8),
+            self.optics.interaction,
+            self.gains,
+            np.array([arm.correct_gain for arm in self.arms]),
+            (self.images / exposures[:, None, None]).astype(np.float32),
+            tuple(arm.label for arm in self.arms),
+            tuple(configuration_file.to_text(arm.settings) for arm in self.arms),
+            sensor.layout.cells,
+            sensor.illumination,
+            configuration.control.frame_rate_hz,
+            configuration.control.delay_frames,
+            configuration.run.settle_frames,
+            configuration.control.mode == CLOSED,
+            configuration.subaperture_m,
+            configuration.pixel_scale_rad,
+            configuration.sensor.wavelength_m,
+            configuration.science.wavelength_m,
+            configuration.science.wavelength_m / configuration.width_m / PSF_SAMPLING,
+            configuration.to_text(),
+            self.seed,
+            self.realisation,
+        )
+
+
+def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
+    """Return slopes that are known without an error."""
+    x, y = vector.astype(np.float32).reshape(2, -1)
+    zeros, counts = np.zeros(len(x), np.float32), np.zeros(len(x), np.int32)
+    return Slopes(x, y, zeros, np.zeros(len(x), np.uint8), counts, counts, zeros, zeros)
+
+
+def _checked_schedule(
+    configuration: LoopConfiguration, arms: Sequence[Arm], schedule: ArrayLike | None
+) -> NDArray[np.int64]:
+    if not 1 <= len(arms) <= _MOST_ARMS:
+        raise InputError(f"arms: expected 1 to {_MOST_ARMS}, got {len(arms)}")
+    if schedule is None:
+        return np.zeros(configuration.run.frames, np.int64)
+    which = numbers_between("schedule", schedule, 0, len(arms) - 1, integer=True)
+    if which.ndim != 1:
+        raise InputError(f"schedule: expected one arm for each frame, got shape {which.shape}")
+    return which.astype(np.int64)
+
+
+def _without_light(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
+    control = replace(configuration.control, gain=0.0, leak=0.0)
+    camera = Camera(photons_per_subaperture=1.0)
+    return replace(configuration, name="-", camera=camera, control=control, run=Run())
+
+
+@lru_cache(maxsize=2)
+def _prepared(configuration: LoopConfiguration) -> LoopOptics:
+    pupil = make_pupil(configuration)
+    sensor, mirror = make_sensor(configuration, pupil), make_mirror(configuration, pupil)
+    check_controllable(mirror.commands, 2 * len(sensor.layout))
+    interaction = interaction_matrix(sensor, mirror)
+    reconstructor = make_reconstructor(interaction, configuration.control.largest_condition)
+    return LoopOptics(pupil, sensor, mirror, interaction, reconstructor, ScienceCamera.of(pupil))
+
+
+@lru_cache(maxsize=2)
+def _air(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
+    return make_atmosphere(configuration, seed, realisation)
+
+
+@lru_cache(maxsize=2)
+def _typical_spots(
+    configuration: LoopConfiguration, seed: int, realisation: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    optics, air = prepare(configuration), _air(configuration, seed, realisation)
+    return typical_spots(configuration, optics.sensor, optics.mirror, air, optics.reconstructor.matrix)
