@@ -120,7 +120,12 @@ def stop_on_signal() -> Iterator[threading.Event]:
     writing.setblocking(False)
     before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
     wakeup = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
-    listener = threading.Thread(target=lambda: reading.recv(1) and stop.set(), daemon=True)
+
+    def listen() -> None:
+        if reading.recv(1):
+            stop.set()
+
+    listener = threading.Thread(target=listen, name="faintspot-signals", daemon=True)
     listener.start()
     try:
         yield stop

@@ -1,0 +1,86 @@
+"""Slopes as they would be without a mirror, from the telemetry of a closed loop."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between, numbers_between
+from faintspot.errors import InputError
+from faintspot.loop.record import LoopRecord
+
+Floats = NDArray[np.float64]
+
+
+def pseudo_open_loop_slopes(
+    slopes_px: ArrayLike,
+    commands: ArrayLike,
+    interaction_matrix: ArrayLike,
+    *,
+    centroid_gain: ArrayLike = 1.0,
+    delay_frames: int = 0,
+) -> Floats:
+    """Return the slopes of the air alone: residual slopes without what the mirror held during their frame.
+
+    Parameters
+    ----------
+    slopes_px : (frames, 2 n) array
+        Residual slopes from the reference, as measured.
+    commands : (frames, m) array
+        With `delay_frames` 0: what the mirror held during each frame; else the command computed from it.
+    interaction_matrix : (2 n, m) array
+        Slopes in px that a unit of each command adds, at a centroid gain of 1.
+    centroid_gain : number or (frames,) array
+        Slope measured for a displacement of 1 px.
+    delay_frames : int
+        The command computed from frame k acts first during frame k + delay_frames.
+
+    Returns
+    -------
+    (frames - delay_frames, 2 n) array
+        The first frames, whose mirror is not known, are left out.
+
+    Raises
+    ------
+    InputError
+        When shapes do not fit together, for a negative delay, or a gain that is not above 0.
+    """
+    slopes = _table("slopes_px", slopes_px)
+    held = _table("commands", commands)
+    matrix = _table("interaction_matrix", interaction_matrix)
+    frames = len(slopes)
+    if len(held) != frames:
+        raise InputError(f"commands: expected {frames} frames, as in slopes_px, got {len(held)}")
+    if matrix.shape != (slopes.shape[1], held.shape[1]):
+        raise InputError(
+            f"interaction_matrix: expected shape {(slopes.shape[1], held.shape[1])} for these slopes and "
+            f"commands, got {matrix.shape}"
+        )
+    delay = int(number_between("delay_frames", delay_frames, 0, frames - 1, integer=True))
+    gain = numbers_between("centroid_gain", centroid_gain, 0, low_open=True)
+    if gain.shape not in ((), (frames,)):
+        raise InputError(f"centroid_gain: expected one number or {frames}, got shape {gain.shape}")
+    divisor = np.broadcast_to(gain, (frames,))[delay:, None]
+    result: Floats = slopes[delay:] / divisor - held[: frames - delay] @ matrix.T
+    return result
+
+
+def open_loop_slopes(record: LoopRecord) -> Floats:
+    """Return the slopes of the air alone that a run saw, (frames, 2 n) px.
+
+    A run in open loop has measured just them; only the centroid gain is taken out.
+    """
+    gain = record.centroid_gain[record.arm]
+    if not record.closed:
+        measured: Floats = record.slopes_px / gain[:, None]
+        return measured
+    return pseudo_open_loop_slopes(
+        record.slopes_px, record.commands, record.interaction_matrix, centroid_gain=gain
+    )
+
+
+def _table(name: str, value: ArrayLike) -> Floats:
+    array = finite_array(name, value)
+    if array.ndim != 2:
+        raise InputError(f"{name}: expected two axes, got shape {array.shape}")
+    return array.astype(np.float64)

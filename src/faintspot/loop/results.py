@@ -1,0 +1,267 @@
+"""Results of the closed-loop experiments, and the files that hold them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.loop.recognise import BUDGET_FILE as BUDGET_FILE
+from faintspot.loop.recognise import INTERLEAVED_FILE as INTERLEAVED_FILE
+from faintspot.loop.recognise import MAGNITUDE_FILE as MAGNITUDE_FILE
+from faintspot.loop.record import LoopRecord
+
+_FORMAT = 1
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class InterleavedResult:
+    """Observations with and without denoising in turn, as on the sky; one item per set."""
+
+    records: tuple[LoopRecord, ...]
+    block: tuple[NDArray[np.int64], ...]
+    """(frames,) each: number of the measurement that a frame belongs to."""
+    strengths: tuple[Floats, ...]
+    """(arms,) each: strength of the denoising, electrons; NaN: none."""
+    set_names: tuple[str, ...]
+    settle_in_block: int
+    """Frames at the start of every measurement that are not scored."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write the sets and what they are to a folder, which is made.
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        folder = make_folder(folder)
+        for number, record in enumerate(self.records, start=1):
+            record.save(set_file(folder, number))
+        self.save_description(folder)
+
+    def save_description(self, folder: Path) -> None:
+        """Write what the sets are, where their records are written already.
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        sets = [
+            {
+                "name": name,
+                "strengths_e": [None if math.isnan(strength) else float(strength) for strength in strengths],
+                "block_frames": np.bincount(block).tolist(),
+            }
+            for name, strengths, block in zip(self.set_names, self.strengths, self.block, strict=True)
+        ]
+        document = {"format": _FORMAT, "settle_in_block": self.settle_in_block, "sets": sets}
+        write_atomically(folder / INTERLEAVED_FILE, (json.dumps(document, indent=1) + "\n").encode())
+
+    @classmethod
+    def load(cls, folder: str | Path) -> InterleavedResult:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, or is something else.
+        """
+        folder = Path(folder)
+        path = folder / INTERLEAVED_FILE
+        try:
+            document: Any = json.loads(path.read_text(encoding="utf-8"))
+            sets = document["sets"]
+            if document["format"] != _FORMAT:
+                raise ValueError(f"format {document['format']}")
+            strengths = [
+                np.array([math.nan if value is None else value for value in each["strengths_e"]], np.float64)
+                for each in sets
+            ]
+            block = [np.repeat(np.arange(len(each["block_frames"])), each["block_frames"]) for each in sets]
+            names = tuple(str(each["name"]) for each in sets)
+            settle = int(document["settle_in_block"])
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: not the result of interleaved observations ({error})") from None
+        records = tuple(LoopRecord.load(set_file(folder, number)) for number in range(1, len(sets) + 1))
+        return cls(records, tuple(block), tuple(strengths), names, settle)
+
+
+@dataclass(frozen=True, eq=False)
+class MagnitudeResult:
+    """Strehl ratio against the star's light: A arms, F fluxes, R realisations of the air."""
+
+    labels: tuple[str, ...]
+    """(A,)"""
+    photons: Floats
+    """(F,): photo-electrons of a fully lit sub-aperture in a frame."""
+    magnitudes: Floats
+    """(F,)"""
+    strehl: Floats
+    """(A, F, R): long exposure; NaN where not measured yet."""
+    centroid_gain: Floats
+    """(A, F, R)"""
+    settings: NDArray[np.str_]
+    """(A, F): TOML text of the tuned settings; "" where not tuned yet."""
+    gains: Floats
+    """(A, F): loop gain."""
+    psf: NDArray[np.float32]
+    """(A, F, p, p): long-exposure image, mean over realisations; 1 at the peak of a flat wavefront's."""
+    configuration: str
+    """TOML text."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the result to a compressed NumPy file (.npz).
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        _save(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> MagnitudeResult:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, or is something else.
+        """
+        return cls(**_load(cls, path, "a magnitude experiment"))
+
+
+@dataclass(frozen=True, eq=False)
+class BudgetResult:
+    """Error budget: A arms with T terms switched off, R realisations of the air."""
+
+    terms: tuple[str, ...]
+    """(T,): what is switched off; the first is nothing."""
+    labels: tuple[str, ...]
+    """(A,)"""
+    strehl: Floats
+    """(A, T, R): long exposure; NaN where not measured yet."""
+    residual_nm: Floats
+    """(A, T, R): rms of the wavefront after the mirror, root of the mean square over the frames."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the result to a compressed NumPy file (.npz).
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        _save(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> BudgetResult:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, or is something else.
+        """
+        return cls(**_load(cls, path, "an error budget"))
+
+
+def set_file(folder: Path, number: int) -> Path:
+    """Return where the record of a set is, counted from 1."""
+    return folder / f"set-{number}.npz"
+
+
+def make_folder(folder: str | Path) -> Path:
+    """Make a folder where it is not there, and return its path.
+
+    Raises
+    ------
+    InputError
+        When it cannot be made.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        raise InputError(f"{folder}: the folder {folder.parent} does not exist: create it first") from None
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from None
+    return folder
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that it is never seen half written.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def save_arrays(path: Path, values: dict[str, Any]) -> None:
+    """Write arrays to a compressed NumPy file that is never seen half written.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    import io
+
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **values)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_arrays(path: Path, what: str) -> dict[str, NDArray[Any]]:
+    """Read the arrays of a NumPy file; `what` it should be is named in messages.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception as error:  # a damaged archive raises whatever its reader meets
+        raise InputError(f"{path}: not {what} ({error})".splitlines()[0]) from None
+
+
+def _save(result: Any, path: str | Path) -> None:
+    values = {item.name: np.asarray(getattr(result, item.name)) for item in fields(result)}
+    save_arrays(Path(path), {"format": np.asarray(_FORMAT), **values})
+
+
+def _load(kind: type[Any], path: str | Path, what: str) -> dict[str, Any]:
+    values: dict[str, Any] = load_arrays(Path(path), what)
+    names = [item.name for item in fields(kind)]
+    if values.pop("format", None) != _FORMAT or set(values) != set(names):
+        raise InputError(f"{path}: not {what} of format {_FORMAT}")
+    for name in ("labels", "terms"):
+        if name in values:
+            values[name] = tuple(str(text) for text in values[name])
+    if "configuration" in values:
+        values["configuration"] = str(values["configuration"])
+    return values

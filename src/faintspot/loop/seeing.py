@@ -1,0 +1,277 @@
+"""The Fried parameter r0 from the variance of open-loop slopes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between, numbers_between
+from faintspot.errors import InputError
+from faintspot.loop.configuration import R0_WAVELENGTH_M, LoopConfiguration
+from faintspot.loop.pseudo_open_loop import open_loop_slopes
+from faintspot.loop.record import LoopRecord
+
+Floats = NDArray[np.float64]
+
+KOLMOGOROV = math.inf
+"""Outer scale of Kolmogorov's spectrum."""
+
+_LEAST_ILLUMINATION = 0.85  # of sub-apertures that are used: theory is that of whole squares
+_FEWEST_FRAMES = 20
+_FREQUENCIES = 600
+_ANGLES = 96
+_LOWEST, _HIGHEST = 1e-5, 60.0  # frequencies, in cycles per sub-aperture
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """What the slopes of a stretch of frames say about the air."""
+
+    r0_m: float
+    """Fried parameter at 500 nm; NaN when the slopes vary no more than their noise."""
+    r0_x_m: float
+    """From the slopes along x alone."""
+    r0_y_m: float
+    r0_kolmogorov_m: float
+    """What would come out without the outer scale, from the same slopes."""
+    slope_std_px: float
+    """Standard deviation of a slope without its noise, as it entered."""
+    noise_std_px: float
+    """Standard deviation of a slope's noise."""
+    frames: int
+
+
+def slope_variance(
+    subaperture_m: float,
+    outer_scale_m: float,
+    *,
+    baseline_m: float | None = None,
+    positions: ArrayLike | None = None,
+    along: ArrayLike = (1.0, 0.0),
+) -> float:
+    """Return the variance of the wavefront's mean gradient over square sub-apertures for r0 = 1 m, rad^2.
+
+    Of von Karman turbulence, whose phase has the power spectral density
+    0.0229 r0^(-5/3) (f^2 + 1 / L0^2)^(-11/6); for another r0 (at 500 nm) multiply by r0^(-5/3). The
+    gradient of the optical path does not depend on the wavelength.
+
+    Parameters
+    ----------
+    subaperture_m : float
+    outer_scale_m : float
+        L0; infinite for Kolmogorov's spectrum, cut at 1e5 sub-apertures.
+    baseline_m : float, optional
+        Distance over which the gradient is taken. Default: the sub-aperture's side; one that is simulated
+        with n points across has n - 1 steps between them, (n - 1) / n of its side.
+    positions : (n, 2) array, optional
+        Centres x, y of n sub-apertures, m: the variance about their mean in each frame, averaged over them.
+        Default: the variance of one slope.
+    along : two numbers
+        Direction of the gradient, along a side of the sub-apertures.
+
+    Raises
+    ------
+    InputError
+        For sizes that are not above 0, or positions of another shape.
+    """
+    side = number_between("subaperture_m", subaperture_m, 0, low_open=True)
+    if math.isnan(outer_scale_m) or outer_scale_m <= 0:
+        raise InputError(f"outer_scale_m = {outer_scale_m:g}: expected a number above 0, or infinity")
+    direction = np.asarray(along, np.float64)
+    places = None
+    if positions is not None:
+        array = finite_array("positions", positions).astype(np.float64)
+        if array.ndim != 2 or array.shape[1] != 2:
+            raise InputError(f"positions: expected x and y of each sub-aperture, got shape {array.shape}")
+        places = tuple(map(tuple, array.tolist()))
+    baseline = side if baseline_m is None else number_between("baseline_m", baseline_m, 0, low_open=True)
+    to_x, to_y = (direction / math.hypot(*direction)).tolist()
+    return _slope_variance(side, baseline, float(outer_scale_m), places, to_x, to_y)
+
+
+@lru_cache(maxsize=64)
+def _slope_variance(
+    side: float,
+    baseline: float,
+    outer_scale_m: float,
+    positions: tuple[tuple[float, ...], ...] | None,
+    to_x: float,
+    to_y: float,
+) -> float:
+    frequency = np.geomspace(_LOWEST, _HIGHEST, _FREQUENCIES)[:, None] / side
+    angle = (np.arange(_ANGLES) + 0.5) * math.pi / _ANGLES  # half a turn: the other half is the same
+    x, y = frequency * np.cos(angle), frequency * np.sin(angle)
+    along, across = to_x * x + to_y * y, to_x * y - to_y * x
+    gradient = 2 * math.pi * along * np.sinc(along * baseline) * np.sinc(across * side)
+    density = 0.0229 * (frequency**2 + outer_scale_m**-2) ** (-11 / 6) * gradient**2
+    if positions is not None:
+        density = density * (1 - _array_factor(positions, x, y))
+    # d^2 f = f^2 dangle dlog f
+    by_frequency = (density * frequency**2).mean(axis=1) * 2 * math.pi
+    in_radians = float(np.trapezoid(by_frequency, np.log(frequency[:, 0])))
+    return in_radians * (R0_WAVELENGTH_M / (2 * math.pi)) ** 2
+
+
+def estimate_r0(
+    slopes_px: ArrayLike,
+    *,
+    cells: ArrayLike,
+    subaperture_m: float,
+    pixel_scale_rad: float,
+    outer_scale_m: float,
+    baseline_m: float | None = None,
+    segment: ArrayLike | None = None,
+    static_px: ArrayLike | None = None,
+    remove_tip_tilt: bool = True,
+) -> Seeing:
+    """Return r0 from slopes of the air alone, (frames, 2 n) px: all x, then all y.
+
+    The slopes' variance is set equal to `slope_variance`. Noise, which differs from frame to frame, is taken
+    out by the covariance of each slope with itself one and two frames later: the variance without noise is
+    their extrapolation to no delay along a parabola, (4 C1 - C2) / 3.
+
+    Parameters
+    ----------
+    slopes_px : (frames, 2 n) array
+        As `pseudo_open_loop_slopes` returns them.
+    cells : (n, 2) array of int
+        Row and column of each sub-aperture in the lenslet array.
+    subaperture_m : float
+        Side of a sub-aperture.
+    pixel_scale_rad : float
+        Angle on the sky that a pixel sees.
+    outer_scale_m : float
+        Infinite: Kolmogorov's spectrum, which overestimates r0.
+    baseline_m : float, optional
+        As `slope_variance`.
+    segment : (frames,) array of int, optional
+        Frames with the same number follow each other without a gap, as those of a measurement. Default: all.
+    static_px : (2 n,) array, optional
+        Slopes that are no turbulence's, better known from a longer record. Default: the mean of the frames.
+    remove_tip_tilt : bool
+        Whether the mean over all sub-apertures is taken out of each frame, and out of the theory. It changes
+        so slowly that short records hold few independent values of it, and telescopes shake.
+
+    Raises
+    ------
+    InputError
+        When shapes do not fit together, or there are fewer than 20 frames.
+    """
+    slopes, places = _checked(slopes_px, cells)
+    part = np.zeros(len(slopes), np.int64) if segment is None else np.asarray(segment)
+    if part.shape != (len(slopes),):
+        raise InputError(
+            f"segment: expected a number for each of {len(slopes)} frames, got shape {part.shape}"
+        )
+    scale = number_between("pixel_scale_rad", pixel_scale_rad, 0, low_open=True)
+    axes = slopes.reshape(len(slopes), 2, -1)
+    axes = axes - (axes.mean(axis=0) if static_px is None else _checked_static(static_px, axes.shape[2]))
+    if remove_tip_tilt:
+        axes = axes - axes.mean(axis=2, keepdims=True)
+    total = np.square(axes).mean(axis=(0, 2))
+    first, second = (_lagged(axes, part, lag) for lag in (1, 2))
+    signal = (4 * first - second) / 3
+    positions = places[:, ::-1] * subaperture_m if remove_tip_tilt else None
+    theory, kolmogorov = (
+        np.array(
+            [
+                slope_variance(
+                    subaperture_m, scale_m, baseline_m=baseline_m, positions=positions, along=along
+                )
+                for along in ((1.0, 0.0), (0.0, 1.0))
+            ]
+        )
+        for scale_m in (outer_scale_m, KOLMOGOROV)
+    )
+    measured = signal * scale**2
+    return Seeing(
+        _r0(measured.sum(), theory.sum()),
+        _r0(measured[0], theory[0]),
+        _r0(measured[1], theory[1]),
+        _r0(measured.sum(), kolmogorov.sum()),
+        math.sqrt(max(0.0, signal.mean())),
+        math.sqrt(max(0.0, (total - signal).mean())),
+        len(slopes),
+    )
+
+
+def r0_of_record(record: LoopRecord, frames: ArrayLike, *, remove_tip_tilt: bool = True) -> Seeing:
+    """Return r0 from some frames of a run, given as a mask, with its own outer scale; see `estimate_r0`.
+
+    Of sub-apertures that are at least 85 % lit, all others when there are none.
+
+    Raises
+    ------
+    InputError
+        When there are fewer than 20 frames.
+    """
+    configuration = LoopConfiguration.from_text(record.configuration)
+    chosen = np.flatnonzero(np.asarray(frames))
+    usable = record.illumination >= _LEAST_ILLUMINATION
+    if not usable.any():
+        usable = np.ones_like(usable)
+    gaps = np.cumsum(np.diff(chosen, prepend=chosen[:1]) > 1)
+    slopes = open_loop_slopes(record)[:, np.tile(usable, 2)]
+    return estimate_r0(
+        slopes[chosen],
+        cells=record.cells[usable],
+        subaperture_m=record.subaperture_m,
+        pixel_scale_rad=record.pixel_scale_rad,
+        outer_scale_m=configuration.atmosphere.outer_scale_m,
+        baseline_m=record.subaperture_m * (1 - 1 / configuration.sensor.samples),
+        segment=gaps,
+        static_px=slopes[record.scored].mean(axis=0),
+        remove_tip_tilt=remove_tip_tilt,
+    )
+
+
+def mean_r0(r0_m: ArrayLike) -> float:
+    """Return the r0 of steady air with the mean strength of turbulence, (mean of r0^(-5/3))^(-3/5)."""
+    values = numbers_between("r0_m", r0_m, 0, low_open=True)
+    return float(np.mean(values ** (-5 / 3)) ** (-3 / 5))
+
+
+def _array_factor(positions: tuple[tuple[float, ...], ...], x: Floats, y: Floats) -> Floats:
+    """Return |mean of exp(2 pi i f r)|^2: the part of the variance that all sub-apertures share."""
+    total = np.zeros(x.shape, np.complex128)
+    for across, up in positions:
+        total += np.exp(2j * math.pi * (across * x + up * y))
+    factor: Floats = np.square(np.abs(total / len(positions)))
+    return factor
+
+
+def _checked(slopes_px: ArrayLike, cells: ArrayLike) -> tuple[Floats, Floats]:
+    slopes = finite_array("slopes_px", slopes_px).astype(np.float64)
+    places = finite_array("cells", cells).astype(np.float64)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise InputError(f"cells: expected row and column of each sub-aperture, got shape {places.shape}")
+    if slopes.ndim != 2 or slopes.shape[1] != 2 * len(places):
+        raise InputError(
+            f"slopes_px: expected shape (frames, {2 * len(places)}) for {len(places)} sub-apertures, "
+            f"got {slopes.shape}"
+        )
+    if len(slopes) < _FEWEST_FRAMES:
+        raise InputError(f"slopes_px: expected at least {_FEWEST_FRAMES} frames, got {len(slopes)}")
+    return slopes, places
+
+
+def _checked_static(static_px: ArrayLike, n: int) -> Floats:
+    static = finite_array("static_px", static_px).astype(np.float64)
+    if static.shape != (2 * n,):
+        raise InputError(f"static_px: expected {2 * n} slopes, got shape {static.shape}")
+    return static.reshape(2, n)
+
+
+def _lagged(axes: Floats, part: NDArray[np.int64], lag: int) -> Floats:
+    """Return the mean product of slopes `lag` frames apart of the same stretch, for x and for y."""
+    together = part[lag:] == part[:-lag]
+    products: Floats = (axes[lag:][together] * axes[:-lag][together]).mean(axis=(0, 2))
+    return products
+
+
+def _r0(variance: float, theory: float) -> float:
+    return float((variance / theory) ** (-3 / 5)) if variance > 0 else math.nan

@@ -1,0 +1,224 @@
+"""What closed-loop results amount to, in plain sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from faintspot.errors import InputError
+from faintspot.loop.analysis import (
+    NO_TV,
+    TV,
+    TV_BEST,
+    Measurements,
+    differences_by_flux,
+    differences_by_strength,
+    gains_in_magnitude,
+    measurements,
+    strehl_table,
+)
+from faintspot.loop.results import (
+    BUDGET_FILE,
+    INTERLEAVED_FILE,
+    MAGNITUDE_FILE,
+    BudgetResult,
+    InterleavedResult,
+    MagnitudeResult,
+)
+from faintspot.loop.statistics import Estimate, MagnitudeGain
+
+NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
+REFERENCE = "brightest pixels"
+"""Label of the arm that others are compared with."""
+_WEIGHTED = ", weighted reconstructor"
+_PREDICTED = (
+    ("maximum a posteriori", "maximum likelihood"),
+    ("trained score, from the prediction", "trained score"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResults:
+    """What there is in a folder of results; None: not run."""
+
+    interleaved: InterleavedResult | None = None
+    magnitude: MagnitudeResult | None = None
+    budget: BudgetResult | None = None
+
+    @classmethod
+    def load(cls, folder: str | Path) -> LoopResults:
+        """Read the results in a folder.
+
+        Raises
+        ------
+        InputError
+            When there are none, or one cannot be read.
+        """
+        folder = Path(folder)
+        results = cls(
+            InterleavedResult.load(folder) if (folder / INTERLEAVED_FILE).exists() else None,
+            MagnitudeResult.load(folder / MAGNITUDE_FILE) if (folder / MAGNITUDE_FILE).exists() else None,
+            BudgetResult.load(folder / BUDGET_FILE) if (folder / BUDGET_FILE).exists() else None,
+        )
+        if results.interleaved is None and results.magnitude is None and results.budget is None:
+            raise InputError(
+                f"{folder}: no results of a loop: expected {INTERLEAVED_FILE}, {MAGNITUDE_FILE} or "
+                f"{BUDGET_FILE}"
+            )
+        return results
+
+
+def loop_verdict(results: LoopResults) -> list[str]:
+    """Return what the results say about TV, and then about the other ways to measure slopes."""
+    comparisons: list[Estimate | None] = []
+    lines = []
+    if results.interleaved is not None:
+        table = measurements(results.interleaved)
+        lines += _interleaved_lines(table)
+        comparisons += [row.difference for row in strehl_table(table)]
+        comparisons += [row.difference for row in differences_by_strength(table)]
+    if results.magnitude is not None:
+        lines += _magnitude_lines(results.magnitude)
+        tv, reference = tv_arm(results.magnitude), reference_arm(results.magnitude)
+        if tv is not None and tv != reference:
+            comparisons += differences_by_flux(results.magnitude, tv, reference)
+    return _headline(comparisons) + lines
+
+
+def reference_arm(result: MagnitudeResult) -> int:
+    """Return the arm that others are compared with: brightest pixels, else the first."""
+    return result.labels.index(REFERENCE) if REFERENCE in result.labels else 0
+
+
+def tv_arm(result: MagnitudeResult) -> int | None:
+    """Return the arm with TV, or None."""
+    return next((arm for arm, label in enumerate(result.labels) if label.lower().startswith("tv")), None)
+
+
+def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
+    """Return what arms of a pair differ by, the arm with it and the one without: weights, predictions."""
+    labels = result.labels
+    pairs = [
+        ("weighted reconstructor", arm, labels.index(label.removesuffix(_WEIGHTED)))
+        for arm, label in enumerate(labels)
+        if label.endswith(_WEIGHTED) and label.removesuffix(_WEIGHTED) in labels
+    ]
+    return pairs + [
+        ("loop's own prediction", labels.index(with_it), labels.index(without))
+        for with_it, without in _PREDICTED
+        if with_it in labels and without in labels
+    ]
+
+
+def in_words(estimate: Estimate | None) -> str:
+    """Return a difference in Strehl with its interval, as "+0.012 (−0.004 to +0.028)"."""
+    if estimate is None or not np.isfinite(estimate.value):
+        return "–"
+    if not np.isfinite(estimate.low):
+        return f"{signed(estimate.value)} (too few for an interval)"
+    return f"{signed(estimate.value)} ({signed(estimate.low)} to {signed(estimate.high)})"
+
+
+def gain_in_words(gain: MagnitudeGain) -> str:
+    """Return a gain in magnitudes with its interval, or why there is none."""
+    if not np.isfinite(gain.gain):
+        return gain.why_not
+    if np.isnan(gain.low):
+        return f"{signed(gain.gain, 2)} ({gain.why_not})"
+    ends = [signed(end, 2) if np.isfinite(end) else "beyond" for end in (gain.low, gain.high)]
+    return f"{signed(gain.gain, 2)} ({ends[0]} to {ends[1]})"
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """Return a number with its sign, a minus as long as a plus."""
+    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")
+
+
+def better_and_worse(result: MagnitudeResult, arm: int, reference: int) -> tuple[str, str]:
+    """Return at which fluxes an arm's Strehl is above and below another's beyond its error, in words.
+
+    "" for none.
+    """
+    decided = [each.decided for each in differences_by_flux(result, arm, reference)]
+    if decided == [1] * len(decided):
+        return "all fluxes", ""
+    if decided == [-1] * len(decided):
+        return "", "all fluxes"
+    above, below = (
+        ", ".join(
+            f"{photons:.3g}" for photons, sign in zip(result.photons, decided, strict=True) if sign == wanted
+        )
+        for wanted in (1, -1)
+    )
+    unit = " photo-electrons"
+    return above and above + unit, below and below + unit
+
+
+def _headline(comparisons: list[Estimate | None]) -> list[str]:
+    known = [each for each in comparisons if each is not None and np.isfinite(each.low)]
+    if not known:
+        return ["Too few measurements to say whether TV raises the Strehl ratio."] if comparisons else []
+    gains, losses = (sum(each.decided == sign for each in known) for sign in (1, -1))
+    if gains:
+        first = f"TV raises the Strehl ratio beyond its error in {gains} of {len(known)} comparisons"
+    else:
+        first = NOWHERE
+    return [
+        f"{first}; it lowers it beyond its error in {losses} of {len(known)} comparisons."
+        if losses
+        else f"{first}."
+    ]
+
+
+def _interleaved_lines(table: Measurements) -> list[str]:
+    rows = {row.group: row for row in strehl_table(table)}
+    if NO_TV not in rows:
+        return ["Interleaved observations: no measurement without TV yet."]
+    return [
+        f"Interleaved, {name}: Strehl {row.mean:.3f} in {row.count} measurements against "
+        f"{rows[NO_TV].mean:.3f} in {rows[NO_TV].count} without; paired difference "
+        f"{in_words(row.difference)}, "
+        f"{_judgement(row.difference)}."
+        for name, row in rows.items()
+        if name in (TV, TV_BEST)
+    ]
+
+
+def _magnitude_lines(result: MagnitudeResult) -> list[str]:
+    reference = reference_arm(result)
+    base = result.labels[reference]
+    tv = tv_arm(result)
+    order = [arm for arm in range(len(result.labels)) if arm != reference]
+    if tv in order:
+        order = [tv, *(arm for arm in order if arm != tv)]
+    lines = []
+    for arm in order:
+        above, below = better_and_worse(result, arm, reference)
+        parts = [f"more Strehl beyond its error at {above}"] if above else []
+        parts += [f"less Strehl beyond its error at {below}"] if below else []
+        found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
+        lines.append(f"Magnitudes, {result.labels[arm]} against {base}: {found}{_largest_gain(result, arm)}.")
+    for option, arm, without in options_that_may_pay(result):
+        above, below = better_and_worse(result, arm, without)
+        found = f"pays at {above}" if above else "pays nowhere beyond its error"
+        found += f", costs at {below}" if below else ""
+        lines.append(f"The {option} ({result.labels[arm]} against {result.labels[without]}) {found}.")
+    return lines
+
+
+def _largest_gain(result: MagnitudeResult, arm: int) -> str:
+    gains = [
+        gain for gain in gains_in_magnitude(result, arm, reference_arm(result)) if np.isfinite(gain.gain)
+    ]
+    if not gains:
+        return ""
+    middle = gains[len(gains) // 2]
+    return f"; limiting magnitude at Strehl {middle.strehl:g}: {gain_in_words(middle)} mag"
+
+
+def _judgement(estimate: Estimate | None) -> str:
+    if estimate is None or not np.isfinite(estimate.low):
+        return "too few to judge"
+    return {1: "more beyond its error", -1: "less beyond its error", 0: "within its error"}[estimate.decided]
