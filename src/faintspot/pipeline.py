@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from faintspot.checks import finite_array, number_between, real_array
 from faintspot.errors import InputError
 from faintspot.flags import INVALID
-from faintspot.kernels import fused, located
-from faintspot.kernels.host import lanes_for
+from faintspot.kernels import fused, located, thresholded
+from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.parallel import run_groups
 from faintspot.preparation import METHODS, Preparation, packed_calibration
 from faintspot.sensor import configuration
@@ -128,6 +128,7 @@ class SlopePipeline:
         self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         self._parts = psf, score, layout.offsets + _reference_positions(reference, len(layout))
         self._preparation = self._prepared()
+        self._in_rows = self._row_arguments()
         self._identity = _identity(*self._parts)
 
     @classmethod
@@ -157,6 +158,7 @@ class SlopePipeline:
         other._lanes = lanes_for(np.float32, width)
         other._calibration = packed_calibration(self.layout, self.calibration, width)
         other._preparation = other._prepared()
+        other._in_rows = other._row_arguments()
         return other
 
     @property
@@ -266,7 +268,20 @@ class SlopePipeline:
             predicted = plan.no_prior if prior is None else _prior_slopes(prior, len(frames), n)
             arguments = (*source, saturation, tables, variants, predicted, *constants)
             return located.locate_groups, arguments, shape
-        return fused.slopes_of_groups, (*source, saturation, tables, variants, *constants), shape
+        arguments = (*source, saturation, tables, variants, *constants)
+        if self._in_rows is not None:
+            return thresholded.thresholded_slopes, (*self._in_rows, *arguments), shape
+        return fused.slopes_of_groups, arguments, shape
+
+    def _row_arguments(self) -> tuple[Any, ...] | None:
+        """What the kernel takes that measures pixels in rows, where that is possible."""
+        columns = self.layout.window[1]
+        widths = [width for width in WIDTHS if columns % width == 0 and width <= self._lanes.width]
+        if self.settings.estimator != "thresholded" or not widths:
+            return None
+        maps = np.ascontiguousarray(self.calibration.maps(self.layout.frame_shape), np.float32)
+        ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
+        return lanes_for(np.float32, max(widths)), maps, ramp
 
     def _variants(self, frames: NDArray[Any], saturation: float) -> NDArray[np.int64]:
         """Which table of settings every frame is measured with, by its light where that matters."""

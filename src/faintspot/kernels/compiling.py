@@ -26,10 +26,25 @@ def inlined(function: Callable[..., Any]) -> Any:
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile with Numba: cached on disk, without the GIL, division by zero as in NumPy.
 
+    Nor does it count references to arrays: who calls a kernel keeps its arrays alive, and counting them, with
+    atomic instructions at every call of one kernel by another, took half of the time that the centre of gravity
+    of a sub-aperture takes. So it cannot make arrays: see `allocating`.
+    """
+    return _dispatcher(function, _nrt=False)
+
+
+def allocating(function: Callable[..., Any]) -> Any:
+    """Compile as `compiled` does what makes arrays."""
+    return _dispatcher(function)
+
+
+def _dispatcher(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile with a cache that asks for all kernels' sources.
+
     Numba's cache asks only whether a function's own file has changed, but kernels inline each other across
     files; so their cache is stamped with all of them.
     """
-    dispatcher = njit(cache=True, nogil=True, error_model="numpy")(function)
+    dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if cache_file is not None and hasattr(cache_file, "_source_stamp"):
         cache_file._source_stamp = _kernels_stamp()

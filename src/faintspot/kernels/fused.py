@@ -179,7 +179,8 @@ def slopes_of_groups(
             gather_taps(width, first, taps, rows)
             smooth_group(lanes, image, ny, nx, taps.shape[2] - 1, rows, state, output)
         else:
-            output[: ny * nx * width] = image[: ny * nx * width]
+            for i in range(0, ny * nx * width, width):
+                store(output, i, load(lanes, image, i))
         if stages.shape[0] > 0:
             store_stage(width, image, stages[CALIBRATED, f], first)
             store_stage(width, output, stages[DENOISED, f], first)
@@ -259,32 +260,64 @@ def _store_slope(
     slopes: Any,
 ) -> None:
     """Write one sub-aperture's result; the reference position (slope 0) where it is invalid."""
-    x, y, flux, flag, iterations, bad_pixels, error_x, error_y = slopes
-    total = numbers[brightest.SUM * width + lane]
-    position_x, position_y = numbers[brightest.X * width + lane], numbers[brightest.Y * width + lane]
     bits = flags[lane]
-    # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
-    lit = total > settings[FLOOR, s] * numbers[brightest.LARGEST * width + lane]
-    inside = abs(position_x) <= 0.5 * nx and abs(position_y) <= 0.5 * ny
     if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
         if counts[total_variation.INFEASIBLE * width + lane]:
             bits |= INFEASIBLE_STRENGTH
         if not counts[total_variation.CONVERGED * width + lane]:
             bits |= NOT_CONVERGED
-        if not (lit and inside):
-            bits |= NO_LIGHT
+    slopes[4][f, s] = counts[total_variation.ITERATIONS * width + lane]
+    slopes[5][f, s] = bad_counts[lane]
+    store_centroid(
+        ny,
+        nx,
+        f,
+        s,
+        settings,
+        bits,
+        numbers[brightest.SUM * width + lane],
+        numbers[brightest.LARGEST * width + lane],
+        numbers[brightest.X * width + lane],
+        numbers[brightest.Y * width + lane],
+        numbers[brightest.ERROR_X * width + lane],
+        numbers[brightest.ERROR_Y * width + lane],
+        slopes,
+    )
+
+
+@compiled
+def store_centroid(
+    ny: Any,
+    nx: Any,
+    f: Any,
+    s: Any,
+    settings: Any,
+    bits: Any,
+    total: Any,
+    largest: Any,
+    position_x: Any,
+    position_y: Any,
+    deviation_x: Any,
+    deviation_y: Any,
+    slopes: Any,
+) -> None:
+    """Write position, flux, flags and standard errors of one sub-aperture; the reference where invalid."""
+    x, y, flux, flag, _, _, error_x, error_y = slopes
+    # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
+    lit = total > settings[FLOOR, s] * largest
+    inside = abs(position_x) <= 0.5 * nx and abs(position_y) <= 0.5 * ny
+    if not (bits & TOO_MANY_BAD_PIXELS or (lit and inside)):
+        bits |= NO_LIGHT
     valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
     reach = settings[RANGE, s]
     x[f, s] = within(position_x - settings[ZERO_X, s], reach) if valid else 0.0
     y[f, s] = within(position_y - settings[ZERO_Y, s], reach) if valid else 0.0
     known = valid and settings[VARIANCE, s] >= 0.0
     scale = settings[ERROR_SCALE, s]
-    error_x[f, s] = scale * numbers[brightest.ERROR_X * width + lane] if known else math.inf
-    error_y[f, s] = scale * numbers[brightest.ERROR_Y * width + lane] if known else math.inf
+    error_x[f, s] = scale * deviation_x if known else math.inf
+    error_y[f, s] = scale * deviation_y if known else math.inf
     flux[f, s] = total
     flag[f, s] = bits
-    iterations[f, s] = counts[total_variation.ITERATIONS * width + lane]
-    bad_pixels[f, s] = bad_counts[lane]
 
 
 @compiled

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.kernels.compiling import compiled
+from faintspot.kernels.compiling import allocating, compiled
 
 SUBTRACT_NEXT, THRESHOLD = 0, 1
 _DIGIT_BITS = 8
@@ -92,7 +92,7 @@ def _measure(
         valid[k - 1] = lit
 
 
-@compiled
+@allocating
 def positions_of_every_k(
     images: Any,
     side: Any,
@@ -117,7 +117,7 @@ def positions_of_every_k(
             positions[i, k, 1] = y[k]
 
 
-@compiled
+@allocating
 def errors_of_every_k(
     images: Any,
     side: Any,

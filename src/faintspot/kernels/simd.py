@@ -145,19 +145,13 @@ def copy_transposed(
     vector = Vector(lanes.scalar, lanes.width)
     kind = source.dtype
 
-    def row(context: Any, builder: Any, data: Any, place: Any) -> Any:
-        packed = ir.VectorType(context.get_data_type(kind), lanes.width)
-        pointer = builder.bitcast(builder.gep(data, [place]), packed.as_pointer())
-        values = builder.load(pointer, align=kind.bitwidth // 8)
-        return values if kind == lanes.scalar else builder.uitofp(values, _llvm_vector(vector))
-
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         data, first = (context.make_array(sig.args[k])(context, builder, args[k]).data for k in (1, 2))
         offset = context.cast(builder, args[3], sig.args[3], types.intp)
         rows = []
         for lane in range(lanes.width):
             start = builder.load(builder.gep(first, [ir.IntType(64)(lane)]))
-            rows.append(row(context, builder, data, builder.add(start, offset)))
+            rows.append(_load_widened(context, builder, data, builder.add(start, offset), kind, vector))
         place = context.cast(builder, args[5], sig.args[5], types.intp)
         pointer = _element_pointer(context, builder, sig.args[4], args[4], place, vector)
         for lane, values in enumerate(_transposed(builder, rows)):
@@ -196,6 +190,26 @@ def load(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
         return builder.load(pointer, align=lanes.scalar.bitwidth // 8)
 
     return vector(lanes, array, offset), emit
+
+
+@intrinsic
+def widened(typing_context: Any, lanes: Any, array: Any, offset: Any) -> Any:
+    """Load W consecutive unsigned integers, or numbers of the lanes' own type, as the latter."""
+    vector, kind = Vector(lanes.scalar, lanes.width), array.dtype
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place = context.cast(builder, args[2], sig.args[2], types.intp)
+        data = context.make_array(sig.args[1])(context, builder, args[1]).data
+        return _load_widened(context, builder, data, place, kind, vector)
+
+    return vector(lanes, array, offset), emit
+
+
+def _load_widened(context: Any, builder: Any, data: Any, place: Any, kind: Any, vector: Vector) -> Any:
+    packed = ir.VectorType(context.get_data_type(kind), vector.width)
+    pointer = builder.bitcast(builder.gep(data, [place]), packed.as_pointer())
+    values = builder.load(pointer, align=kind.bitwidth // 8)
+    return values if kind == vector.scalar else builder.uitofp(values, _llvm_vector(vector))
 
 
 @intrinsic
@@ -372,6 +386,18 @@ def sum_of(typing_context: Any, a: Any) -> Any:
         name = f"llvm.vector.reduce.fadd.v{a.width}f{a.scalar.bitwidth}"
         function = cgutils.get_or_insert_function(builder.module, kind, name)
         return builder.call(function, [ir.Constant(scalar, -0.0), args[0]], fastmath=("reassoc",))
+
+    return a.scalar(a), emit
+
+
+@intrinsic
+def largest_of(typing_context: Any, a: Any) -> Any:
+    """The largest of all lanes; NaN only where all are."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(_llvm_scalar(a.scalar), [_llvm_vector(a)])
+        name = f"llvm.vector.reduce.fmax.v{a.width}f{a.scalar.bitwidth}"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [args[0]])
 
     return a.scalar(a), emit
 

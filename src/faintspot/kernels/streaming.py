@@ -16,6 +16,7 @@ from faintspot.kernels.compiling import compiled
 from faintspot.kernels.fused import slopes_of_groups
 from faintspot.kernels.located import locate_groups
 from faintspot.kernels.simd import intrinsic
+from faintspot.kernels.thresholded import thresholded_slopes
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
 
@@ -131,4 +132,26 @@ def stream_located(
         if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
             return item
         locate_groups(*before, item, item + 1, *after)
+    return stop
+
+
+@compiled
+def stream_thresholded(
+    progress: Any,
+    frame_cell: Any,
+    rows_cell: Any,
+    frame: Any,
+    last_rows: Any,
+    control: Any,
+    stop_cell: Any,
+    start: Any,
+    stop: Any,
+    before: Any,
+    after: Any,
+) -> Any:
+    """As `stream_gravity`, with `thresholded_slopes`."""
+    for item in range(start, stop):
+        if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
+            return item
+        thresholded_slopes(*before, item, item + 1, *after)
     return stop

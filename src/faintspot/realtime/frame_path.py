@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.kernels import fused, located, streaming
+from faintspot.kernels import fused, located, streaming, thresholded
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
@@ -22,6 +22,11 @@ from faintspot.preparation import METHODS
 from faintspot.realtime.workers import Workers
 
 STOP_CELL = 0
+_STREAMED = {
+    fused.slopes_of_groups: streaming.stream_gravity,
+    located.locate_groups: streaming.stream_located,
+    thresholded.thresholded_slopes: streaming.stream_thresholded,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +72,7 @@ class _Groups:
         made = [pipeline.kernel_call(slot[None], slot.dtype, variants) for slot in slots]
         self._before = [arguments for _, arguments, _ in made]
         kernel, _, shape = made[0]
-        gravity = kernel is not located.locate_groups
-        self._kernel = streaming.stream_gravity if gravity else streaming.stream_located
+        self._kernel = _STREAMED[kernel]
         self._direct: Callable[..., int] | None = None
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
         self._scratch = [

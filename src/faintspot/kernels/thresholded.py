@@ -1,0 +1,197 @@
+"""Centres of gravity above a threshold, straight from the frame: one pass, W pixels of a row at once.
+
+No pixel waits for another here, so that nothing is copied and put side by side as for the denoiser. What has
+bad pixels is left to `fused`, which fills them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from faintspot.checks import LARGEST_FLOAT32
+from faintspot.kernels import fused
+from faintspot.kernels.compiling import compiled
+from faintspot.kernels.simd import (
+    absolute,
+    any_lane,
+    largest_of,
+    load,
+    maximum,
+    multiply_add,
+    select,
+    splat,
+    sum_of,
+    widened,
+    width_of,
+)
+
+_WITHIN = 1.0 / 12.0  # of the light in a pixel, where in it is not known: px^2
+
+
+@compiled
+def thresholded_slopes(
+    pixels: Any,
+    maps: Any,
+    ramp: Any,
+    lanes: Any,
+    frames: Any,
+    corners: Any,
+    ny: Any,
+    nx: Any,
+    calibration: Any,
+    saturation: Any,
+    tables: Any,
+    variants: Any,
+    before: Any,
+    algorithm: Any,
+    taps: Any,
+    start: Any,
+    stop: Any,
+    scratch: Any,
+    slopes: Any,
+    stages: Any,
+) -> None:
+    """Compute the slopes of the groups [start, stop) of a block of frames.
+
+    Parameters that are not listed here are those of `fused.slopes_of_groups`, which does groups with bad pixels.
+
+    Parameters
+    ----------
+    pixels : Lanes
+        Of pixels in a row; their number divides nx.
+    maps : (2, h, w) float32
+        Dark and scale of every pixel of the frame.
+    ramp : (nx,) float32
+        Positions of a window's columns, px from its middle.
+    """
+    width = width_of(lanes)
+    n = corners.shape[0]
+    n_groups = (n + width - 1) // width
+    for item in range(start, stop):
+        f, group = item // n_groups, item % n_groups
+        first, last = group * width, min((group + 1) * width, n)
+        settings = tables[variants[f]]
+        whole = stages.shape[0] == 0
+        for s in range(first, last):
+            done = _measure(pixels, frames, f, s, corners, ny, nx, maps, ramp, saturation, settings, slopes)
+            whole = whole and done
+        if whole:
+            continue
+        fused.slopes_of_groups(
+            lanes,
+            frames,
+            corners,
+            ny,
+            nx,
+            calibration,
+            saturation,
+            tables,
+            variants,
+            before,
+            algorithm,
+            taps,
+            item,
+            item + 1,
+            scratch,
+            slopes,
+            stages,
+        )
+        for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
+            _measure(pixels, frames, f, s, corners, ny, nx, maps, ramp, saturation, settings, slopes)
+
+
+@compiled
+def _measure(
+    pixels: Any,
+    frames: Any,
+    f: Any,
+    s: Any,
+    corners: Any,
+    ny: Any,
+    nx: Any,
+    maps: Any,
+    ramp: Any,
+    saturation: Any,
+    settings: Any,
+    slopes: Any,
+) -> Any:
+    """Measure one sub-aperture; False, and nothing written, where it has bad pixels."""
+    width = width_of(pixels)
+    height, line = frames.shape[1], frames.shape[2]
+    corner = corners[s, 0] * line + corners[s, 1]
+    zero, threshold = splat(pixels, 0.0), splat(pixels, settings[fused.LEVEL, s])
+    v, e = splat(pixels, settings[fused.VARIANCE, s]), splat(pixels, settings[fused.EXCESS, s])
+    one = splat(pixels, 1.0)
+    spoilt, brightest, largest = zero, splat(pixels, -math.inf), zero
+    total, moment_x, moment_y = zero, zero, zero
+    noise, noise_x, noise_xx, noise_y, noise_yy = zero, zero, zero, zero, zero
+    for x in range(0, nx, width):
+        column = load(pixels, ramp, x)
+        light, light_y, part, part_y, part_yy = zero, zero, zero, zero, zero
+        row = splat(pixels, -0.5 * (ny - 1))
+        for y in range(ny):
+            here = corner + y * line + x
+            raw = widened(pixels, frames, f * height * line + here)
+            value = (raw - load(pixels, maps, here)) * load(pixels, maps, height * line + here)
+            brightest = maximum(raw, brightest)
+            largest = maximum(absolute(value), largest)
+            spoilt = multiply_add(value, zero, spoilt)  # 0, or NaN where a value is not finite
+            left = select(value >= threshold, value - threshold, zero)
+            light = light + left
+            light_y = multiply_add(left, row, light_y)
+            variance = select(left > zero, multiply_add(maximum(value, zero), e, v), zero)
+            part = part + variance
+            variance_y = variance * row
+            part_y = part_y + variance_y
+            part_yy = multiply_add(variance_y, row, part_yy)
+            row = row + one
+        total, moment_y = total + light, moment_y + light_y
+        moment_x = multiply_add(light, column, moment_x)
+        noise, noise_y, noise_yy = noise + part, noise_y + part_y, noise_yy + part_yy
+        part_x = part * column
+        noise_x = noise_x + part_x
+        noise_xx = multiply_add(part_x, column, noise_xx)
+    good = select(spoilt >= zero, select(largest <= splat(pixels, LARGEST_FLOAT32), zero, one), one)
+    if any_lane(good > zero):
+        return False
+    light = sum_of(total)
+    position_x = position_y = deviation_x = deviation_y = np.float32(0.0)
+    if light > 0.0:
+        scale = np.float32(1.0) / light
+        position_x, position_y = sum_of(moment_x) * scale, sum_of(moment_y) * scale
+        # Second moments about the centre of gravity, from those about the window's middle.
+        here = splat(pixels, -2.0 * position_x)
+        around = multiply_add(noise_x, here, noise_xx)
+        around = multiply_add(noise, splat(pixels, position_x * position_x + _WITHIN), around)
+        deviation_x = _root(sum_of(around)) * scale
+        here = splat(pixels, -2.0 * position_y)
+        around = multiply_add(noise_y, here, noise_yy)
+        around = multiply_add(noise, splat(pixels, position_y * position_y + _WITHIN), around)
+        deviation_y = _root(sum_of(around)) * scale
+    bits = fused.SATURATED if any_lane(brightest >= splat(pixels, saturation)) else 0
+    slopes[4][f, s] = slopes[5][f, s] = 0
+    fused.store_centroid(
+        ny,
+        nx,
+        f,
+        s,
+        settings,
+        bits,
+        light,
+        largest_of(largest),
+        position_x,
+        position_y,
+        deviation_x,
+        deviation_y,
+        slopes,
+    )
+    return True
+
+
+@compiled
+def _root(square: Any) -> Any:
+    """Square root of what round-off may have left below 0."""
+    return math.sqrt(max(square, np.float32(0.0)))
