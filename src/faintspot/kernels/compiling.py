@@ -27,8 +27,8 @@ def compiled(function: Callable[..., Any]) -> Any:
     """Compile with Numba: cached on disk, without the GIL, division by zero as in NumPy.
 
     Nor does it count references to arrays: who calls a kernel keeps its arrays alive, and counting them, with
-    atomic instructions at every call of one kernel by another, took half of the time that the centre of gravity
-    of a sub-aperture takes. So it cannot make arrays: see `allocating`.
+    atomic instructions at every call of one kernel by another, took half of the time of a plain centre of
+    gravity. So it cannot make arrays: see `allocating`.
     """
     return _dispatcher(function, _nrt=False)
 
@@ -49,3 +49,23 @@ def _dispatcher(function: Callable[..., Any], **options: Any) -> Any:
     if cache_file is not None and hasattr(cache_file, "_source_stamp"):
         cache_file._source_stamp = _kernels_stamp()
     return dispatcher
+
+
+class Direct:
+    """A kernel for arguments that always have the same types, which are found out once.
+
+    Finding them out takes as long as a small frame's measurement. Nothing is checked afterwards: other types
+    would be read as if they were those.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self._kernel, self._entry = kernel, None
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the kernel."""
+        if self._entry is not None:
+            return self._entry(*arguments)
+        result = self._kernel(*arguments)
+        types = tuple(self._kernel.typeof_pyval(argument) for argument in arguments)
+        self._entry = self._kernel.overloads[types].entry_point
+        return result

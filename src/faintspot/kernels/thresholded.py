@@ -56,7 +56,8 @@ def thresholded_slopes(
 ) -> None:
     """Compute the slopes of the groups [start, stop) of a block of frames.
 
-    Parameters that are not listed here are those of `fused.slopes_of_groups`, which does groups with bad pixels.
+    Parameters that are not listed here are those of `fused.slopes_of_groups`, which does groups with bad
+    pixels.
 
     Parameters
     ----------

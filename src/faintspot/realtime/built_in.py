@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import LARGEST_FLOAT32
-from faintspot.kernels import fused
+from faintspot.kernels import fused, located, thresholded
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
 from faintspot.sensor.layout import Layout
 
 # Places in the arguments of `SlopePipeline.kernel_call`.
 _LANES, _FRAMES, _CORNERS, _, _, _CALIBRATION, _SATURATION, _TABLES, _, _BEFORE = range(10)
+
+_IN_ROWS = 3  # more arguments come first where pixels are measured in rows
 
 
 class BuiltIn:
@@ -41,8 +44,8 @@ class BuiltIn:
         own_estimator: bool = True,
     ) -> None:
         layout = pipeline.layout
-        self._function, arguments, shape = _call(pipeline, denoise, background, own_estimator)
-        self.gravity = self._function is fused.slopes_of_groups
+        self._function, self._rows, arguments, shape = _call(pipeline, denoise, background, own_estimator)
+        self.gravity = self._function is not located.locate_groups
         self.denoises = self.gravity and arguments[_BEFORE] != fused.NOTHING
         self.settings: NDArray[np.float32] = arguments[_TABLES][0]
         """Rows as in `faintspot.kernels.fused`."""
@@ -54,6 +57,9 @@ class BuiltIn:
             arguments[_CORNERS] = _stacked_corners(layout)
             arguments[_CALIBRATION] = np.zeros_like(arguments[_CALIBRATION])
             arguments[_CALIBRATION][:, :, 1] = 1.0  # images - 0, times 1
+            if self._rows:
+                maps = np.repeat(np.array([0.0, 1.0], np.float32), math.prod(self._frame_shape))
+                self._rows = (self._rows[0], maps.reshape(2, *self._frame_shape), self._rows[2])
         self._arguments = arguments
         if shape is None:
             self._scratch = new_scratch(lanes, *layout.window)
@@ -73,6 +79,7 @@ class BuiltIn:
         before = self._arguments[_CORNERS:_SATURATION]
         after = self._arguments[_SATURATION + 1 :]
         self._function(
+            *self._rows,
             self._arguments[_LANES],
             frames,
             *before,
@@ -89,14 +96,20 @@ class BuiltIn:
 
 def _call(
     pipeline: SlopePipeline, denoise: bool, background: bool, own_estimator: bool
-) -> tuple[Any, list[Any], tuple[int, int, int] | None]:
-    """The compiled function and its arguments without the stages that are left out."""
+) -> tuple[Any, tuple[Any, ...], list[Any], tuple[int, int, int] | None]:
+    """The compiled function, what it takes first to measure in rows, and its other arguments.
+
+    Without the stages that are left out.
+    """
     frames = np.zeros((1, *pipeline.layout.frame_shape), np.float32)
     function, given, shape = pipeline.kernel_call(frames, np.float32, np.zeros(1, np.int64))
-    arguments = list(given)
-    if function is not fused.slopes_of_groups:
+    rows = given[:_IN_ROWS] if function is thresholded.thresholded_slopes else ()
+    arguments = list(given[len(rows) :])
+    if rows and background:
+        return function, rows, arguments, shape
+    if function is located.locate_groups:
         if own_estimator:
-            return function, arguments, shape
+            return function, (), arguments, shape
         denoise = background = False
         no_taps = np.ones((len(pipeline.layout), 2, 1), np.float32)
         arguments[_BEFORE:] = [fused.NOTHING, 0, no_taps]
@@ -107,7 +120,7 @@ def _call(
         tables[:, fused.RANK] = tables[:, fused.SUBTRACT] = 0.0
         tables[:, fused.LEVEL] = -LARGEST_FLOAT32  # below every pixel: all stay as they are
         arguments[_TABLES] = tables
-    return fused.slopes_of_groups, arguments, None
+    return fused.slopes_of_groups, (), arguments, None
 
 
 def _stacked_corners(layout: Layout) -> NDArray[np.int64]:

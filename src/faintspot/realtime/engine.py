@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from faintspot.errors import InputError
-from faintspot.flags import SubapertureFlag
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import Interleaving
@@ -230,26 +229,30 @@ class Engine:
     def _end_frame(
         self, ring: PixelRing, path: Path, arm: int, arrival: int, number: int, explained: bool
     ) -> None:
-        """Publish what was measured, unless it was not that frame."""
-        counters = self.counters
-        moment = ring.last_row_time_ns(number) if number >= 0 else 0
-        if not (moment and ring.intact(number, arrival)):
+        """Publish what was measured, unless it was not that frame; first of all the slopes."""
+        counters, slopes = self.counters, path.slopes
+        moment = ring.last_row_time_ns(number, arrival) if number >= 0 else 0
+        if not moment:
             self._lose(ring, arrival, number)
             return
-        self._streams.publish_slopes(path.slopes, number)
+        self._streams.publish_slopes(slopes, number)
         published = time.monotonic_ns()
-        self.latencies.add(published - moment)
-        self._streams.publish_details(path.slopes, number)
+        latency = published - moment
+        self.latencies.add(latency)
         change = self.live.change_number
         self._streams.publish_marks((number, arm, change, moment, published))
-        self._telemetry.write(number, arm, change, moment, published, path.slopes)
+        invalid, limited = self._streams.publish_details(slopes, number)
+        self._telemetry.write(number, arm, change, moment, published, slopes)
         if explained:
             self._telemetry.write_images(number, ring.slot(number), path.denoised)
-        if self._arrival:
+        counters.frames_in += 1
+        counters.processed += 1
+        counters.invalid_subapertures += invalid
+        counters.at_iteration_limit += limited
+        counters.late += latency > self._deadline_ns
+        if self._arrival and number != self._number + 1:
             counters.skipped += max(number - self._number - 1, 0)
             counters.repeated += number <= self._number
-        counters.late += published - moment > self._deadline_ns
-        self._count(path)
         self._measured[arm] += 1
         self._arrival, self._number = arrival, number
 
@@ -272,15 +275,6 @@ class Engine:
         counters.frames_in += max(newest - 1 - arrival, 0)
         self._arrival = max(newest - 1, arrival)
         self._number = ring.number_of(newest) - 1
-
-    def _count(self, path: Path) -> None:
-        """Count what was published."""
-        slopes, counters = path.slopes, self.counters
-        counters.frames_in += 1
-        counters.processed += 1
-        counters.invalid_subapertures += len(slopes.x) - int(np.count_nonzero(slopes.valid))
-        limited = slopes.flags & SubapertureFlag.NOT_CONVERGED
-        counters.at_iteration_limit += int(np.count_nonzero(limited))
 
     # The watcher's thread ---------------------------------------------------------------------------
 

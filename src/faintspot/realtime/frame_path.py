@@ -6,7 +6,7 @@ another one beside the running system and takes it between two frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.kernels import fused, located, streaming, thresholded
+from faintspot.kernels.compiling import Direct
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
@@ -72,8 +73,7 @@ class _Groups:
         made = [pipeline.kernel_call(slot[None], slot.dtype, variants) for slot in slots]
         self._before = [arguments for _, arguments, _ in made]
         kernel, _, shape = made[0]
-        self._kernel = _STREAMED[kernel]
-        self._direct: Callable[..., int] | None = None
+        self._kernel = Direct(_STREAMED[kernel])
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
         self._scratch = [
             new_scratch(lanes, *window) if shape is None else new_spot_scratch(lanes, *window, *shape)
@@ -93,7 +93,7 @@ class _Groups:
         first, last = self._groups
         start = first + (last - first) * share // self._shares
         stop = first + (last - first) * (share + 1) // self._shares
-        arguments = (
+        done: int = self._kernel(
             progress.cells,
             progress.frame_cell,
             progress.rows_cell,
@@ -106,12 +106,7 @@ class _Groups:
             self._before[slot],
             (self._scratch[share], *after),
         )
-        if self._direct is None:
-            # Finding out which types it was compiled for takes several times as long as a frame: done once.
-            self._kernel(*arguments)
-            types = tuple(self._kernel.typeof_pyval(argument) for argument in arguments)
-            self._direct = self._kernel.overloads[types].entry_point
-        return self._direct(*arguments) == stop
+        return done == stop
 
 
 class FramePath:

@@ -32,10 +32,11 @@ _TOO_MANY_BAD = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
 class ModularPipeline:
     """Turns frames into slopes as a `SlopePipeline` does, with modules in place of some of its stages.
 
-    Without modules slopes are those of the pipeline, bit for bit; so they are with a module that does what
-    the built-in stage does, but for: iterations and the flags of the denoising, which a "denoise" module does
-    not report; standard errors, which are propagated from the images that a "calibrate" or "denoise" module
-    returned, and are infinite (not known) after a "background" or "centroid" module.
+    Without modules slopes are those of the pipeline, bit for bit ("thresholded": to float32 rounding, where
+    pixels are bad); so they are with a module that does what the built-in stage does, but for: iterations and
+    the flags of the denoising, which a "denoise" module does not report; standard errors, which are
+    propagated from the images that a "calibrate" or "denoise" module returned, and are infinite (not known)
+    after a "background" or "centroid" module.
 
     Bad pixels, saturation and missing light are found and flagged as built in, also before a "calibrate"
     module. A sub-aperture for which a module returns what is not finite is flagged NO_LIGHT. Estimators that

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.kernels.compiling import Direct
+from faintspot.kernels.details import fill_details
 from faintspot.pipeline import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -43,6 +45,8 @@ class SlopeStreams:
         self._details = _created(f"{name}_details", (len(DETAILS), n))
         self._marks = _created(f"{name}_marks", (len(MARKS),), np.int64)
         self._n = n
+        self._fill = Direct(fill_details)
+        self._counts = np.zeros(2, np.int64)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -59,12 +63,26 @@ class SlopeStreams:
             vector[: self._n] = slopes.x
             vector[self._n :] = slopes.y
 
-    def publish_details(self, slopes: Slopes, frame: int) -> None:
-        """Publish what else is known of each slope; by the thread that holds the streams."""
+    def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int]:
+        """Publish what else is known of each slope; by the thread that holds the streams.
+
+        Returns
+        -------
+        invalid, limited : int
+            Sub-apertures without a slope, and those whose denoising ended at the iteration limit.
+        """
         with self._details.write_view_locked(frame_id=frame) as table:
-            table[0], table[1] = slopes.flux, slopes.valid
-            table[2], table[3] = slopes.standard_error_x, slopes.standard_error_y
-            table[4], table[5] = slopes.iterations, slopes.flags
+            self._fill(
+                slopes.flux,
+                slopes.flags,
+                slopes.iterations,
+                slopes.standard_error_x,
+                slopes.standard_error_y,
+                self._counts,
+                table,
+            )
+        invalid, limited = self._counts.tolist()
+        return invalid, limited
 
     def publish_marks(self, marks: tuple[int, ...]) -> None:
         """Publish with what and when a frame was measured; by the thread that holds the streams."""

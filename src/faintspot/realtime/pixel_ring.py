@@ -268,11 +268,15 @@ class PixelRing:
                 return number if cell[SLOT_ARRIVAL] == arrival else -1
         return -1
 
-    def last_row_time_ns(self, frame: int) -> int:
-        """Return when its last row was complete (CLOCK_MONOTONIC), 0 for incomplete or not held."""
+    def last_row_time_ns(self, frame: int, arrival: int | None = None) -> int:
+        """Return when its last row was complete (CLOCK_MONOTONIC), 0 for incomplete or not held.
+
+        Where frame numbers may repeat, `arrival` says which one is meant.
+        """
         cell = self.cells[FIRST_SLOT + frame % self.slots]
         moment = int(cell[SLOT_TIME])
-        return moment if cell[SLOT_FRAME] == frame else 0
+        held = cell[SLOT_FRAME] == frame and (arrival is None or cell[SLOT_ARRIVAL] == arrival)
+        return moment if held else 0
 
     def wait(self, frame: int, rows: int, timeout_s: float) -> bool:
         """Wait until the first `rows` rows of a frame are there; False when they do not come.
