@@ -59,7 +59,8 @@ class Direct:
     """
 
     def __init__(self, kernel: Any) -> None:
-        self._kernel, self._entry = kernel, None
+        self._kernel = kernel
+        self._entry: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel."""
