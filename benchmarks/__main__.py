@@ -15,6 +15,8 @@ NAMES = (
     "estimators",
     "realtime",
     "realtime_sustained",
+    "pyrtc",
+    "loop",
     "roofline",
     "startup",
     "breakdown",

@@ -14,6 +14,7 @@ from faintspot.errors import InputError, MissingExtraError
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
+    "loop": "Measure what a method gains in a closed adaptive-optics loop, in simulation.",
     "realtime": "Measure frames as they arrive, row by row, and publish slopes in shared memory.",
     "report": "Make a web page of pictures and tables from slopes or a study.",
     "slopes": "Turn recorded frames into slopes.",

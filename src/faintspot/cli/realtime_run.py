@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from functools import partial
 from typing import Any
@@ -78,7 +79,6 @@ def run(
       faintspot realtime run --interleave none,tv --every 50
     """
     from faintspot.pipeline import SlopePipeline
-    from faintspot.realtime.bridge import StreamBridge
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.handlers import handlers_of
@@ -96,7 +96,7 @@ def run(
         settings,
         threads=threads,
         cpus=processors,
-        source=None if stream is None else StreamBridge(stream, name, say=partial(click.echo, err=True)),
+        source=None if stream is None else _followed(stream, name),
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
         deadline_s=deadline * 1e-6,
         images_every=images_every,
@@ -115,6 +115,13 @@ def run(
             threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
             engine.run(frames)
     click.echo(summary(engine.status()))
+
+
+def _followed(stream: str, name: str) -> Any:
+    """The stream as the engine's own source, which keeps a processor busy as waiting for rows would."""
+    from faintspot.realtime.bridge import StreamBridge
+
+    return StreamBridge(stream, name, say=partial(click.echo, err=True), spins=(os.cpu_count() or 1) > 1)
 
 
 def _stop_when_set(stop: threading.Event, engine: Any) -> None:

@@ -200,25 +200,30 @@ class Engine:
                 if ring.closed:
                     self.counters.source_restarts += 1
                     break
-                continue
-            path, arm = self._take(ring)
-            self._path, self._waiting = path, True
-            arrival = self._arrival + 1
-            explain = self._images_every > 0 and self._measured[arm] % self._images_every == 0
-            whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
-            number = ring.number_of(arrival)
-            if whole and number >= 0 and number != self._number + 1:  # it lies in another slot than expected
-                whole = path.measure(arrival, number % ring.slots, explain=explain)
-            self._waiting = False
-            if not whole and path.stopped:
+            elif not self._measure_next(ring):
                 if self._stopping.is_set() or ring.closed or ring.stale:
                     self.counters.source_restarts += not self._stopping.is_set()
                     break
-                path.go_on()
-            else:
-                self._end_frame(ring, path, arm, arrival, number if whole else -1, explain)
+                if self._path is not None:
+                    self._path.go_on()
         if self._workers is not None:
             self._workers.park()
+
+    def _measure_next(self, ring: PixelRing) -> bool:
+        """Measure and publish the next frame; return False when waiting for it was ended."""
+        path, arm = self._take(ring)
+        self._path, self._waiting = path, True
+        arrival = self._arrival + 1
+        explain = self._images_every > 0 and self._measured[arm] % self._images_every == 0
+        whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
+        number = ring.number_of(arrival)
+        if whole and number >= 0 and number != self._number + 1:  # it lies in another slot than expected
+            whole = path.measure(arrival, number % ring.slots, explain=explain)
+        self._waiting = False
+        if not whole and path.stopped:
+            return False
+        self._end_frame(ring, path, arm, arrival, number if whole else -1, explain)
+        return True
 
     def _take(self, ring: PixelRing) -> tuple[Path, int]:
         """Return the way of the next frame, and whose turn it is; changes of settings take effect here."""

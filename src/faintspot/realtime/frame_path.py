@@ -150,13 +150,15 @@ class FramePath:
         self._control = np.zeros(1, np.int64)
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide
-        # What is left over is measured in narrower groups where that is faster: its rows come last.
-        narrow = 0 < rest <= wide // 2 and wide // 2 in WIDTHS and pipeline.settings.estimator not in METHODS
+        # What is left over is measured in a narrower group where that is faster: its rows come last.
+        gravity = pipeline.settings.estimator not in METHODS
+        narrow = [width for width in WIDTHS if rest <= width < wide] if rest and gravity else []
         self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares)
         self._narrow = None
         if narrow:
-            groups = full * 2, full * 2 + 1
-            self._narrow = _Groups(pipeline.with_width(wide // 2), slots, groups, 1)
+            width = min(narrow)
+            groups = full * wide // width, full * wide // width + 1
+            self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1)
         self._plain = results, self._stages[:0]
         self._explaining = results, self._stages
 

@@ -1,0 +1,214 @@
+"""faintspot loop: closed-loop experiments."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from faintspot.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from faintspot.loop.running import Workplace
+
+
+def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of every experiment."""
+    for option in (
+        click.option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
+        click.option(
+            "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use: tcp://HOST:PORT."
+        ),
+        click.option(
+            "--workers",
+            type=click.IntRange(0),
+            metavar="N",
+            help="Processes on this machine. Default: all processors. 0: this process, without Dask.",
+        ),
+        click.option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
+        click.option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="Where results go. Default: the configuration's name, or name-quick.",
+        ),
+        click.argument("configuration", metavar="[CONFIG]", default="canary"),
+    ):
+        command = option(command)
+    return command
+
+
+@click.group(name="loop", short_help="Measure what a method gains in a closed adaptive-optics loop.")
+def command() -> None:
+    """Measure what a method gains in a closed adaptive-optics loop, in simulation.
+
+    Telescope, turbulence, Shack-Hartmann sensor, camera, mirror and control are simulated; slopes come from
+    the same pipeline as everywhere. CONFIG is a TOML file or the name of a shipped configuration; default:
+    canary. Needs the extra `loop`. Interrupted and started again, the commands go on where they stopped.
+
+    \b
+    Examples:
+      faintspot loop run --quick
+      faintspot loop magnitude camera_3e --arms brightest,smoothed,tv
+      faintspot loop show canary > mine.toml
+    """
+
+
+@command.command(name="list", short_help="List the shipped configurations.")
+def list_shipped() -> None:
+    """List the shipped configurations."""
+    from faintspot.loop.configuration import load_loop, shipped_loops
+
+    for name in shipped_loops():
+        loop = load_loop(name)
+        camera, sensor = loop.camera, loop.sensor
+        noise = camera.read_noise_e / camera.em_gain
+        click.echo(
+            f"{name:18s} {loop.telescope.diameter_m:g} m, {sensor.subapertures}x{sensor.subapertures} "
+            f"sub-apertures of {sensor.pixels}x{sensor.pixels} pixels, {noise:g} e- read noise, "
+            f"{loop.photons:g} photons"
+        )
+
+
+@command.command(short_help="Print a configuration as TOML.")
+@click.argument("name", metavar="CONFIG")
+def show(name: str) -> None:
+    """Print a configuration, shipped or of a file, as TOML with every value written out."""
+    from faintspot.loop.configuration import load_loop
+
+    click.echo(load_loop(name).to_text(), nl=False)
+
+
+@command.command(short_help="Observe with and without denoising in turn.")
+@_experiment_options
+def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **where: Any) -> None:
+    """Observe with and without TV denoising in turn, as on the sky.
+
+    Four sets: two at full multiplication gain of the camera and two at 75 %; in each, a measurement without
+    denoising, then 8 or 20 strengths rising from 0 to 2 electrons, repeated, while the turbulence drifts.
+
+    \b
+    Examples:
+      faintspot loop run --quick
+      faintspot loop run mine.toml -o mine
+    """
+    from faintspot.loop.configuration import load_loop
+    from faintspot.loop.interleaved import run_interleaved
+    from faintspot.loop.summary import interleaved_summary
+
+    loop = load_loop(configuration)
+    folder = output or _folder(loop.name, quick)
+    with _workplace(**where) as place:
+        result = run_interleaved(loop, folder, quick=quick, place=place, overwrite=overwrite)
+    click.echo(interleaved_summary(result))
+    _report(folder)
+
+
+@command.command(short_help="Measure the Strehl ratio against the star's magnitude.")
+@_experiment_options
+@click.option("--arms", metavar="NAMES", help="Methods to compare, with commas. Default: all that suit.")
+@click.option(
+    "--photons", metavar="NUMBERS", help="Photo-electrons of a sub-aperture in a frame, with commas."
+)
+def magnitude(
+    configuration: str,
+    output: str | None,
+    quick: bool,
+    overwrite: bool,
+    arms: str | None,
+    photons: str | None,
+    **where: Any,
+) -> None:
+    """Measure the Strehl ratio of any list of methods against the star's magnitude.
+
+    Each method is tuned at each flux, its settings and the loop gain together, on air that is not scored.
+    Methods: cog, thresholded, brightest, smoothed, tv, weighted, ml, ml_weighted, map, map_weighted, trained,
+    trained_predicted, brightest_uncorrected, tv_uncorrected.
+
+    \b
+    Examples:
+      faintspot loop magnitude --quick
+      faintspot loop magnitude camera_3e --arms brightest,smoothed,tv,ml --photons 60,200,640
+    """
+    from faintspot.loop.configuration import load_loop
+    from faintspot.loop.magnitude import run_magnitude
+    from faintspot.loop.summary import magnitude_summary
+
+    loop = load_loop(configuration)
+    folder = output or _folder(loop.name, quick)
+    fluxes = None if photons is None else [_number(text) for text in _listed(photons)]
+    names = None if arms is None else _listed(arms)
+    with _workplace(**where) as place:
+        result = run_magnitude(loop, folder, names, fluxes, quick=quick, place=place, overwrite=overwrite)
+    click.echo(magnitude_summary(result))
+    _report(folder)
+
+
+@command.command(short_help="Say what limits the Strehl ratio, by switching terms off.")
+@_experiment_options
+@click.option("--arms", metavar="NAMES", help="Methods, with commas. Default: brightest,smoothed,tv.")
+def budget(
+    configuration: str, output: str | None, quick: bool, overwrite: bool, arms: str | None, **where: Any
+) -> None:
+    """Say what limits the Strehl ratio, by switching terms of the error off.
+
+    At the configuration's own flux, each method is tuned and then runs without photon and read noise, without
+    delay of the loop, without what the mirror cannot correct, with its actual centroid gain, and with the
+    wavefront's true slopes.
+
+    \b
+    Examples:
+      faintspot loop budget camera_3e --quick
+    """
+    from faintspot.loop.budget import run_budget
+    from faintspot.loop.configuration import load_loop
+    from faintspot.loop.summary import budget_summary
+
+    loop = load_loop(configuration)
+    folder = output or _folder(loop.name, quick)
+    names = None if arms is None else _listed(arms)
+    with _workplace(**where) as place:
+        result = run_budget(loop, folder, names, quick=quick, place=place, overwrite=overwrite)
+    click.echo(budget_summary(result))
+    _report(folder)
+
+
+@contextmanager
+def _workplace(workers: int | None, scheduler: str | None) -> Iterator[Workplace]:
+    """Yield where the work is done, with a progress bar."""
+    from faintspot.loop.running import Workplace
+
+    with progress_bar("loop") as advance:
+        yield Workplace(workers, scheduler, advance, lambda text: click.echo(text, err=True))
+
+
+def _folder(name: str, quick: bool) -> str:
+    return f"{name}-quick" if quick else name
+
+
+def _listed(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _number(text: str) -> float:
+    from faintspot.errors import InputError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--photons: expected numbers with commas, got {text!r}") from None
+
+
+def _report(folder: str) -> None:
+    """Write the page of a folder of results."""
+    from faintspot.report.loop_page import write_loop_report
+
+    page = Path(folder) / "report.html"
+    write_loop_report(folder, page)
+    click.echo(f"{shlex.quote(str(page))}: open it in a browser")

@@ -1,0 +1,196 @@
+"""Tuning of an arm for a configuration's light: loop gain and everything else of it together."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.loop.arms import Choice, Parameter, arm_named, tuned_parameters
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.running import Advance
+from faintspot.loop.simulation import simulate_loop
+
+FIRST_TUNING_REALISATION = 1000
+"""Realisations of the air from this one on are tuned on; those before are scored."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """How thoroughly settings are sought.
+
+    Parameters
+    ----------
+    coarse_frames : int
+        Of every combination of the coarse values, with one realisation of the air.
+    frames : int
+        Of the settings around the best ones, with every realisation; also of the final choice.
+    settle_frames : int
+        Of these, not scored.
+    realisations : int
+        Of the refined search.
+    finalists : int
+        Coarse combinations that are looked at again.
+    rounds : int
+        Most steps away from the best of them; 0: none.
+
+    Raises
+    ------
+    InputError
+        For numbers out of range.
+    """
+
+    coarse_frames: int = 250
+    frames: int = 400
+    settle_frames: int = 60
+    realisations: int = 2
+    finalists: int = 4
+    rounds: int = 5
+
+    def __post_init__(self) -> None:
+        lowest = {"coarse_frames": self.settle_frames + 1, "frames": self.settle_frames + 1, "rounds": 0}
+        for name in ("settle_frames", "coarse_frames", "frames", "realisations", "finalists", "rounds"):
+            number_between(f"search.{name}", getattr(self, name), lowest.get(name, 1), 10**6, integer=True)
+
+
+QUICK = Search(coarse_frames=160, frames=160, settle_frames=40, realisations=1, finalists=1, rounds=0)
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What the search found."""
+
+    choice: Choice
+    strehl: float
+    """Mean of the tuning runs; the best of many, so higher than that of other runs."""
+    tried: int
+    """Settings that were looked at."""
+
+
+def tune(
+    name: str,
+    configuration: LoopConfiguration,
+    search: Search | None = None,
+    advance: Advance | None = None,
+) -> Tuned:
+    """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
+
+    All combinations of a few values of each parameter first, then steps from the best of them to
+    neighbouring values of one parameter at a time, as long as that helps. All see the same air and noise;
+    realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
+
+    Parameters
+    ----------
+    name : str
+        One of `faintspot.loop.arms.ARM_NAMES`.
+    configuration : LoopConfiguration
+    search : Search, optional
+    advance : callable, optional
+        Told the number of frames simulated, after every run.
+
+    Raises
+    ------
+    InputError
+        For an unknown arm.
+    """
+    search = Search() if search is None else search
+    parameters = tuned_parameters(name)
+    trials = _Trials(name, configuration, search, advance)
+    coarse = [
+        dict(zip(parameters, values, strict=True))
+        for values in itertools.product(*(parameter.coarse for parameter in parameters.values()))
+    ]
+    ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
+    if search.rounds == 0:
+        return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
+    best = max(ranked[: search.finalists], key=trials.fine)
+    for _ in range(search.rounds):
+        better = max(_neighbours(best, parameters), key=trials.fine)
+        if trials.fine(better) <= trials.fine(best):
+            break
+        best = better
+    return Tuned(best, trials.fine(best), trials.tried)
+
+
+def tuning_unit(
+    name: str, configuration: LoopConfiguration, search: Search, advance: Advance
+) -> dict[str, NDArray[Any]]:
+    """Return what `tune` found, as arrays that can be stored."""
+    tuned = tune(name, configuration, search, advance)
+    return {
+        "choice": np.asarray(json.dumps(dict(tuned.choice))),
+        "strehl": np.asarray(tuned.strehl),
+        "tried": np.asarray(tuned.tried),
+    }
+
+
+def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, float]:
+    """Return the choice that `tuning_unit` stored."""
+    choice: dict[str, float] = json.loads(str(result["choice"]))
+    return choice
+
+
+def tuning_frames(name: str, search: Search) -> int:
+    """Return about how many frames tuning an arm simulates."""
+    parameters = tuned_parameters(name)
+    combinations = int(np.prod([len(parameter.coarse) for parameter in parameters.values()]))
+    looks = search.finalists + 2 * len(parameters) * min(2, search.rounds) if search.rounds else 0
+    return combinations * search.coarse_frames + looks * search.frames * search.realisations
+
+
+class _Trials:
+    """Strehl ratios of the settings that were looked at."""
+
+    def __init__(
+        self, name: str, configuration: LoopConfiguration, search: Search, advance: Advance | None
+    ) -> None:
+        self._name, self._search = name, search
+        self._advance, self._frames = advance, 0
+        self._configuration = configuration
+        self._coarse: dict[tuple[float, ...], float] = {}
+        self._fine: dict[tuple[float, ...], float] = {}
+
+    @property
+    def tried(self) -> int:
+        return len(self._coarse.keys() | self._fine.keys())
+
+    def coarse(self, choice: Choice) -> float:
+        """Return the Strehl ratio in one short run."""
+        key = tuple(choice.values())
+        if key not in self._coarse:
+            self._coarse[key] = self._strehl(choice, self._search.coarse_frames, 1)
+        return self._coarse[key]
+
+    def fine(self, choice: Choice) -> float:
+        """Return the mean Strehl ratio of longer runs."""
+        key = tuple(choice.values())
+        if key not in self._fine:
+            self._fine[key] = self._strehl(choice, self._search.frames, self._search.realisations)
+        return self._fine[key]
+
+    def _strehl(self, choice: Choice, frames: int, realisations: int) -> float:
+        short = self._configuration.replace("run", frames=frames, settle_frames=self._search.settle_frames)
+        arm = arm_named(self._name, short, choice)
+        runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
+        strehl = float(np.mean([simulate_loop(short, [arm], realisation=run).mean_strehl() for run in runs]))
+        self._frames += frames * realisations
+        if self._advance is not None:
+            self._advance(self._frames)
+        return strehl
+
+
+def _neighbours(choice: Choice, parameters: Mapping[str, Parameter]) -> list[dict[str, float]]:
+    """Return the choices one step away in one parameter."""
+    near = []
+    for name, parameter in parameters.items():
+        place = parameter.values.index(choice[name])
+        for other in (place - 1, place + 1):
+            if 0 <= other < len(parameter.values):
+                near.append({**choice, name: parameter.values[other]})
+    return near

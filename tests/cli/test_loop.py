@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.cli.cli_cases import Commands
+from tests.loop.experiment_cases import PLAN, SEARCH, small
+
+import faintspot.cli
+from faintspot.loop import budget, interleaved, magnitude
+from faintspot.loop.configuration import LoopConfiguration, load_loop, shipped_loops
+
+pytest.importorskip("hcipy")
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(autouse=True)
+def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(faintspot.cli._COMMANDS, "loop", "")
+    monkeypatch.setattr(interleaved, "QUICK_PLAN", PLAN)
+    monkeypatch.setattr(magnitude, "QUICK", SEARCH)
+    monkeypatch.setattr(budget, "QUICK", SEARCH)
+    monkeypatch.setattr(budget, "TERMS", ("nothing", "slope error"))
+    monkeypatch.chdir(tmp_path)
+    faint = small().replace("camera", em_gain=100.0).replace("run", photons_per_subaperture=(40.0, 400.0))
+    Path("small.toml").write_text(faint.to_text(), encoding="utf-8")
+
+
+def test_list_and_show(run: Commands) -> None:
+    listed = run("loop", "list").out.splitlines()
+    assert [line.split()[0] for line in listed] == shipped_loops()
+    shown = run("loop", "show", "canary").out
+    assert LoopConfiguration.from_text(shown) == load_loop("canary")
+
+
+def test_run_and_report(run: Commands) -> None:
+    result = run("loop", "run", "small.toml", "--quick", "--workers", 0)
+    assert result.code == 0, result.err
+    assert "75 % of the gain, 3 strengths" in result.out
+    assert "TV, strength 0.6 to 1.1" in result.out
+    assert "paired" in result.out
+    assert result.out.splitlines()[-1] == "small-quick/report.html: open it in a browser"
+    assert "TV" in Path("small-quick/report.html").read_text(encoding="utf-8")
+    again = run("report", "small-quick", "-o", "page.html")
+    assert again.out == "page.html: open it in a browser\n"
+    assert Path("page.html").is_file()
+
+
+def test_magnitude(run: Commands) -> None:
+    result = run(
+        "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--arms", "brightest", "-o", "here"
+    )
+    assert result.code == 0, result.err
+    assert result.out.splitlines()[0].split() == ["photo-electrons", "40", "400"]
+    assert Path("here/report.html").is_file()
+
+
+def test_budget(run: Commands) -> None:
+    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--arms", "cog")
+    assert result.code == 0, result.err
+    lines = result.out.splitlines()
+    assert lines[0].split() == ["without", "centre", "of", "gravity"]
+    assert lines[2].startswith("slope error")
+    assert lines[-1] == "small-quick/report.html: open it in a browser"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "nowhere.toml"], "nowhere.toml: no such file, and none of the shipped configurations"),
+        (["show", "nowhere"], "nowhere: no such file"),
+        (["magnitude", "small.toml", "--arms", "kog"], "arm = 'kog': expected one of"),
+        (["magnitude", "small.toml", "--photons", "1,x"], "--photons: expected numbers with commas, got 'x'"),
+        (["magnitude", "small.toml", "--photons", "-1"], "photons"),
+        (["run", "small.toml", "-o", "no/where"], "the folder no does not exist"),
+        (["budget", "open_loop"], "expected 'closed' for an error budget"),
+    ],
+)
+def test_errors_are_one_line(run: Commands, arguments: list[str], message: str) -> None:
+    result = run("loop", *arguments)
+    assert result.code == 2
+    assert message in result.error

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.loop.experiment_cases import SEARCH, small
+
+from faintspot.errors import InputError
+from faintspot.loop import tuning
+from faintspot.loop.arms import tuned_parameters
+from faintspot.loop.tuning import FIRST_TUNING_REALISATION, Search, stored_choice, tune, tuning_unit
+
+
+class _Record:
+    def __init__(self, strehl: float) -> None:
+        self._strehl = strehl
+
+    def mean_strehl(self) -> float:
+        return self._strehl
+
+
+@pytest.fixture
+def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A loop whose Strehl ratio is highest at gain 0.6 and 16 kept pixels; yields realisations used."""
+    used: list[int] = []
+
+    def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
+        used.append(realisation)
+        kept = arms[0].settings.keep_brightest
+        return _Record(1 - (arms[0].gain - 0.6) ** 2 - 0.1 * np.log(kept / 16) ** 2)
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    return used
+
+
+def test_finds_the_top(hill: list[int]) -> None:
+    told: list[int] = []
+    found = tune("brightest", small(), Search(rounds=9), told.append)
+    assert found.choice == {"gain": 0.6, "kept": 0.25}
+    assert found.strehl == pytest.approx(1)
+    assert min(hill) >= FIRST_TUNING_REALISATION
+    assert told == sorted(told)
+
+
+def test_looks_at_no_choice_twice(hill: list[int]) -> None:
+    search = Search(rounds=9, realisations=1)
+    found = tune("brightest", small(), search)
+    coarse = np.prod([len(parameter.coarse) for parameter in tuned_parameters("brightest").values()])
+    assert len(hill) <= found.tried + coarse  # each at most once coarsely and once finely
+
+
+def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
+    found = tune("brightest", small(), tuning.QUICK)
+    assert found.choice == {"gain": 0.7, "kept": 0.35}
+    assert found.tried == 9
+
+
+def test_is_repeatable_and_stored() -> None:
+    one, other = (tuning_unit("cog", small(), SEARCH, lambda frames: None) for _ in range(2))
+    assert stored_choice(one) == stored_choice(other)
+    np.testing.assert_array_equal(one["strehl"], other["strehl"])
+    assert 0 < one["strehl"] < 1
+
+
+def test_search_is_checked() -> None:
+    with pytest.raises(InputError, match=r"search.frames"):
+        Search(frames=50, settle_frames=60)
+    with pytest.raises(InputError, match=r"search.rounds"):
+        Search(rounds=-1)
