@@ -77,7 +77,7 @@ def test_load_swap_unload(name: str, host: Host, tmp_path: Path) -> None:
     with pytest.raises(fs.InputError, match="denoise: module gentle is loaded there; swap takes its place"):
         run(name, "load", "strong.py")
     assert "denoise: strong" in run(name, "swap", "strong.py")
-    assert run(name, "unload", "strong") == "denoise: built in taken at the next frame\n"
+    assert run(name, "unload", "strong") == "denoise: the built-in stage, taken at the next frame\n"
     assert host.loaded == {}
 
 

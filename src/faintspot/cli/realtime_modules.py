@@ -49,7 +49,7 @@ def swap(name: str, module: str) -> None:
 def unload(name: str, stage: str) -> None:
     """Put a built-in stage back in place of a module."""
     reply = _asked(name, "unload", stage=stage)
-    click.echo(f"{reply['stage']}: built in {_since(reply['frame'])}")
+    click.echo(f"{reply['stage']}: the built-in stage, {_since(reply['frame'])}")
 
 
 @click.command("modules")
