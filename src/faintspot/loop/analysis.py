@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,8 +120,9 @@ class SetSeeing:
     """From the whole slopes."""
 
 
+@lru_cache(maxsize=2)
 def measurements(result: InterleavedResult) -> Measurements:
-    """Return the table of all measurements of interleaved observations.
+    """Return the table of all measurements of interleaved observations; the last ones made are kept.
 
     Raises
     ------

@@ -226,12 +226,12 @@ def _finished_by_workers(
     """Yield every unit and its result as it finishes."""
     from faintspot.study import running as study_running
 
-    distributed = study_running._dask_distributed()
+    distributed = study_running.dask_distributed()
     topic = f"faintspot-loop-{uuid.uuid4()}"
     # What workers tell and finished units arrive here, so that all is told to the caller in its own thread.
     news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-    with study_running._client(place.scheduler, place.workers, len(units)) as client:
-        place.say(f"Dask scheduler {client.scheduler.address}{study_running._dashboard(client)}")
+    with study_running.dask_client(place.scheduler, place.workers, len(units)) as client:
+        place.say(f"Dask scheduler {client.scheduler.address}{study_running.dashboard(client)}")
         client.subscribe_topic(topic, lambda event: news.put(event[1]))
         waiting = {unit.key: unit for unit in units}
         futures = {}

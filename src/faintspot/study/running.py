@@ -109,9 +109,9 @@ def _finished_cells(
         for index, cell in cells.items():
             yield index, measure_cell(cell, specification)
         return
-    distributed = _dask_distributed()
-    with _client(scheduler, workers, len(cells)) as client:
-        announce(f"Dask scheduler {client.scheduler.address}{_dashboard(client)}")
+    distributed = dask_distributed()
+    with dask_client(scheduler, workers, len(cells)) as client:
+        announce(f"Dask scheduler {client.scheduler.address}{dashboard(client)}")
         futures = {
             client.submit(
                 _measure_on_worker, cell, specification, specification.fingerprint, pure=False
@@ -127,7 +127,7 @@ def _finished_cells(
             client.cancel(list(futures))
 
 
-def _dask_distributed() -> Any:
+def dask_distributed() -> Any:
     """Return the module, of which only a part is typed."""
     try:
         return importlib.import_module("distributed")
@@ -143,14 +143,14 @@ def _measure_on_worker(cell: Cell, specification: StudySpecification, fingerprin
 
 
 @contextmanager
-def _client(scheduler: str | None, workers: int | None, n_cells: int) -> Iterator[Any]:
+def dask_client(scheduler: str | None, workers: int | None, n_cells: int) -> Iterator[Any]:
     """Connect to a running scheduler, or start a cluster of this machine's processes.
 
     Never as Dask's default: what else the process computes with Dask is not the study's.
     """
     import dask
 
-    distributed = _dask_distributed()
+    distributed = dask_distributed()
     if scheduler is not None:
         try:
             client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
@@ -178,7 +178,7 @@ def _client(scheduler: str | None, workers: int | None, n_cells: int) -> Iterato
         yield client
 
 
-def _dashboard(client: Any) -> str:
+def dashboard(client: Any) -> str:
     """Return where the dashboard is; without Bokeh, which draws it, Dask links to a missing page."""
     link = client.dashboard_link
     return f", dashboard {link}" if link and importlib.util.find_spec("bokeh") else ""
