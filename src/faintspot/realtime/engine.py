@@ -101,6 +101,7 @@ class Engine:
         self.live = LiveSettings(self.programmes.make, settings)
         self.modules = EngineModules(self.live, self.programmes)
         layout = self.live.pipeline.layout
+        self._raw = np.zeros(layout.frame_shape, np.float32)
         self._streams = SlopeStreams(name, len(layout))
         try:
             self._telemetry = TelemetryRing.create(
@@ -249,7 +250,9 @@ class Engine:
         invalid, limited = self._streams.publish_details(slopes, number)
         self._telemetry.write(number, arm, change, moment, published, slopes)
         if explained:
-            self._telemetry.write_images(number, ring.slot(number), path.denoised)
+            np.copyto(self._raw, ring.slot(number))
+            if ring.intact(number, arrival):
+                self._telemetry.write_images(number, self._raw, path.denoised)
         counters.frames_in += 1
         counters.processed += 1
         counters.invalid_subapertures += invalid
