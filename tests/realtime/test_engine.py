@@ -29,6 +29,7 @@ def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     assert all(np.array_equal(bench.slopes[number], expected[number]) for number in range(6))
     counters = bench.engine.counters
     assert (counters.processed, counters.dropped, counters.skipped) == (6, 0, 0)
+    assert counters.iterations == make(SETTINGS)(data).iterations.sum()
     assert bench.engine.latencies.count == 6
 
 

@@ -90,6 +90,9 @@ def _table(name: str) -> Any:
     grid.add_section()
     for key, value in reply["counters"].items():
         grid.add_row(key.replace("_", " "), f"{value}")
+    slopes = reply["counters"]["processed"] * reply["subapertures"]
+    mean = f"{reply['counters']['iterations'] / slopes:.1f}" if slopes else "-"
+    grid.add_row("iterations a sub-aperture", mean)
     grid.add_section()
     for key in ("min", "p50", "p99", "p99_9", "max"):
         value = latency[f"{key}_us"]

@@ -14,15 +14,16 @@ _INVALID, _NOT_CONVERGED = int(INVALID), int(SubapertureFlag.NOT_CONVERGED)
 def fill_details(
     flux: Any, flags: Any, iterations: Any, error_x: Any, error_y: Any, counts: Any, table: Any
 ) -> None:
-    """Fill a table (6, n), and count invalid sub-apertures and those at the iteration limit, (2,) int64.
+    """Fill a table (6, n), and count: invalid sub-apertures, those at the iteration limit, iterations.
 
     Rows of the table: flux, valid, standard errors of x and y, iterations, flags.
     """
-    counts[0] = counts[1] = 0
+    counts[0] = counts[1] = counts[2] = 0
     for s in range(flux.shape[0]):
         invalid = flags[s] & _INVALID != 0
         counts[0] += invalid
         counts[1] += flags[s] & _NOT_CONVERGED != 0
+        counts[2] += iterations[s]
         table[0, s] = flux[s]
         table[1, s] = 0.0 if invalid else 1.0
         table[2, s] = error_x[s]

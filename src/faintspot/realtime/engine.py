@@ -127,6 +127,7 @@ class Engine:
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator,
+            "subapertures": len(self.live.pipeline.layout),
             "arms": self.interleaving.labels,
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
@@ -247,7 +248,7 @@ class Engine:
         self.latencies.add(latency)
         change = self.live.change_number
         self._streams.publish_marks((number, arm, change, moment, published))
-        invalid, limited = self._streams.publish_details(slopes, number)
+        invalid, limited, iterations = self._streams.publish_details(slopes, number)
         self._telemetry.write(number, arm, change, moment, published, slopes)
         if explained:
             np.copyto(self._raw, ring.slot(number))
@@ -257,6 +258,7 @@ class Engine:
         counters.processed += 1
         counters.invalid_subapertures += invalid
         counters.at_iteration_limit += limited
+        counters.iterations += iterations
         counters.late += latency > self._deadline_ns
         if self._arrival and number != self._number + 1:
             counters.skipped += max(number - self._number - 1, 0)

@@ -46,7 +46,7 @@ class SlopeStreams:
         self._marks = _created(f"{name}_marks", (len(MARKS),), np.int64)
         self._n = n
         self._fill = Direct(fill_details)
-        self._counts = np.zeros(2, np.int64)
+        self._counts = np.zeros(3, np.int64)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -63,13 +63,14 @@ class SlopeStreams:
             vector[: self._n] = slopes.x
             vector[self._n :] = slopes.y
 
-    def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int]:
+    def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int, int]:
         """Publish what else is known of each slope; by the thread that holds the streams.
 
         Returns
         -------
-        invalid, limited : int
-            Sub-apertures without a slope, and those whose denoising ended at the iteration limit.
+        invalid, limited, iterations : int
+            Sub-apertures without a slope, those whose denoising ended at the iteration limit, and how many
+            iterations all took together.
         """
         with self._details.write_view_locked(frame_id=frame) as table:
             self._fill(
@@ -81,8 +82,8 @@ class SlopeStreams:
                 self._counts,
                 table,
             )
-        invalid, limited = self._counts.tolist()
-        return invalid, limited
+        invalid, limited, iterations = self._counts.tolist()
+        return invalid, limited, iterations
 
     def publish_marks(self, marks: tuple[int, ...]) -> None:
         """Publish with what and when a frame was measured; by the thread that holds the streams."""

@@ -166,6 +166,8 @@ class Counters:
     """Slopes that were not valid."""
     at_iteration_limit: int = 0
     """Slopes whose denoising ended at the iteration limit."""
+    iterations: int = 0
+    """Iterations of the denoising, of all sub-apertures together."""
     settings_changes: int = 0
     """Changes of settings that took effect."""
     settings_refused: int = 0
