@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import os
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
 import pytest
+from rich.console import Console
 from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
+from faintspot.cli import realtime_control
 from faintspot.io import open_frames
 from faintspot.realtime.bridge import StreamBridge
 from faintspot.realtime.engine import Engine
@@ -171,3 +175,18 @@ def test_recorded_frames_give_the_slopes_that_they_give_offline(bench: Bench, tm
     for record in records:
         for name in ("x", "y", "flux", "flags", "iterations", "standard_error_x"):
             assert np.array_equal(record[name], getattr(expected, name)[record["frame"]]), name
+
+
+def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = simulated(1)
+    with bench.ring() as ring:
+        bench.attached()
+        bench.send(ring, 0, data[0])
+        monkeypatch.setattr(realtime_control, "_asked", lambda name, what: bench.engine.status())
+        console = Console(width=100, record=True, file=io.StringIO())
+        console.print(realtime_control._table(bench.name))
+    text = console.export_text()
+    mean = make(SETTINGS)(data[0]).iterations.mean()
+    assert f"{mean:.1f}" in next(line for line in text.splitlines() if "iterations a sub-aperture" in line)
+    assert "latency p99.9, us" in text
+    assert f"process {os.getpid()}, frame 0" in text
