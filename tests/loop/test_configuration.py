@@ -114,3 +114,11 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: s
 def test_a_missing_file_names_what_is_shipped() -> None:
     with pytest.raises(InputError, match=r"no such file.*canary"):
         load_loop("nothing.toml")
+
+
+def test_a_folder_of_results_does_not_hide_a_shipped_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "canary").mkdir()
+    assert load_loop("canary").name == "canary"

@@ -285,7 +285,8 @@ def load_loop(path: str | Path) -> LoopConfiguration:
     """
     path = Path(path)
     name = path.name.removesuffix(".toml")
-    if not path.exists() and path.parent == Path() and name in shipped_loops():
+    # A folder of that name holds results of an earlier run.
+    if not path.is_file() and path.parent == Path() and name in shipped_loops():
         text = (_shipped() / f"{name}.toml").read_text(encoding="utf-8")
         return LoopConfiguration.from_text(text, f"{name}.toml")
     try:
