@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from faintspot.errors import InputError
+from faintspot.loop.files import make_folder, write_atomically
 from faintspot.loop.recognise import holds_loop_results
 from faintspot.loop.results import (
     BUDGET_FILE,
@@ -15,8 +16,6 @@ from faintspot.loop.results import (
     BudgetResult,
     InterleavedResult,
     MagnitudeResult,
-    make_folder,
-    write_atomically,
 )
 
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
+from faintspot.loop.files import load_fields, save_fields
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.sensor.settings import Settings
-
-_FORMAT = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,15 +150,7 @@ class LoopRecord:
         InputError
             When it cannot be written.
         """
-        path = Path(path)
-        values: dict[str, Any] = {item.name: np.asarray(getattr(self, item.name)) for item in fields(self)}
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            with partial.open("wb") as file:
-                np.savez_compressed(file, format=_FORMAT, **values)
-            partial.replace(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        save_fields(self, path)
 
     @classmethod
     def load(cls, path: str | Path) -> LoopRecord:
@@ -171,22 +161,4 @@ class LoopRecord:
         InputError
             When it cannot be read, or is something else.
         """
-        path = Path(path)
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                values = {name: stored[name] for name in stored.files}
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except Exception as error:  # a damaged archive raises whatever its reader meets
-            raise InputError(f"{path}: not a record of a loop ({error})".splitlines()[0]) from None
-        found = values.pop("format", None)
-        if found is None or int(found) != _FORMAT or set(values) != {item.name for item in fields(cls)}:
-            raise InputError(f"{path}: not a record of a loop of format {_FORMAT}")
-        return cls(**{name: _restored(value) for name, value in values.items()})
-
-
-def _restored(value: NDArray[Any]) -> Any:
-    """Return an array as what it was: arrays of text are tuples, those without axes plain numbers or text."""
-    if value.ndim == 0:
-        return value.item()
-    return tuple(value.tolist()) if value.dtype.kind == "U" else value
+        return cls(**load_fields(cls, path, "a record of a loop"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.loop.files import FORMAT, load_fields, make_folder, save_fields, write_atomically
 from faintspot.loop.recognise import BUDGET_FILE as BUDGET_FILE
 from faintspot.loop.recognise import INTERLEAVED_FILE as INTERLEAVED_FILE
 from faintspot.loop.recognise import MAGNITUDE_FILE as MAGNITUDE_FILE
 from faintspot.loop.record import LoopRecord
-
-_FORMAT = 1
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +63,7 @@ class InterleavedResult:
             }
             for name, strengths, block in zip(self.set_names, self.strengths, self.block, strict=True)
         ]
-        document = {"format": _FORMAT, "settle_in_block": self.settle_in_block, "sets": sets}
+        document = {"format": FORMAT, "settle_in_block": self.settle_in_block, "sets": sets}
         write_atomically(folder / INTERLEAVED_FILE, (json.dumps(document, indent=1) + "\n").encode())
 
     @classmethod
@@ -81,7 +80,7 @@ class InterleavedResult:
         try:
             document: Any = json.loads(path.read_text(encoding="utf-8"))
             sets = document["sets"]
-            if document["format"] != _FORMAT:
+            if document["format"] != FORMAT:
                 raise ValueError(f"format {document['format']}")
             strengths = [
                 np.array([math.nan if value is None else value for value in each["strengths_e"]], np.float64)
@@ -129,7 +128,7 @@ class MagnitudeResult:
         InputError
             When it cannot be written.
         """
-        _save(self, path)
+        save_fields(self, path)
 
     @classmethod
     def load(cls, path: str | Path) -> MagnitudeResult:
@@ -140,7 +139,7 @@ class MagnitudeResult:
         InputError
             When it cannot be read, or is something else.
         """
-        return cls(**_load(cls, path, "a magnitude experiment"))
+        return cls(**load_fields(cls, path, "a magnitude experiment"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +163,7 @@ class BudgetResult:
         InputError
             When it cannot be written.
         """
-        _save(self, path)
+        save_fields(self, path)
 
     @classmethod
     def load(cls, path: str | Path) -> BudgetResult:
@@ -175,93 +174,9 @@ class BudgetResult:
         InputError
             When it cannot be read, or is something else.
         """
-        return cls(**_load(cls, path, "an error budget"))
+        return cls(**load_fields(cls, path, "an error budget"))
 
 
 def set_file(folder: Path, number: int) -> Path:
     """Return where the record of a set is, counted from 1."""
     return folder / f"set-{number}.npz"
-
-
-def make_folder(folder: str | Path) -> Path:
-    """Make a folder where it is not there, and return its path.
-
-    Raises
-    ------
-    InputError
-        When it cannot be made.
-    """
-    folder = Path(folder)
-    try:
-        folder.mkdir(exist_ok=True)
-    except FileNotFoundError:
-        raise InputError(f"{folder}: the folder {folder.parent} does not exist: create it first") from None
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from None
-    return folder
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is never seen half written.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
-
-
-def save_arrays(path: Path, values: dict[str, Any]) -> None:
-    """Write arrays to a compressed NumPy file that is never seen half written.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
-    import io
-
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **values)
-    write_atomically(path, buffer.getvalue())
-
-
-def load_arrays(path: Path, what: str) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a NumPy file; `what` it should be is named in messages.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:  # a damaged archive raises whatever its reader meets
-        raise InputError(f"{path}: not {what} ({error})".splitlines()[0]) from None
-
-
-def _save(result: Any, path: str | Path) -> None:
-    values = {item.name: np.asarray(getattr(result, item.name)) for item in fields(result)}
-    save_arrays(Path(path), {"format": np.asarray(_FORMAT), **values})
-
-
-def _load(kind: type[Any], path: str | Path, what: str) -> dict[str, Any]:
-    values: dict[str, Any] = load_arrays(Path(path), what)
-    names = [item.name for item in fields(kind)]
-    if values.pop("format", None) != _FORMAT or set(values) != set(names):
-        raise InputError(f"{path}: not {what} of format {_FORMAT}")
-    for name in ("labels", "terms"):
-        if name in values:
-            values[name] = tuple(str(text) for text in values[name])
-    if "configuration" in values:
-        values["configuration"] = str(values["configuration"])
-    return values

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from faintspot import __version__
 from faintspot.checks import number_between
 from faintspot.errors import InputError
-from faintspot.loop.results import load_arrays, make_folder, save_arrays, write_atomically
+from faintspot.loop.files import load_arrays, make_folder, save_arrays, write_atomically
 
 Arrays = dict[str, NDArray[Any]]
 Result = TypeVar("Result")

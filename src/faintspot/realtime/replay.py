@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import queue
-import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import chain
 from types import TracebackType
 from typing import Any, Self
@@ -22,7 +20,6 @@ from faintspot.realtime.pixel_ring import PixelRing
 
 _BLOCK_BYTES, _BLOCKS_AHEAD = 4 << 20, 8
 _LOOK_S = 0.05  # between two looks at whether to stop, while waiting for the disk or for room
-_SWITCH_S = 50e-6  # the thread that reads must not hold up the one that publishes for longer
 
 
 def ring_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
@@ -171,14 +168,3 @@ class Replay(Readout):
                 continue
             return True
         return False
-
-
-@contextmanager
-def quick_switching() -> Iterator[None]:
-    """Let threads of this process take turns after 50 us instead of 5 ms, for as long as it lasts."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(_SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
