@@ -1,6 +1,7 @@
 # make demo   simulate a faint star, measure it with and without denoising, write a report
 # make test   lint, types, tests
-# make bench  speed against other packages, as ratios in one run
+# make bench  speed against other packages, as ratios in one run, as a page (about 15 minutes)
+# make bench-compare  what changed since the run before, beyond noise (or: OLD=file NEW=file)
 # make clean  remove what these made
 
 PYTHON ?= python3
@@ -11,7 +12,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint types unit bench clean
+.PHONY: demo test lint types unit bench bench-compare clean
 
 demo: $(VENV)/installed
 	$(BIN)/faintspot demo
@@ -30,6 +31,9 @@ unit: $(VENV)/installed
 
 bench: $(VENV)/installed-benchmarks
 	$(BIN)/python -m benchmarks
+
+bench-compare: $(VENV)/installed
+	$(BIN)/python -m benchmarks compare $(OLD) $(NEW)
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

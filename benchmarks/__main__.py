@@ -1,46 +1,151 @@
-"""Run benchmarks: `python -m benchmarks [NAME ...] [--json FILE]` in the root of the project."""
+"""Benchmarks: `python -m benchmarks [NAME ...]`, `... compare [OLD NEW]`, `... page FILE`, in the root.
+
+A run prints its tables and writes them, with the machine and the versions, as JSON and as a page.
+"""
 
 from __future__ import annotations
 
 import importlib
-import json
+import importlib.util
+import sys
+import time
+import traceback
+from datetime import datetime
 from pathlib import Path
 
 import click
 
-from benchmarks import measuring
+from benchmarks import compare, machine, results, showing
+from benchmarks.measuring import Table
 
-NAMES = (
+_ORDER = (
     "rivals",
+    "scale",
     "estimators",
+    "roofline",
+    "breakdown",
     "realtime",
+    "latency",
     "realtime_sustained",
     "pyrtc",
     "loop",
-    "roofline",
-    "startup",
-    "breakdown",
     "study",
+    "startup",
+    "gpu",
+)
+NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
+LONG = {"realtime_sustained"}
+"""Run only when named, or with --full: 12 minutes."""
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_FOLDER = click.option(
+    "--folder",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=results.FOLDER,
+    show_default=True,
+    help="Where results are.",
 )
 
 
 @click.command()
 @click.argument("names", nargs=-1, type=click.Choice(NAMES))
-@click.option(
-    "--json", "json_path", type=click.Path(dir_okay=False, path_type=Path), help="Write all numbers."
-)
-def main(names: tuple[str, ...], json_path: Path | None) -> None:
-    """Run the benchmarks NAMES, by default all."""
-    facts = measuring.machine()
-    for name, fact in facts.items():
+@click.option("--full", is_flag=True, help=f"With {', '.join(sorted(LONG))}, too.")
+@_FOLDER
+def run(names: tuple[str, ...], full: bool, folder: Path) -> None:
+    """Run the benchmarks NAMES, by default all but the long ones.
+
+    `python -m benchmarks compare` says what changed since the run before, `... page FILE` makes the page of
+    stored results again.
+    """
+    chosen = [name for name in names or NAMES if names or full or name not in LONG]
+    found = results.Results(
+        datetime.now().strftime("%Y-%m-%dT%H:%M:%S"), machine.fingerprint(), machine.versions()
+    )
+    for name, fact in {**found.fingerprint, **found.versions}.items():
         click.echo(f"{name:>22}  {fact}")
-    tables = []
-    for name in names or NAMES:
-        for table in importlib.import_module(f"benchmarks.{name}").run():
-            measuring.show(table)
-            tables.append(table)
-    if json_path is not None:
-        json_path.write_text(json.dumps(measuring.as_json(tables, facts), indent=1) + "\n")
+    try:
+        for count, name in enumerate(chosen, start=1):
+            click.echo(f"\n[{count}/{len(chosen)}] {name} ...")
+            found.benchmarks.append(measured(name))
+            results.write(found, folder)
+            _show(found.benchmarks[-1])
+    finally:  # an interrupted run keeps what is finished
+        if found.benchmarks:
+            _write_page(found, folder / f"{found.stem}.json")
+    if any(benchmark.failure for benchmark in found.benchmarks):
+        sys.exit(1)
+
+
+def measured(name: str) -> results.Benchmark:
+    """Run one benchmark; when it fails, say why, so that the others can go on."""
+    load, start = machine.load_average(), time.monotonic()
+    about, failure = "", ""
+    tables: list[Table] = []
+    try:
+        module = importlib.import_module(f"benchmarks.{name}")
+        about = module.__doc__ or ""
+        tables = module.run()
+    except Exception as error:
+        traceback.print_exc()
+        failure = f"{type(error).__name__}: {error}".splitlines()[0]
+    return results.Benchmark(name, about, time.monotonic() - start, load, tables, failure)
+
+
+def _show(benchmark: results.Benchmark) -> None:
+    for table in benchmark.tables:
+        showing.show(table)
+    if benchmark.failure:
+        click.echo(f"  FAILED: {benchmark.failure}")
+    click.echo(f"  {benchmark.seconds:.0f} s; load average when it began: {benchmark.load}")
+
+
+def _write_page(found: results.Results, stored: Path) -> None:
+    from benchmarks.page import write_page
+
+    path = stored.with_suffix(".html")
+    write_page(found, path)
+    click.echo(f"\n{path}\n{stored}")
+
+
+@click.command("compare")
+@click.argument("files", nargs=-1, type=_FILE, metavar="[OLD NEW]")
+@click.option("--anyway", is_flag=True, help="Compare different machines, too.")
+@_FOLDER
+def compare_runs(files: tuple[Path, ...], anyway: bool, folder: Path) -> None:
+    """Say what changed beyond noise from OLD to NEW, by default the two newest of the same machine.
+
+    The exit status is 1 when something got worse, 2 when the two cannot be compared.
+    """
+    if len(files) not in (0, 2):
+        raise click.UsageError("expected two files, or none")
+    try:
+        old, new = files or compare.two_newest(folder, anyway=anyway)
+        found, notes = compare.compare(old, new, anyway=anyway)
+    except results.ResultsError as error:
+        click.echo(str(error), err=True)
+        sys.exit(2)
+    compare.show(found, notes)
+    sys.exit(any(change.verdict == compare.WORSE for change in found))
+
+
+@click.command("page")
+@click.argument("file", type=_FILE)
+def make_page(file: Path) -> None:
+    """Make the page of stored results again."""
+    try:
+        found = results.read(file)
+    except results.ResultsError as error:
+        click.echo(str(error), err=True)
+        sys.exit(2)
+    _write_page(found, file)
+
+
+def main() -> None:
+    """Run the command that the first argument names; without one, benchmarks."""
+    commands = {"compare": compare_runs, "page": make_page}
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in commands:
+        commands[name](sys.argv[2:], prog_name=f"python -m benchmarks {name}")
+    run(prog_name="python -m benchmarks")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from benchmarks.measuring import Row, Table, best, interleaved, pinned
+from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
 from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.calibration import make_detector, make_pipeline
@@ -172,7 +172,8 @@ def run() -> list[Table]:
     for name in arms:
         rate = FRAMES / best(times, name)
         target = f"at least {TARGET_FRAMES_PER_S:g}"
-        rows.append(Row(name, {"frames/s": rate}, target, rate >= TARGET_FRAMES_PER_S))
+        known = {"frames/s": absolute_spread(times, name)}
+        rows.append(Row(name, {"frames/s": rate}, target, rate >= TARGET_FRAMES_PER_S, known))
     notes = ["measuring the centroid gain (120 frames) is part of each run"]
     loop = Table("loop", "Loop frames per second of a 4.2 m telescope, 7 x 7, one core", rows, notes)
     return [loop, parts_table(configuration), air_table(configuration)]

@@ -1,4 +1,4 @@
-"""How the benchmarks measure, and how they show what they found.
+"""How the benchmarks measure.
 
 Other programs share the machine, so absolute times are only indicative. What counts are ratios, and these
 are measured side by side: all candidates take turns (A B A B ...), on one processor, within one process.
@@ -12,19 +12,21 @@ Of many turns two statistics are kept:
 - the *median of the ratios of turns*: a slow phase hits both partners of a turn, but not always equally.
 
 A target of a ratio is met when both meet it (roofline.py: the first, and it says why).
+
+Each ratio comes with its spread: the turns are cut into ten successive parts, the ratio is taken without one
+of them after the other, and by how much it moves tells its standard error (the jackknife, by blocks, because
+slow phases last for many turns). compare.py needs it to tell a change from noise.
 """
 
 from __future__ import annotations
 
 import gc
+import math
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,7 +36,9 @@ Candidate = Callable[[], Any]
 Times = dict[str, NDArray[np.float64]]
 
 _SHORTEST_SAMPLE_S = 0.005  # far above the clock's resolution, short enough to fall between disturbances
-_PACKAGES = ("faintspot", "numpy", "numba", "llvmlite", "jax", "pyrtcao", "scikit-image")
+_PARTS = 10
+_ABSOLUTE = 0.1
+"""Absolute times depend on who else uses the machine, too: by how much, from run to run, roughly."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,10 @@ class Row:
     values: dict[str, float]
     target: str = ""
     met: bool | None = None
+    spread: dict[str, float] = field(default_factory=dict)
+    """Relative standard error of those values that are compared from run to run."""
+    better: str = ""
+    """Whether "higher" or "lower" values of these are better; without it, the target says."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,8 @@ class Table:
     title: str
     rows: list[Row]
     notes: list[str] = field(default_factory=list)
+    curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    """What is drawn but not tabulated: points (x, y) by name."""
 
 
 @contextmanager
@@ -112,63 +122,57 @@ def best(times: Times, name: str) -> float:
     return float(times[name].min())
 
 
-def machine() -> dict[str, str]:
-    """Describe the machine and the versions of what runs on it."""
-    from faintspot.kernels.host import lanes_for
+def spread(times: Times, statistic: Callable[[Times], float]) -> float:
+    """Return the relative standard error of a statistic of the times, by a jackknife.
 
-    processor = platform.processor() or platform.machine()
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        names = [line for line in information.read_text().splitlines() if line.startswith("model name")]
-        processor = names[0].split(":", 1)[1].strip() if names else processor
-    facts = {
-        "processor": processor,
-        "processors": str(os.cpu_count()),
-        "SIMD lanes (float32)": str(lanes_for(np.float32).width),
-        "load average": ", ".join(f"{load:.1f}" for load in os.getloadavg()),
-        "python": platform.python_version(),
-    }
-    for package in _PACKAGES:
-        try:
-            facts[package] = version(package)
-        except PackageNotFoundError:
-            facts[package] = "not installed"
-    return facts
+    It is infinite where noise makes the statistic, a difference of times perhaps, negative.
+    """
+    turns = len(next(iter(times.values())))
+    if turns < 2:
+        raise ValueError(f"times: expected at least two turns, got {turns}")
+    parts = np.array_split(np.arange(turns), min(_PARTS, turns))
+    found = [statistic({name: np.delete(each, part) for name, each in times.items()}) for part in parts]
+    if min(found) <= 0:
+        return math.inf
+    return float(np.std(np.log(found)) * np.sqrt(len(parts) - 1))
 
 
-def _text(value: float) -> str:
-    """Return three significant digits."""
-    if 0 < abs(value) < 1e-3:
-        return f"{value:.0e}"
-    digits = 0 if abs(value) >= 100 else 1 if abs(value) >= 10 else 2 if abs(value) >= 1 else 3
-    return f"{value:.{digits}f}"
+def absolute_spread(times: Times, name: str) -> float:
+    """Return the same for the shortest time of a candidate alone."""
+    return float(np.hypot(spread(times, lambda part: best(part, name)), _ABSOLUTE))
 
 
-def show(table: Table) -> None:
-    """Print a table."""
-    import rich.table
-    from rich.console import Console
+@dataclass(frozen=True)
+class Ratio:
+    """Both ratios of two candidates' times, and the spread of each, under the names of their columns."""
 
-    columns = list(dict.fromkeys(column for row in table.rows for column in row.values))
-    console = Console(width=max(130, Console().width))
-    grid = rich.table.Table(title=table.title, title_justify="left")
-    with_targets = any(row.target for row in table.rows)
-    grid.add_column("", no_wrap=True)
-    for column in columns:
-        grid.add_column(column, justify="right")
-    for heading in ("target", "met") if with_targets else ():
-        grid.add_column(heading)
-    for row in table.rows:
-        cells = [row.name] + [_text(row.values[c]) if c in row.values else "" for c in columns]
-        if with_targets:
-            cells += [row.target, "" if row.met is None else "yes" if row.met else "NO"]
-        grid.add_row(*cells)
-    console.print(grid)
-    for note in table.notes:
-        console.print(f"  {note}", highlight=False, markup=False)
-    console.print()
+    values: dict[str, float]
+    spread: dict[str, float]
+
+    @property
+    def smaller(self) -> float:
+        """The smaller one of both."""
+        return min(self.values.values())
+
+    @property
+    def larger(self) -> float:
+        """The larger one of both."""
+        return max(self.values.values())
 
 
-def as_json(tables: list[Table], facts: dict[str, str]) -> dict[str, Any]:
-    """Return everything as plain values."""
-    return {"machine": facts, "benchmarks": [asdict(table) for table in tables]}
+def ratio(
+    times: Times,
+    numerator: str,
+    denominator: str,
+    columns: tuple[str, str] = ("ratio of best", "median ratio"),
+) -> Ratio:
+    """Return the ratio of best and the median ratio of two candidates' times."""
+    statistics: tuple[Callable[[Times], float], ...] = (
+        lambda part: best(part, numerator) / best(part, denominator),
+        lambda part: median_ratio(part, numerator, denominator),
+    )
+    named = dict(zip(columns, statistics, strict=True))
+    return Ratio(
+        {name: statistic(times) for name, statistic in named.items()},
+        {name: spread(times, statistic) for name, statistic in named.items()},
+    )

@@ -38,7 +38,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from benchmarks.measuring import Candidate, Row, Table, best, interleaved, median_ratio, pinned
+from benchmarks.measuring import (
+    Candidate,
+    Row,
+    Table,
+    Times,
+    best,
+    interleaved,
+    median_ratio,
+    pinned,
+    ratio,
+    spread,
+)
 from faintspot.realtime.control import request
 from faintspot.realtime.frame_path import FramePath, Progress
 from faintspot.realtime.private_socket import socket_path
@@ -196,17 +207,22 @@ def _alone() -> Table:
     targets = {f"compiled code, {arm}": limit for arm, (_, limit) in ARMS.items()}
     rows = []
     for candidate in candidates:
-        ratio, median = best(times, candidate) / best(times, "pyRTC"), median_ratio(times, candidate, "pyRTC")
-        values = {"us": best(times, candidate) * 1e6, "ratio": ratio, "median ratio": median}
-        rows.append(_row(candidate, values, targets.get(candidate), max(ratio, median)))
+        found = ratio(times, candidate, "pyRTC", ("ratio", "median ratio"))
+        values = {"us": best(times, candidate) * 1e6, **found.values}
+        known = {} if candidate == "pyRTC" else found.spread
+        rows.append(_row(candidate, values, targets.get(candidate), found.larger, known))
     note = f"plain positions differ by at most {difference:.1e} px (allowed: {SAME_POSITION_PX:.0e})"
     title = "pyRTC's centre of gravity and faintspot, one frame, one thread"
     return Table("pyrtc", title, rows, [note])
 
 
-def _row(name: str, values: dict[str, float], limit: float | None, ratio: float) -> Row:
-    """Return a line with its target, where there is one."""
-    return Row(name, values) if limit is None else Row(name, values, f"<= {limit:g}", ratio <= limit)
+def _row(
+    name: str, values: dict[str, float], limit: float | None, ratio: float, known: dict[str, float]
+) -> Row:
+    """Return a line with its target, where there is one; `known` is its spread."""
+    if limit is None:
+        return Row(name, values, spread=known, better="lower")
+    return Row(name, values, f"<= {limit:g}", ratio <= limit, known)
 
 
 class _Systems:
@@ -283,6 +299,10 @@ class _Systems:
                 process.wait()
 
 
+def _spread_of_rounds(rounds: Times, arm: str) -> float:
+    return spread(rounds, lambda part: median_ratio(part, arm, "pyRTC"))
+
+
 def _streams() -> Table:
     """Compare both systems, from stream to stream."""
     layout, stack = frames()
@@ -305,21 +325,23 @@ def _streams() -> Table:
         finally:
             systems.end()
     rows = []
-    base = np.array([np.median(part) for part in collected["pyRTC"]])
+    rounds = {arm: np.array([np.median(part) for part in parts]) for arm, parts in collected.items()}
     for arm, parts in collected.items():
         whole = np.concatenate(parts)
         p50, p99, p99_9 = np.percentile(whole, [50, 99, 99.9])
-        ratio = float(np.median(np.array([np.median(part) for part in parts]) / base))
+        middle = median_ratio(rounds, arm, "pyRTC")
         missing = ROUNDS * FRAMES_A_ROUND - len(whole)
         values = {
             "p50": p50,
             "p99": p99,
             "p99.9": p99_9,
-            "ratio of p50": ratio,
+            "ratio of p50": middle,
             "not in time": float(missing),
         }
         limit = ARMS[arm][1] if arm in ARMS else None
-        rows.append(_row(arm if arm == "pyRTC" else f"faintspot, {arm}", values, limit, ratio))
+        name = arm if arm == "pyRTC" else f"faintspot, {arm}"
+        known = {} if arm == "pyRTC" else {"ratio of p50": _spread_of_rounds(rounds, arm)}
+        rows.append(_row(name, values, limit, middle, known))
     note = f"{ROUNDS} rounds of {FRAMES_A_ROUND} frames at {RATE_HZ:g}/s; {os.cpu_count()} processors"
     return Table("pyrtc_streams", "From the frame's stream to the slopes' stream, us", rows, [note])
 

@@ -8,9 +8,12 @@ handed the stack of images, ready made.
   does not solve the constrained problem, so that something else would have to find the weight). It makes 20
   iterations of Chambolle's algorithm (`eps=0`, the last update is not used), which come less close to the
   solution than 20 of faintspot's; its positions are therefore compared where both have converged.
-- NumPy and JAX: faintspot's algorithm, see rival_numpy.py and rival_jax.py. All images at once, and in blocks
-  that fit the cache; the faster one counts.
+- NumPy, JAX and PyTorch: faintspot's algorithm, see rival_numpy.py, rival_jax.py and rival_torch.py. All
+  images at once, and in blocks that fit the cache; the faster one counts.
+- OpenCV and prox_tv: other functionals, in a table of their own, see rival_others.py.
 - C++: only the sweep, see sweep.cpp.
+
+Optional packages that are not installed are named below the table.
 """
 
 from __future__ import annotations
@@ -19,23 +22,43 @@ import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from benchmarks import sweeps
-from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, median_ratio, pinned
+from benchmarks import rival_others, sweeps
+from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from benchmarks.rival_numpy import NumpyRival, locate
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E = 20, 12, 0.45, 200.0
 NUMPY_BLOCKS = (64, 128, 256, 512)
 JAX_BLOCKS = (64, 128, 256)
+TORCH_BLOCKS = (64,)  # each takes half a minute to compile; 128 and 256 cost 3 and 25 % more
+MODULES = {
+    "skimage": "scikit-image",
+    "jax": "jax",
+    "torch": "torch",
+    "cv2": "opencv-python-headless",
+    "prox_tv": "prox_tv",
+}
+"""Optional rivals: what to import, and what to install."""
 SKIMAGE_IMAGES = 36  # takes one image after the other: so many tell the time of one
+TARGETS = {"scikit-image": 200.0, "NumPy": 9.0, "JAX": 9.0}
 SAME_POSITION_PX = 1e-4  # same algorithm: only float32 rounding may differ
 SAME_SOLUTION_PX = 0.01  # another algorithm, where both have converged
 SAME_FIELD = 1e-4  # dual fields, of order one, after 20 sweeps in another order of rounding
+
+GRIDS = {
+    36: (7, 3.5, 0.5),
+    100: (10, 9.0, 0.0),
+    316: (20, 10.0, 0.0),
+    1208: (40, 19.9, 3.4),
+    4616: (80, 40.0, 11.5),
+}
+"""Side, outer radius and radius of the obstruction of a pupil with so many sub-apertures."""
 
 Floats = NDArray[np.float32]
 
@@ -56,12 +79,11 @@ class Problem:
 
 
 def layout_of(n: int, pixels: int = 16) -> fs.Layout:
-    """Return the layout with n sub-apertures: 36 (7 x 7), 4616 (80 x 80, obstructed) or a row of them."""
-    if n == 36:
-        return fs.Layout.grid((7, 7), pixels=pixels, outer_radius=3.5, inner_radius=0.5)
-    if n == 4616:
-        return fs.Layout.grid((80, 80), pixels=pixels, outer_radius=40, inner_radius=11.5)
-    return fs.Layout.grid((1, n), pixels=pixels)
+    """Return the layout with n sub-apertures: that of GRIDS, or a row of them."""
+    if n not in GRIDS:
+        return fs.Layout.grid((1, n), pixels=pixels)
+    side, outer, inner = GRIDS[n]
+    return fs.Layout.grid((side, side), pixels=pixels, outer_radius=outer, inner_radius=inner)
 
 
 def problem(
@@ -103,6 +125,13 @@ def jax_rival(case: Problem, block: int) -> Callable[[], Any]:
     return make(case.images, block, NOISE_STD, KEEP, ITERATIONS)
 
 
+def torch_rival(case: Problem, block: int) -> Callable[[], Any]:
+    """Return the PyTorch version, in blocks of `block` images."""
+    from benchmarks.rival_torch import torch_rival as make
+
+    return make(case.images, block, NOISE_STD, KEEP, ITERATIONS)
+
+
 def skimage_rival(images: NDArray[Any], weights: NDArray[Any], iterations: int) -> Callable[[], NDArray[Any]]:
     """Return scikit-image's denoising in a loop, then the same NumPy code as in the NumPy version."""
     from skimage.restoration import denoise_tv_chambolle
@@ -129,19 +158,27 @@ def skimage_difference(case: Problem, count: int = 4, iterations: int = 2000) ->
     return float(np.abs(theirs - locate(ours.images, KEEP)).max())
 
 
+SAME_ALGORITHM: dict[str, tuple[str, Callable[[Problem, int], Candidate], tuple[int, ...]]] = {
+    "NumPy": ("numpy", numpy_rival, NUMPY_BLOCKS),
+    "JAX": ("jax", jax_rival, JAX_BLOCKS),
+    "PyTorch": ("torch", torch_rival, TORCH_BLOCKS),
+}
+"""What to import, how to make it run, and its block sizes."""
+
 # Measurements ------------------------------------------------------------------------------------------
 
 
-def _row(name: str, n: int, times: Times, rival: str, differs_px: float, target: float) -> Row:
-    ratio = median_ratio(times, rival, "faintspot")
+def _row(name: str, n: int, times: Times, rival: str, differs_px: float, target: float | None = None) -> Row:
+    found = ratio(times, rival, "faintspot")
     values = {
         "faintspot us": best(times, "faintspot") / n * 1e6,
         "rival us": best(times, rival) / n * 1e6,
-        "ratio of best": best(times, rival) / best(times, "faintspot"),
-        "median ratio": ratio,
+        **found.values,
         "differs px": differs_px,
     }
-    return Row(name, values, f">= {target:g}", min(ratio, values["ratio of best"]) >= target)
+    if target is None:
+        return Row(name, values, spread=found.spread, better="higher")
+    return Row(name, values, f">= {target:g}", found.smaller >= target, found.spread)
 
 
 def _check(name: str, differs: float, limit: float) -> float:
@@ -151,24 +188,32 @@ def _check(name: str, differs: float, limit: float) -> float:
 
 
 def _fastest(case: Problem, name: str, make: Callable[[Problem, int], Candidate], blocks: Any) -> Any:
-    """Return the name and the fastest of a rival's block sizes, after showing that it is right."""
+    """Return the fastest of a rival's block sizes, in words and ready to run; all are shown to be right."""
     n = len(case.images)
-    rivals = {block: make(case, block) for block in [b for b in blocks if b < n] + [n]}
+    sizes = [b for b in blocks if b < n]
+    if name != "PyTorch" or not sizes:  # it takes too long to compile for what is never the fastest
+        sizes.append(n)
+    rivals = {block: make(case, block) for block in sizes}
     for rival in rivals.values():
         _check(name, difference(case, rival), SAME_POSITION_PX)
     times = interleaved({str(block): rival for block, rival in rivals.items()}, seconds=0.0, fewest=5)
     block = min(rivals, key=lambda b: best(times, str(b)))
-    return f"{name}, {f'blocks of {block}' if block < n else 'all at once'}", rivals[block]
+    return f"{n}: {name}, {f'blocks of {block}' if block < n else 'all at once'}", rivals[block]
 
 
-def _same_algorithm(n: int) -> list[Row]:
-    """Compare with NumPy and JAX."""
-    case = problem(n)
-    rivals: dict[str, Candidate] = dict([_fastest(case, "NumPy", numpy_rival, NUMPY_BLOCKS)])
-    if available("jax"):
-        rivals |= dict([_fastest(case, "JAX", jax_rival, JAX_BLOCKS)])
+def _same_algorithm(n: int) -> tuple[list[Row], list[str]]:
+    """Compare with NumPy, JAX and PyTorch; also return in words which block sizes were the fastest."""
+    case, rivals, fastest = problem(n), {}, []
+    for name, (module, make, blocks) in SAME_ALGORITHM.items():
+        if available(module):
+            words, rivals[name] = _fastest(case, name, make, blocks)
+            fastest.append(words)
     times = interleaved({"faintspot": case.slopes} | rivals, seconds=5.0 if n < 100 else 15.0)
-    return [_row(f"{n}: {name}", n, times, name, difference(case, run), 9.0) for name, run in rivals.items()]
+    rows = [
+        _row(f"{n}: {name}", n, times, name, difference(case, run), TARGETS.get(name))
+        for name, run in rivals.items()
+    ]
+    return rows, fastest
 
 
 def _against_skimage(n: int) -> Row:
@@ -180,7 +225,48 @@ def _against_skimage(n: int) -> Row:
     rival = skimage_rival(images, solved.multiplier, ITERATIONS)
     times = interleaved({"faintspot": case.slopes, "rival": rival}, seconds=5.0)
     times["rival"] *= n / len(images)
-    return _row(f"{n}: scikit-image", n, times, "rival", differs, 200.0)
+    return _row(f"{n}: scikit-image", n, times, "rival", differs, TARGETS["scikit-image"])
+
+
+def _other_rivals(case: Problem) -> tuple[dict[str, Candidate], list[str]]:
+    """Return what solves another problem, ready to run, and what is not there."""
+    solved = fs.tv_denoise(case.images, NOISE_STD, tolerance=0.0, max_iterations=ITERATIONS, full_output=True)
+    makers: dict[str, tuple[str, Callable[[], Candidate]]] = {
+        f"OpenCV TV-L1, {count} iterations": ("cv2", partial(rival_others.opencv_rival, case.images, count))
+        for count in rival_others.OPENCV_ITERATIONS
+    }
+    prox_tv = partial(rival_others.prox_tv_rival, case.images, solved.multiplier)
+    makers["prox_tv, anisotropic"] = "prox_tv", prox_tv
+    rivals, notes = {}, _missing("cv2", "prox_tv")
+    for name, (module, make) in makers.items():
+        if available(module):
+            try:
+                rivals[name] = make()
+            except ImportError as error:  # compiled where it was installed, so that libraries may be missing
+                notes.append(f"left out, {MODULES[module]}: {error}")
+    return rivals, notes
+
+
+def _others() -> Table:
+    """Compare with what solves another problem."""
+    n = 36
+    case = problem(n)
+    title = (
+        "Other TV denoisers, other problems, one thread: theirs denoising alone, faintspot frame to slopes"
+    )
+    rivals, notes = _other_rivals(case)
+    if not rivals:
+        return Table("rivals_others", title, [], notes)
+    times = interleaved({"faintspot": case.slopes, **rivals}, seconds=5.0)
+    ours, rows = case.slopes(), []
+    for name, rival in rivals.items():
+        theirs = locate(rival().astype(np.float32), KEEP)
+        rows.append(_row(f"{n}: {name}", n, times, name, float(np.sqrt(np.mean((theirs - ours) ** 2)))))
+    return Table("rivals_others", title, rows, [*notes, *rival_others.NOTES])
+
+
+def _missing(*modules: str) -> list[str]:
+    return [f"not installed: pip install {MODULES[name]}" for name in modules if not available(name)]
 
 
 def _threads_used(run: Candidate) -> float:
@@ -207,15 +293,14 @@ def _against_cpp() -> Table:
             "cpp": lambda run=cpp: run(count),  # type: ignore[misc]
         }
         times = interleaved(candidates, seconds=3.0)
-        ratio, scale = median_ratio(times, "numba", "cpp"), 1e9 / (count * sweeps.SIDE**2)
+        found, scale = ratio(times, "numba", "cpp"), 1e9 / (count * sweeps.SIDE**2)
         values = {
             "Numba ns/pixel": best(times, "numba") * scale,
             "C++ ns/pixel": best(times, "cpp") * scale,
-            "ratio of best": best(times, "numba") / best(times, "cpp"),
-            "median ratio": ratio,
+            **found.values,
             "differs": differs,
         }
-        rows.append(Row(f"W = {width}", values, "<= 1.1", max(ratio, values["ratio of best"]) <= 1.1))
+        rows.append(Row(f"W = {width}", values, "<= 1.1", found.larger <= 1.1, found.spread))
     return Table("rivals_cpp", title, rows, ["ns for one pixel of all W images; both the same arithmetic"])
 
 
@@ -225,12 +310,14 @@ def run() -> list[Table]:
     with pinned():
         rows = []
         for n in (36, 4616):
-            rows += _same_algorithm(n)
+            found, fastest = _same_algorithm(n)
+            rows += found
+            notes.append("; ".join(fastest))
             if available("skimage"):
                 rows.append(_against_skimage(n))
         if available("jax"):
             used = _threads_used(jax_rival(problem(36), 36))
             notes.append(f"JAX used {used:.2f} threads")
-        notes += [f"not installed: {package}" for package in ("jax", "skimage") if not available(package)]
+        notes += _missing("skimage", "jax", "torch")
         title = "Frame to slopes, one thread: faintspot against others"
-        return [Table("rivals", title, rows, notes), _against_cpp()]
+        return [Table("rivals", title, rows, notes), _others(), _against_cpp()]

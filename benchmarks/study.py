@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from benchmarks.measuring import Row, Table, best, interleaved, median_ratio, pinned
+from benchmarks.measuring import Row, Table, best, interleaved, pinned, ratio
 from faintspot.study.cell import measure_cell, realisations
 from faintspot.study.specification import StudySpecification
 from faintspot.study.sweep import Sweep
@@ -117,23 +117,26 @@ def run() -> list[Table]:
             seconds=15.0,
         )
     times["rival"] *= count / RIVAL_REALISATIONS
-    ratio = median_ratio(times, "rival", "faintspot")
-    ratio_of_best = best(times, "rival") / best(times, "faintspot")
+    found = ratio(times, "rival", "faintspot")
     values = {
         "faintspot 1/s": count / best(times, "faintspot"),
         "rival 1/s": count / best(times, "rival"),
-        "ratio of best": ratio_of_best,
-        "median ratio": ratio,
+        **found.values,
         "plain differs px": plain,
         "TV differs px": tv,
     }
-    met = min(ratio, ratio_of_best) >= TARGET
     return [
         Table(
             "study",
             title,
             [
-                Row("plain and TV: NumPy, scikit-image", values, f">= {TARGET:g}", met),
+                Row(
+                    "plain and TV: NumPy, scikit-image",
+                    values,
+                    f">= {TARGET:g}",
+                    found.smaller >= TARGET,
+                    found.spread,
+                ),
                 Row("a whole cell, six arms", {"faintspot 1/s": count / best(times, "all")}),
             ],
             ["simulation included; a target is met when both ratios meet it"],

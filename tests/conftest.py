@@ -1,4 +1,4 @@
-"""Settings of Hypothesis: no deadline, because the first call of a kernel compiles it.
+"""Settings of Hypothesis: no deadline, because the first call of a kernel compiles it. Ctrl-C interrupts.
 
 `pytest --hypothesis-profile=thorough` looks 25 times harder.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import signal
 
 from hypothesis import HealthCheck, settings
 
@@ -15,3 +16,7 @@ settings.register_profile(
 settings.register_profile("ci", settings.get_profile("default"), derandomize=True, print_blob=True)
 settings.register_profile("thorough", settings.get_profile("default"), max_examples=1000)
 settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+# A shell's background job ignores Ctrl-C, and so would the programs that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,123 @@
+"""What a run found, as a JSON file: written after every benchmark, so that an interrupted run keeps it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.machine import short
+from benchmarks.measuring import Row, Table
+
+FOLDER = Path(__file__).with_name("results")
+FORMAT = 1
+
+
+class ResultsError(Exception):
+    """A file that cannot be used: one line."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What one module found.
+
+    Attributes
+    ----------
+    about : str
+        How it was measured: the module's own words.
+    load : str
+        Load average when it began.
+    failure : str
+        Why there are no tables; "" when it came to its end.
+    """
+
+    name: str
+    about: str
+    seconds: float
+    load: str
+    tables: list[Table] = field(default_factory=list)
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """A run: when (ISO 8601), on which machine, with what, and what it found so far."""
+
+    started: str
+    fingerprint: dict[str, str]
+    versions: dict[str, str]
+    benchmarks: list[Benchmark] = field(default_factory=list)
+
+    @property
+    def stem(self) -> str:
+        """Name of its files: date, time and fingerprint."""
+        return f"{self.started.replace(':', '')}-{short(self.fingerprint)}"
+
+
+def write(results: Results, folder: Path) -> Path:
+    """Write the JSON file in one step; return its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{results.stem}.json"
+    text = json.dumps({"format": FORMAT, **_plain(asdict(results))}, indent=1, allow_nan=False)
+    unfinished = path.with_suffix(".part")
+    unfinished.write_text(text + "\n", encoding="utf-8")
+    unfinished.replace(path)
+    return path
+
+
+def read(path: Path) -> Results:
+    """Read a JSON file.
+
+    Raises
+    ------
+    ResultsError
+        When it is not there, or not such a file.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content.pop("format") != FORMAT:
+            raise ResultsError(f"{path}: of another format than {FORMAT}, that of this version")
+        benchmarks = [_benchmark(item) for item in content.pop("benchmarks")]
+        return Results(**content, benchmarks=benchmarks)
+    except OSError as error:
+        raise ResultsError(f"{path}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise ResultsError(f"{path}: not the results of benchmarks") from None
+
+
+def newest_first(folder: Path) -> list[Path]:
+    """Return the results of a folder."""
+    return sorted(folder.glob("*.json"), key=lambda path: (path.name.rpartition("-")[0], path), reverse=True)
+
+
+def _benchmark(item: dict[str, Any]) -> Benchmark:
+    tables = [_table(table) for table in item.pop("tables")]
+    return Benchmark(**item, tables=tables)
+
+
+def _table(item: dict[str, Any]) -> Table:
+    rows = [
+        Row(**{**row, "values": _numbers(row["values"]), "spread": _numbers(row["spread"])})
+        for row in item.pop("rows")
+    ]
+    curves = {name: [(x, y) for x, y in points] for name, points in item.pop("curves").items()}
+    return Table(**item, rows=rows, curves=curves)
+
+
+def _numbers(values: dict[str, float | None]) -> dict[str, float]:
+    return {name: math.nan if value is None else value for name, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Return plain Python values; what is not finite, which JSON does not know, becomes null."""
+    if isinstance(value, dict):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if hasattr(value, "item"):  # a NumPy scalar
+        return _plain(value.item())
+    return value if math.isfinite(value) else None

@@ -1,0 +1,112 @@
+"""Results of benchmarks survive being written and read, and an interrupted run keeps what was finished."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from benchmarks import __main__ as command
+from benchmarks import machine, results, showing
+from benchmarks.measuring import Row, Table
+from click.testing import CliRunner
+from tests import benchmark_cases as cases
+
+
+def test_written_and_read_again_they_are_the_same(tmp_path: Path) -> None:
+    found = cases.results()
+    path = results.write(found, tmp_path / "new" / "folder")
+    assert results.read(path) == found
+    assert path.name == f"2026-01-02T030405-{machine.short(found.fingerprint)}.json"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_numbers_that_json_does_not_know_come_back_as_nan(tmp_path: Path) -> None:
+    values = {"nan": math.nan, "infinite": math.inf, "numpy": np.float32(0.5)}
+    table = Table("a", "A", [Row("row", values, met=np.bool_(True))])  # type: ignore[arg-type]
+    row = results.read(results.write(cases.results([table]), tmp_path)).benchmarks[0].tables[0].rows[0]
+    assert math.isnan(row.values["nan"])
+    assert math.isnan(row.values["infinite"])
+    assert row.values["numpy"] == 0.5
+    assert row.met is True
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 1}', '{"format": 0, "benchmarks": []}'])
+def test_other_files_are_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "other.json"
+    path.write_text(text)
+    with pytest.raises(results.ResultsError) as caught:
+        results.read(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_newest_come_first_whatever_the_machine(tmp_path: Path) -> None:
+    for day, name in ((1, "z"), (3, "a"), (2, "k")):
+        found = cases.results(started=f"2026-01-0{day}T00:00:00", machine={"processor": name})
+        results.write(found, tmp_path)
+    assert [path.name[:10] for path in results.newest_first(tmp_path)] == [
+        "2026-01-03",
+        "2026-01-02",
+        "2026-01-01",
+    ]
+
+
+def test_the_fingerprint_tells_machines_apart() -> None:
+    found = machine.fingerprint()
+    assert {"processor", "processors", "SIMD lanes (float32)", "kernel", "python", "numba", "numpy"} == set(
+        found
+    )
+    assert machine.short(found) == machine.short(dict(reversed(found.items())))
+    assert machine.short(found) != machine.short({**found, "kernel": "another"})
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.00012, "1e-04"), (0.5, "0.500"), (1.5, "1.50"), (15.25, "15.2"), (36.0, "36")]
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert showing.number(value) == text
+
+
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `rivals` find something, `scale` fail and `estimators` be interrupted."""
+
+    def fail() -> list[Table]:
+        raise AssertionError("differs\nby much")
+
+    def interrupt() -> list[Table]:
+        raise KeyboardInterrupt
+
+    runs = {"rivals": lambda: [cases.rivals_table()], "scale": fail, "estimators": interrupt}
+    for name, run in runs.items():
+        module = ModuleType(f"benchmarks.{name}", "What it is.\n\nHow it is measured.")
+        module.run = run  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, f"benchmarks.{name}", module)
+
+
+@pytest.mark.usefixtures("made_up")
+def test_a_benchmark_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
+    answer = CliRunner().invoke(command.run, ["scale", "rivals", "--folder", str(tmp_path)])
+    assert answer.exit_code == 1
+    assert "[2/2] rivals" in answer.output
+    (path,) = results.newest_first(tmp_path)
+    found = results.read(path)
+    assert [each.failure for each in found.benchmarks] == ["AssertionError: differs", ""]
+    assert path.with_suffix(".html").exists()
+
+
+@pytest.mark.usefixtures("made_up")
+def test_an_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
+    answer = CliRunner().invoke(command.run, ["rivals", "estimators", "--folder", str(tmp_path)])
+    assert answer.exit_code == 1
+    (path,) = results.newest_first(tmp_path)
+    assert [each.name for each in results.read(path).benchmarks] == ["rivals"]
+    assert "rivals" in path.with_suffix(".html").read_text()
+
+
+def test_long_ones_are_known_names() -> None:
+    assert set(command.NAMES) >= command.LONG
