@@ -6,12 +6,12 @@ import copy
 import hashlib
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from faintspot.checks import finite_array, number_between, real_array
+from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.flags import INVALID
 from faintspot.kernels import fused, located, thresholded
@@ -24,6 +24,9 @@ from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.sensor.settings import Settings
+
+if TYPE_CHECKING:
+    from faintspot.cuda import DevicePipeline
 
 RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
 
@@ -92,11 +95,16 @@ class SlopePipeline:
         SIMD width in float32 numbers: 4, 8 or 16. Default: what the machine has.
     threads : int, optional
         Most threads to use. Default: all processors that the process may use. Slopes do not depend on it.
+    device : {"cpu", "cuda"}, optional
+        Where frames are measured. On an NVIDIA GPU ("cuda", see `faintspot.cuda`) with the estimators "cog",
+        "smoothed" and "thresholded"; `explain` and `kernel_call` use the CPU always.
 
     Raises
     ------
     InputError
-        When the parts do not fit together.
+        When the parts do not fit together, and for "cuda" without a GPU.
+    MissingExtraError
+        For "cuda" without the extra `gpu`.
 
     Examples
     --------
@@ -117,6 +125,7 @@ class SlopePipeline:
         score: TrainedScore | None = None,
         width: int | None = None,
         threads: int | None = None,
+        device: str = "cpu",
     ) -> None:
         self.layout = layout
         self.settings = settings
@@ -130,6 +139,8 @@ class SlopePipeline:
         self._preparation = self._prepared()
         self._in_rows = self._row_arguments()
         self._identity = _identity(*self._parts)
+        self.device = one_of("device", device, ("cpu", "cuda"))
+        self.on_device = self._device_pipeline() if self.device == "cuda" else None
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
@@ -140,6 +151,15 @@ class SlopePipeline:
     def _prepared(self) -> Preparation:
         """Make the tables for the SIMD lanes that are set."""
         return Preparation(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
+
+    def _device_pipeline(self) -> DevicePipeline:
+        """Bring the tables to the GPU."""
+        from faintspot.cuda.availability import check_cuda
+
+        check_cuda()
+        from faintspot.cuda.measuring import DevicePipeline
+
+        return DevicePipeline(self.layout, self.settings, self.calibration, self._preparation)
 
     @property
     def width(self) -> int:
@@ -159,6 +179,7 @@ class SlopePipeline:
         other._calibration = packed_calibration(self.layout, self.calibration, width)
         other._preparation = other._prepared()
         other._in_rows = other._row_arguments()
+        other.on_device = None if self.on_device is None else other._device_pipeline()
         return other
 
     @property
@@ -225,6 +246,9 @@ class SlopePipeline:
         results = tuple(np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES)
         stages = np.empty((fused.STAGE_ROWS if explain else 0, n_frames, n, self.layout.pixels), np.float32)
         variants = self._variants(frames, self.calibration.saturation(array.dtype))
+        if self.on_device is not None and not explain:
+            measured = self.on_device.measure_from_host(frames, array.dtype, variants)
+            return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         kernel, before, shape = self.kernel_call(frames, array.dtype, variants, prior)
 
         def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:

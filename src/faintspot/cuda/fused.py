@@ -1,0 +1,223 @@
+"""The kernel: from frames to slopes in one launch, a warp per sub-aperture.
+
+One kernel per window, algorithm and kind of work, all of which are constants in it: then loops over a
+thread's pixels are unrolled and its arrays are registers. Slopes do not depend on how many warps share a
+block.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+from numba import cuda, float32, int32
+
+from faintspot.cuda.availability import simulated
+from faintspot.cuda.brightest import (
+    make_centroid,
+    make_extremes,
+    make_standard_errors,
+    make_subtract,
+    make_threshold,
+)
+from faintspot.cuda.compiling import device, kernel
+from faintspot.cuda.gather import make_fill, make_gather, make_recall, make_share, make_smooth
+from faintspot.cuda.strips import WARP, Strips, strips_of
+from faintspot.cuda.total_variation import make_denoise
+from faintspot.kernels import fused as cpu
+
+WARPS = 1 if simulated() else 2  # in a block; the twins of the simulator know of one
+FEWEST_BLOCKS = 1 if simulated() else 128  # Numba warns of fewer; those without a sub-aperture end at once
+
+NO_LIGHT, TOO_MANY_BAD_PIXELS, BAD_PIXELS = cpu.NO_LIGHT, cpu.TOO_MANY_BAD_PIXELS, cpu.BAD_PIXELS
+SATURATED, INFEASIBLE_STRENGTH, NOT_CONVERGED = cpu.SATURATED, cpu.INFEASIBLE_STRENGTH, cpu.NOT_CONVERGED
+ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE = cpu.ZERO_X, cpu.ZERO_Y, cpu.RANGE, cpu.MOST_BAD, cpu.VARIANCE
+EXCESS, ERROR_SCALE, STRENGTH, TOLERANCE = cpu.EXCESS, cpu.ERROR_SCALE, cpu.STRENGTH, cpu.TOLERANCE
+LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = cpu.LIMIT, cpu.RANK, cpu.SUBTRACT, cpu.FLOOR, cpu.LEVEL
+SMOOTH, DENOISE = cpu.SMOOTH, cpu.DENOISE
+
+# Rows of the kernel's results (n_rows, n_frames, n_subapertures): float32, and int32.
+X, Y, FLUX, ERROR_X, ERROR_Y = range(5)
+ITERATIONS, BAD_COUNT = range(2)
+
+
+@device
+def within(slope: Any, reach: Any) -> Any:
+    """Keep a slope within the allowed range."""
+    return min(max(slope, -reach), reach)
+
+
+@device
+def judge(bad: Any, saturated: Any, most_bad: Any, converged: Any, infeasible: Any) -> Any:
+    """Flags of a sub-aperture as far as its light does not matter."""
+    bits = int32(SATURATED) if saturated > float32(0.0) else int32(0)
+    if bad > most_bad:
+        return bits | int32(TOO_MANY_BAD_PIXELS)  # which says it all
+    if bad > float32(0.0):
+        bits |= int32(BAD_PIXELS)
+    if infeasible:
+        bits |= int32(INFEASIBLE_STRENGTH)
+    if not converged:
+        bits |= int32(NOT_CONVERGED)
+    return bits
+
+
+def make_store(strips: Strips) -> Any:
+    """Return the function that writes a sub-aperture's result; the reference where it is invalid."""
+    half_x, half_y = 0.5 * strips.nx, 0.5 * strips.ny
+
+    @device
+    def store(
+        table: Any,
+        f: Any,
+        s: Any,
+        bits: Any,
+        brightest: Any,
+        found: Any,
+        errors: Any,
+        numbers: Any,
+        flags: Any,
+    ) -> None:
+        """`found`: flux, x, y; `errors`: of x and y."""
+        total, x, y = found
+        # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
+        lit = total > table[FLOOR, s] * brightest
+        inside = abs(x) <= float32(half_x) and abs(y) <= float32(half_y)
+        if not (bits & int32(TOO_MANY_BAD_PIXELS) or (lit and inside)):
+            bits |= int32(NO_LIGHT)
+        valid = bits & int32(NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
+        known = valid and table[VARIANCE, s] >= float32(0.0)
+        reach, scale = table[RANGE, s], table[ERROR_SCALE, s]
+        numbers[X, f, s] = within(x - table[ZERO_X, s], reach) if valid else float32(0.0)
+        numbers[Y, f, s] = within(y - table[ZERO_Y, s], reach) if valid else float32(0.0)
+        numbers[FLUX, f, s] = total
+        numbers[ERROR_X, f, s] = scale * errors[0] if known else float32(math.inf)
+        numbers[ERROR_Y, f, s] = scale * errors[1] if known else float32(math.inf)
+        flags[f, s] = bits
+
+    return store
+
+
+def make_locate(strips: Strips) -> Any:
+    """Return the function for background, centre of gravity and its standard errors."""
+    rows = strips.rows
+    extremes, find_threshold = make_extremes(strips), make_threshold(strips)
+    subtract, centroid = make_subtract(strips), make_centroid(strips)
+    standard_errors, recall = make_standard_errors(strips), make_recall(strips)
+
+    @device
+    def locate(
+        image: Any, tile: Any, table: Any, s: Any, top: Any, column: Any, present: Any, away: Any
+    ) -> Any:
+        """`tile`: the image before it was denoised; `away`: x and y of the thread's first pixel, px.
+
+        Return the largest magnitude, (flux, x, y), and the errors of x and y.
+        """
+        low, high, total = extremes(image, present)
+        threshold = table[LEVEL, s]
+        if table[RANK, s] > float32(0.0):
+            threshold = find_threshold(image, present, table[RANK, s], low, high, total)
+        subtract(image, present, threshold, threshold * table[SUBTRACT, s])
+        found = centroid(image, away[0], away[1])
+        errors = (float32(math.inf), float32(math.inf))
+        if table[VARIANCE, s] >= float32(0.0):
+            measured = cuda.local.array(rows, float32)
+            recall(tile, top, column, present, measured)
+            errors = standard_errors(
+                measured,
+                image,
+                away[0] - found[1],
+                away[1] - found[2],
+                table[VARIANCE, s],
+                table[EXCESS, s],
+                found[0],
+            )
+        return max(abs(low), abs(high)), found, errors
+
+    return locate
+
+
+@cache
+def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: int = WARPS) -> Any:
+    """Return the kernel for a window (ny, nx).
+
+    Launch it with `warps` * 32 threads a block; blocks along x are a frame's, along y the frames. It takes
+    frames (n_frames, h * w) uint16 or float32; w and places (n,), each window's first pixel, both int32;
+    maps of dark and electrons per ADU (2, h * w), saturation, tables (n_variants, rows, n) and taps
+    (n, 2, 1 + reach), all float32; variants (n_frames,) int32; and writes numbers (5, n_frames, n) float32,
+    counts (2, n_frames, n) int32 and flags (n_frames, n) uint8.
+
+    Raises
+    ------
+    InputError
+        When the window is too large for a warp.
+    """
+    strips = strips_of(window)
+    ny, nx, rows, threads, last = strips.ny, strips.nx, strips.rows, strips.threads, strips.strips - 1
+    centre_x, centre_y = 0.5 * (nx - 1), 0.5 * (ny - 1)
+    full = strips.full
+    planes = 3 if before == SMOOTH else 2
+    gather, share, fill = make_gather(strips), make_share(strips), make_fill(strips)
+    recall, smooth, denoise = make_recall(strips), make_smooth(strips), make_denoise(strips, algorithm)
+    locate, store = make_locate(strips), make_store(strips)
+
+    @kernel
+    def slopes(
+        frames: Any,
+        line: Any,
+        places: Any,
+        maps: Any,
+        saturation: Any,
+        tables: Any,
+        variants: Any,
+        taps: Any,
+        numbers: Any,
+        counts: Any,
+        flags: Any,
+    ) -> None:
+        lane, block_warp = cuda.threadIdx.x % WARP, cuda.threadIdx.x // WARP
+        s, f = cuda.blockIdx.x * warps + block_warp, cuda.blockIdx.y
+        if s >= places.shape[0]:
+            return
+        table = tables[variants[f]]
+        strip, column = lane // nx, lane % nx
+        top = strip * rows
+        present = rows
+        if not full:
+            present = min(rows, ny - top) if lane < threads else 0
+        tiles = cuda.shared.array((planes, warps, ny, nx), float32)
+        tile, scratch = tiles[0, block_warp], tiles[1, block_warp]
+        image = cuda.local.array(rows, float32)
+        place = places[s] + top * line + column
+        bad, saturated = gather(frames[f], maps[0], maps[1], line, place, present, saturation, image)
+        share(image, top, column, present, tile)
+        if bad > float32(0.0):
+            fill(tile, lane, scratch)
+            recall(scratch, top, column, present, image)
+            share(image, top, column, present, tile)
+        iterations, converged, infeasible = int32(0), True, False
+        if before == DENOISE:
+            iterations, converged, infeasible = denoise(
+                image,
+                lane,
+                present,
+                float32(1.0) if lane < threads and column < nx - 1 else float32(0.0),
+                float32(1.0) if strip < last else float32(0.0),
+                table[STRENGTH, s],
+                table[TOLERANCE, s],
+                int32(table[LIMIT, s]),
+            )
+        elif before == SMOOTH:
+            smoothed = tiles[planes - 1, block_warp]
+            smooth(tile, taps[s], lane, scratch, smoothed)
+            recall(smoothed, top, column, present, image)
+        away = (float32(column) - float32(centre_x), float32(top) - float32(centre_y))
+        brightest, found, errors = locate(image, tile, table, s, top, column, present, away)
+        if lane == 0:
+            bits = judge(bad, saturated, table[MOST_BAD, s], converged, infeasible)
+            counts[ITERATIONS, f, s] = iterations
+            counts[BAD_COUNT, f, s] = int32(bad)
+            store(table, f, s, bits, brightest, found, errors, numbers, flags)
+
+    return slopes
