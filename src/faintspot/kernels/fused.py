@@ -103,6 +103,7 @@ def slopes_of_groups(
     variants: Any,
     before: Any,
     algorithm: Any,
+    table: Any,
     taps: Any,
     start: Any,
     stop: Any,
@@ -132,8 +133,8 @@ def slopes_of_groups(
         Which of these tables a frame is measured with.
     before : int
         NOTHING, SMOOTH or DENOISE.
-    algorithm : int
-        Of the denoising.
+    algorithm, table
+        Of the denoising, see `denoise_group`.
     taps : (n_subapertures, 2, 1 + reach) float32
         Of the smoothing along x and y, the central one first.
     scratch : tuple of arrays, from `new_scratch`
@@ -174,7 +175,7 @@ def slopes_of_groups(
         )
         _read_settings(width, first, settings, numbers, counts, centroid_numbers)
         if before == DENOISE:
-            denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
+            denoise_group(lanes, algorithm, table, ny, nx, image, output, state, rows, numbers, counts)
         elif before == SMOOTH:
             gather_taps(width, first, taps, rows)
             smooth_group(lanes, image, ny, nx, taps.shape[2] - 1, rows, state, output)
@@ -369,6 +370,7 @@ def denoise_stack(
     nx: Any,
     settings: Any,
     algorithm: Any,
+    table: Any,
     start: Any,
     stop: Any,
     scratch: Any,
@@ -391,7 +393,7 @@ def denoise_stack(
             numbers[total_variation.STRENGTH * width + lane] = settings[0, s]
             numbers[total_variation.TOLERANCE * width + lane] = settings[1, s]
             counts[total_variation.LIMIT * width + lane] = int(settings[2, s])
-        denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
+        denoise_group(lanes, algorithm, table, ny, nx, image, output, state, rows, numbers, counts)
         for lane in range(min(width, n - first)):
             s = first + lane
             scatter_image(width, output, lane, denoised, s)
