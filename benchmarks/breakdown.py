@@ -48,7 +48,7 @@ def _threshold(count: Any, lanes: Any, pixels: Any, image: Any, numbers: Any) ->
 @njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
 def _subtract(count: Any, lanes: Any, pixels: Any, image: Any, numbers: Any) -> None:
     for _ in range(count):
-        _subtract_background(lanes, image, pixels, numbers)
+        _subtract_background(lanes, image, pixels, numbers, image)
 
 
 @njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]

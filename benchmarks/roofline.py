@@ -76,12 +76,12 @@ def _innermost_loops(lines: list[str]) -> list[list[str]]:
 
 
 def sweep_loop(width: int) -> list[str]:
-    """Return the assembly of the loop over the pixels of an inner row."""
+    """Return the assembly of the loop over the pixels of inner rows: the one with the most arithmetic."""
     Group(width).numba(1)
     assembly = next(text for types, text in numba_sweeps.inspect_asm().items() if types[0].width == width)
     lines = [" ".join(line.split("#")[0].split()) for line in assembly.splitlines()]
     loops = [loop for loop in _innermost_loops(lines) if _pixels(loop)]
-    return max(loops, key=lambda loop: len(arithmetic(loop)) / _pixels(loop))
+    return max(loops, key=lambda loop: len(arithmetic(loop)))
 
 
 def _pixels(loop: list[str]) -> int:

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from faintspot import spot_tables
+from faintspot import presets, spot_tables
 from faintspot.errors import InputError
 from faintspot.estimate.brightest import most_kept, threshold_rank
 from faintspot.estimate.total_variation import ALGORITHMS
 from faintspot.kernels import fused, located
+from faintspot.kernels.flat_start import NO_TABLE, flat_start_table
 from faintspot.requirements import check_parts, is_auto, is_automatic
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
@@ -31,8 +32,6 @@ METHODS = {
     "trained": located.TRAINED,
 }
 """Estimators that know the spot, and what the kernel calls them."""
-_DEFAULT_STEPS = {"weighted": 8}
-_FIT_STEPS = 3
 _FLUX_STEP = 1.02  # measured light counts in steps of this factor, so that settings vary slowly;
 _POSTERIOR_FLUX_STEP = 1.1  # for "map" in larger ones, as each has its tables
 _MOST_LIGHT_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
@@ -127,7 +126,7 @@ class Preparation:
         """Number of steps of an iterated estimator; of "trained", its passes."""
         if self.estimator == "trained":
             return 0 if self._score is None else self._score.passes
-        return self._settings.steps or _DEFAULT_STEPS.get(self.estimator, _FIT_STEPS)
+        return self._settings.steps or presets.steps(self._settings.preset, self.estimator)
 
     @property
     def from_peak(self) -> bool:
@@ -143,6 +142,13 @@ class Preparation:
             return fused.SMOOTH
         denoises = self.estimator == "cog" and np.any(self._each("denoise"))
         return fused.DENOISE if denoises else fused.NOTHING
+
+    @cached_property
+    def start(self) -> NDArray[np.float32]:
+        """What the denoising's start is computed from; no elements where it begins at zero."""
+        if presets.starts_flat(self._settings.preset) and self.before == fused.DENOISE:
+            return flat_start_table(*self._layout.window)
+        return NO_TABLE
 
     @property
     def needs_light(self) -> bool:
@@ -209,7 +215,8 @@ class Preparation:
     def _new_arguments(self) -> Arguments:
         tables = np.stack(self._tables)
         if self.estimator not in METHODS:
-            return tables, (self.before, ALGORITHMS[self._settings.algorithm], self.taps), None
+            denoising = (self.before, ALGORITHMS[self._settings.algorithm], self.start)
+            return tables, (*denoising, self.taps), None
         if len(self._posteriors) > 1:
             self._posteriors = [spot_tables.joined(self._posteriors)]
         posterior = self._posteriors[0] if self._posteriors else spot_tables.NO_POSTERIOR

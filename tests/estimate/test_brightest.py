@@ -41,6 +41,21 @@ def test_every_number_of_pixels(rule: str) -> None:
             assert np.array_equal(fs.brightest_pixels(image, keep, rule=rule), expected)
 
 
+@every_dtype
+@pytest.mark.parametrize("keep", [1, 7, 40, 128, 254])
+def test_ties_and_outliers(keep: int, dtype: Any) -> None:
+    """What stalls a search for the threshold by means: equal pixels, means that outliers spoil."""
+    rng = np.random.default_rng(5)
+    images = rng.poisson(2.0, (48, 16, 16)).astype(dtype) * dtype(0.7)
+    images[::3, 3:5, ::7] = 1e29
+    images[1::3, 5, ::5] = -1e29
+    images[::5] += rng.normal(size=images[::5].shape).astype(dtype)
+    images[7], images[8, 2:] = dtype(0.3), dtype(0.0)
+    images[9] = np.nextafter(dtype(1.0), images[9])
+    result = fs.brightest_pixels(images, keep)
+    assert np.array_equal(result, [naive.brightest_pixels(g, keep) for g in images])
+
+
 def test_ties() -> None:
     g = np.array([[5.0, 3.0, 3.0], [1.0, 3.0, -2.0]])
     # The third largest ties with the second and the fourth.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-from faintspot.kernels.compiling import compiled
+from faintspot.kernels.compiling import compiled, inlined
 from faintspot.kernels.simd import (
     absolute,
     any_lane,
@@ -29,37 +30,121 @@ VARIANCE, EXCESS = 7, 8  # in: variance of a pixel that collects m electrons, VA
 ERROR_X, ERROR_Y = 9, 10  # out: standard error of the centre of gravity, px
 LANE_ROWS = 11
 
-_COUNTING_PASSES = 24  # usually 6 to 10 are enough; ties and outliers go on to the exact passes
+_COUNTING_PASSES = 24  # usually 5 to 8 are enough; outliers go on to the exact passes
+
+
+@inlined
+def _tally(lanes: Any, image: Any, at: Any, pivot: Any, count: Any, total: Any) -> Any:
+    """Add one pixel to number and sum of those above the pivot."""
+    g = load(lanes, image, at)
+    above = g > pivot
+    return select(above, count + splat(lanes, 1.0), count), select(above, total + g, total)
 
 
 @compiled
-def _sum_above(lanes: Any, image: Any, pixels: Any, threshold: Any) -> Any:
-    """Number and sum of the pixels above the threshold."""
+def _sum_above(lanes: Any, image: Any, pixels: Any, pivot: Any) -> Any:
+    """Number and sum of the pixels above the pivot; four sums that do not wait for each other."""
     width = width_of(lanes)
-    zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
-    count, total = zero, zero
-    for i in range(pixels):
-        g = load(lanes, image, i * width)
-        above = g > threshold
-        count = count + select(above, one, zero)
-        total = total + select(above, g, zero)
-    return count, total
+    zero = splat(lanes, 0.0)
+    n0 = n1 = n2 = n3 = s0 = s1 = s2 = s3 = zero
+    whole = pixels - pixels % 4
+    for i in range(0, whole, 4):
+        n0, s0 = _tally(lanes, image, i * width, pivot, n0, s0)
+        n1, s1 = _tally(lanes, image, (i + 1) * width, pivot, n1, s1)
+        n2, s2 = _tally(lanes, image, (i + 2) * width, pivot, n2, s2)
+        n3, s3 = _tally(lanes, image, (i + 3) * width, pivot, n3, s3)
+    for i in range(whole, pixels):
+        n0, s0 = _tally(lanes, image, i * width, pivot, n0, s0)
+    return (n0 + n1) + (n2 + n3), (s0 + s1) + (s2 + s3)
 
 
 @compiled
-def _pivot(lanes: Any, low: Any, high: Any, wanted: Any) -> Any:
-    """The wanted number if it is in [low, high), for low < high; else one in their middle."""
+def _range_and_sum(lanes: Any, image: Any, pixels: Any) -> Any:
+    """Smallest and largest pixel, and the sum of all."""
+    width = width_of(lanes)
+    low = high = other_low = other_high = load(lanes, image, 0)
+    total = other_total = splat(lanes, 0.0)
+    for i in range(0, pixels - 1, 2):
+        g = load(lanes, image, i * width)
+        low, high, total = minimum(g, low), maximum(g, high), total + g
+        g = load(lanes, image, (i + 1) * width)
+        other_low, other_high, other_total = minimum(g, other_low), maximum(g, other_high), other_total + g
+    if pixels % 2 == 1:
+        g = load(lanes, image, (pixels - 1) * width)
+        low, high, total = minimum(g, low), maximum(g, high), total + g
+    return minimum(low, other_low), maximum(high, other_high), total + other_total
+
+
+@compiled
+def _middle(lanes: Any, low: Any, high: Any) -> Any:
+    """A number in [low, high), for low < high: about in their middle."""
     half = splat(lanes, 0.5)
     middle = maximum(half * low + half * high, low)
-    middle = select(middle < high, middle, low)
-    return select(wanted >= low, select(wanted < high, wanted, middle), middle)
+    return select(middle < high, middle, low)
+
+
+@inlined
+def _pivot(lanes: Any, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
+    """A number in a bracket, with about the wanted fraction of the bracket's pixels above it.
+
+    The mean parts them in halves. How far to go from it follows from the most variance that a distribution of
+    this range and mean can have: saves a quarter of the passes.
+    """
+    away = splat(lanes, 1.0) - (wanted + wanted)
+    return multiply_add(away * (mean - low), (high - mean) / (high - low), mean)
 
 
 @compiled
-def _step_exactly(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any, pivot: Any) -> Any:
-    """Narrow the bracket [low, high] of the RANK-th largest pixel at a pivot; new ends are pixel values."""
+def _bracket(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any, total: Any) -> Any:
+    """Part the RANK-th largest pixel from its neighbours in rank, or from all that differ from it.
+
+    As quickselect does, but without moving pixels: count those above a pivot. Returns low and high, and how
+    many pixels are above each: rank is that above low, or one more than that above high, or all between are
+    likely to be equal. Low is -inf where nothing was found below.
+    """
+    one, zero, half = splat(lanes, 1.0), splat(lanes, 0.0), splat(lanes, 0.5)
+    low_count, high_count, low_sum, high_sum = splat(lanes, pixels), zero, total, zero
+    bottom, stalled = splat(lanes, -math.inf), zero
+    for _ in range(_COUNTING_PASSES):
+        between = maximum(low_count - high_count, one)
+        mean = (low_sum - high_sum) / between
+        pivot = _pivot(lanes, mean, low, high, (rank - half - high_count) / between)
+        pivot = select(stalled > zero, mean, pivot)
+        middle = _middle(lanes, low, high)
+        pivot = select(pivot >= low, select(pivot < high, pivot, middle), middle)
+        count, above = _sum_above(lanes, image, pixels, pivot)
+        up = count >= rank
+        low, bottom, low_sum = select(up, pivot, low), select(up, pivot, bottom), select(up, above, low_sum)
+        high, high_sum = select(up, high, pivot), select(up, high_sum, above)
+        low_count, high_count = select(up, count, low_count), select(up, high_count, count)
+        left = low_count - high_count
+        # Nothing parted from the rest: once is bad luck; at the mean, it means that they are equal.
+        stalled = select(left < between, zero, stalled + one)
+        open_lane = minimum(low_count - rank, rank - one - high_count) > zero
+        if not any_lane(select(open_lane, stalled, one + one) < one + one):
+            break
+    return bottom, high, low_count, high_count
+
+
+@compiled
+def _ends(lanes: Any, image: Any, pixels: Any, low: Any, high: Any) -> Any:
+    """The smallest pixel above low, and the largest that is not above high."""
+    width = width_of(lanes)
+    most, least = splat(lanes, math.inf), splat(lanes, -math.inf)
+    first, last = most, least
+    for i in range(pixels):
+        g = load(lanes, image, i * width)
+        first = minimum(select(g > low, g, most), first)
+        last = maximum(select(g > high, least, g), last)
+    return first, last
+
+
+@compiled
+def _step_exactly(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any) -> Any:
+    """Halve the bracket [low, high] of the RANK-th largest pixel; its new ends are pixel values."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
+    pivot = _middle(lanes, low, high)
     count, next_above, next_below = zero, high, low
     for i in range(pixels):
         g = load(lanes, image, i * width)
@@ -77,38 +162,18 @@ def _step_exactly(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high
 
 @compiled
 def find_threshold(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
-    """Find the RANK-th largest pixel of every lane, exactly, and the largest magnitude.
-
-    As quickselect does, but without moving pixels: count those above a pivot, the mean of the pixels that
-    are still in question. Once the pivot parts the RANK-th pixel from a neighbour in rank, one exact pass
-    finds its value.
-    """
+    """Find the RANK-th largest pixel of every lane, exactly, and the largest magnitude."""
     width = width_of(lanes)
-    one, zero = splat(lanes, 1.0), splat(lanes, 0.0)
+    one = splat(lanes, 1.0)
     rank = load(lanes, numbers, RANK * width)
-    low = high = load(lanes, image, 0)
-    low_sum = zero
-    for i in range(pixels):
-        g = load(lanes, image, i * width)
-        low, high = minimum(g, low), maximum(g, high)
-        low_sum = low_sum + g
+    low, high, total = _range_and_sum(lanes, image, pixels)
     store(numbers, LARGEST * width, maximum(absolute(low), absolute(high)))
-    low_count, high_count, high_sum = splat(lanes, pixels), zero, zero
-    pivot = low
-    for _ in range(_COUNTING_PASSES):
-        between = maximum(low_count - high_count, one)
-        pivot = _pivot(lanes, low, high, (low_sum - high_sum) / between)
-        count, total = _sum_above(lanes, image, pixels, pivot)
-        up, down = count > rank, count < rank - one
-        new_low, new_high = select(up, pivot, low), select(down, pivot, high)
-        low_count, low_sum = select(up, count, low_count), select(up, total, low_sum)
-        high_count, high_sum = select(down, count, high_count), select(down, total, high_sum)
-        narrowed = any_lane((new_high - new_low) < (high - low))
-        low, high = new_low, new_high
-        if not narrowed:
-            break
-    while any_lane(low < high):
-        low, high = _step_exactly(lanes, image, pixels, rank, low, high, _pivot(lanes, low, high, pivot))
+    low, high, low_count, high_count = _bracket(lanes, image, pixels, rank, low, high, total)
+    first, last = _ends(lanes, image, pixels, low, high)
+    low = select(rank >= low_count, first, select(rank <= high_count + one, last, first))
+    high = select(rank >= low_count, first, last)
+    while any_lane(low < high):  # ties among others, or outliers that spoil the means
+        low, high = _step_exactly(lanes, image, pixels, rank, low, high)
     store(numbers, THRESHOLD * width, low)
 
 
@@ -123,61 +188,100 @@ def find_largest(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
 
 
 @compiled
-def subtract_background(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
-    """Zero the pixels below THRESHOLD in place, and take it off the others where SUBTRACT is 1."""
+def subtract_background(lanes: Any, image: Any, pixels: Any, numbers: Any, left: Any) -> None:
+    """Zero the pixels below THRESHOLD, and take it off the others where SUBTRACT is 1; `left` is written."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
     threshold = load(lanes, numbers, THRESHOLD * width)
-    offset = threshold * load(lanes, numbers, SUBTRACT * width)
+    offset = select(load(lanes, numbers, SUBTRACT * width) > zero, threshold, zero)
     for i in range(pixels):
         g = load(lanes, image, i * width)
-        store(image, i * width, select(g >= threshold, g - offset, zero))
+        store(left, i * width, select(g >= threshold, g - offset, zero))
+
+
+@inlined
+def _from_middle(lanes: Any, i: Any, n: Any) -> Any:
+    """Position of pixel i of n, px."""
+    return splat(lanes, i - 0.5 * (n - 1))
 
 
 @compiled
-def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
-    """Sum of every lane's image and its centre of gravity; (0, 0) where the sum is not positive."""
+def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, numbers: Any) -> Any:
+    """Write SUM, X and Y, (0, 0) where the sum is not positive; return 1 / SUM, or 1."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
-    total, moment_x, moment_y = zero, zero, zero
-    for y in range(ny):
-        row = zero
-        for x in range(nx):
-            g = load(lanes, image, (y * nx + x) * width)
-            row = row + g
-            moment_x = multiply_add(g, splat(lanes, x - 0.5 * (nx - 1)), moment_x)
-        total = total + row
-        moment_y = multiply_add(row, splat(lanes, y - 0.5 * (ny - 1)), moment_y)
     lit = total > zero
     inverse = one / select(lit, total, one)
     store(numbers, SUM * width, total)
     store(numbers, X * width, select(lit, moment_x * inverse, zero))
     store(numbers, Y * width, select(lit, moment_y * inverse, zero))
+    return inverse
 
 
 @compiled
-def noise_of_centroid(lanes: Any, image: Any, left: Any, ny: Any, nx: Any, numbers: Any) -> None:
-    """Propagate the noise of the pixels that are left to the centre of gravity: VARIANCE + EXCESS max(g, 0).
+def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
+    """Sum of what is left of every lane's image by THRESHOLD and SUBTRACT, and its centre of gravity.
 
-    `image` holds the pixels g as they were measured, `left` what is left of them.
+    (0, 0) where the sum is not positive.
     """
     width = width_of(lanes)
-    zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
-    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
-    x0, y0 = load(lanes, numbers, X * width), load(lanes, numbers, Y * width)
-    noise_x, noise_y = zero, zero
-    within = splat(lanes, 1.0 / 12.0)  # of the light in a pixel, where in it is not known: px^2
+    zero = splat(lanes, 0.0)
+    threshold = load(lanes, numbers, THRESHOLD * width)
+    offset = select(load(lanes, numbers, SUBTRACT * width) > zero, threshold, zero)
+    total, moment_x, moment_y = zero, zero, zero
     for y in range(ny):
-        away_y = splat(lanes, y - 0.5 * (ny - 1)) - y0
+        row, row_x = zero, zero  # sums by row: rows do not wait for each other
         for x in range(nx):
-            here = (y * nx + x) * width
-            variance = multiply_add(maximum(load(lanes, image, here), zero), e, v)
-            variance = select(load(lanes, left, here) > zero, variance, zero)
-            away_x = splat(lanes, x - 0.5 * (nx - 1)) - x0
-            noise_x = multiply_add(variance, multiply_add(away_x, away_x, within), noise_x)
-            noise_y = multiply_add(variance, multiply_add(away_y, away_y, within), noise_y)
-    total = load(lanes, numbers, SUM * width)
-    lit = total > zero
-    inverse = one / select(lit, total, one)
-    store(numbers, ERROR_X * width, square_root(noise_x) * inverse)
-    store(numbers, ERROR_Y * width, square_root(noise_y) * inverse)
+            g = load(lanes, image, (y * nx + x) * width)
+            left = select(g >= threshold, g - offset, zero)
+            row, row_x = row + left, multiply_add(left, _from_middle(lanes, x, nx), row_x)
+        total, moment_x = total + row, moment_x + row_x
+        moment_y = multiply_add(row, _from_middle(lanes, y, ny), moment_y)
+    _store_centre(lanes, total, moment_x, moment_y, numbers)
+
+
+@compiled
+def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
+    """As `centre_of_gravity`, and its standard error: the propagated noise of the pixels that are left.
+
+    That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured; `image` may be denoised.
+    """
+    width = width_of(lanes)
+    zero = splat(lanes, 0.0)
+    threshold = load(lanes, numbers, THRESHOLD * width)
+    offset = select(load(lanes, numbers, SUBTRACT * width) > zero, threshold, zero)
+    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
+    total, moment_x, moment_y = zero, zero, zero
+    noise, noise_x, noise_xx, noise_y, noise_yy = zero, zero, zero, zero, zero
+    for y in range(ny):
+        row, row_x, part, part_x, part_xx = zero, zero, zero, zero, zero
+        for x in range(nx):
+            here, column = (y * nx + x) * width, _from_middle(lanes, x, nx)
+            g = load(lanes, image, here)
+            left = select(g >= threshold, g - offset, zero)
+            row, row_x = row + left, multiply_add(left, column, row_x)
+            variance = multiply_add(maximum(load(lanes, measured, here), zero), e, v)
+            variance = select(left > zero, variance, zero)
+            away = variance * column
+            part, part_x, part_xx = part + variance, part_x + away, multiply_add(away, column, part_xx)
+        line = _from_middle(lanes, y, ny)
+        total, moment_x, moment_y = total + row, moment_x + row_x, multiply_add(row, line, moment_y)
+        noise, noise_x, noise_xx = noise + part, noise_x + part_x, noise_xx + part_xx
+        away = part * line
+        noise_y, noise_yy = noise_y + away, multiply_add(away, line, noise_yy)
+    inverse = _store_centre(lanes, total, moment_x, moment_y, numbers)
+    _store_error(lanes, noise, noise_x, noise_xx, inverse, X, ERROR_X, numbers)
+    _store_error(lanes, noise, noise_y, noise_yy, inverse, Y, ERROR_Y, numbers)
+
+
+@compiled
+def _store_error(
+    lanes: Any, noise: Any, first: Any, second: Any, inverse: Any, position: Any, error: Any, numbers: Any
+) -> None:
+    """Write a standard error, from the noise's moments about the window's middle."""
+    width = width_of(lanes)
+    at = load(lanes, numbers, position * width)
+    # Within a pixel, where in it the light is, is not known: px^2 / 12.
+    around = multiply_add(noise, multiply_add(at, at, splat(lanes, 1.0 / 12.0)), second)
+    around = multiply_add(first, splat(lanes, -2.0) * at, around)
+    store(numbers, error * width, square_root(maximum(around, splat(lanes, 0.0))) * inverse)

@@ -19,8 +19,12 @@ def _kernels_stamp() -> tuple[tuple[float, int], ...]:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Make a function part of every compiled function that calls it, with constant arguments as constants."""
-    return njit(inline="always", error_model="numpy")(function)
+    """Make a function part of the machine code of every compiled function that calls it.
+
+    Constant arguments become constants in the machine code, but not to Numba's typing: inlining by Numba
+    would type the function's body anew at every call, which takes several times longer to compile.
+    """
+    return njit(forceinline=True, nogil=True, error_model="numpy", _nrt=False)(function)
 
 
 def compiled(function: Callable[..., Any]) -> Any:

@@ -20,8 +20,8 @@ from faintspot.kernels.total_variation import denoise_group
 _find_threshold = brightest.find_threshold
 _subtract_background = brightest.subtract_background
 _centre_of_gravity = brightest.centre_of_gravity
+_centre_and_error = brightest.centre_and_error
 _find_largest = brightest.find_largest
-_noise_of_centroid = brightest.noise_of_centroid
 
 NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
@@ -70,15 +70,15 @@ def prepare_group(
 ) -> None:
     """Gather and calibrate the W sub-apertures of a group, fill bad pixels and flag what there is to flag.
 
-    The last group of a frame repeats its last sub-aperture to fill the lanes. `spare` holds ny * nx and
-    `numbers` 2 * W numbers of scratch; for the others see `slopes_of_groups`.
+    The last group of a frame repeats its last sub-aperture to fill the lanes. `spare` holds ny * nx * W
+    and `numbers` 2 * W numbers of scratch; for the others see `slopes_of_groups`.
     """
     width = width_of(lanes)
     n, first = corners.shape[0], group * width
     for lane in range(width):
         s = min(first + lane, n - 1)
         places[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
-    gather_raw(lanes, frames, f, places, ny, nx, image)
+    gather_raw(lanes, frames, f, places, ny, nx, spare, image)
     calibrate(lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, numbers)
     for lane in range(width):
         s = min(first + lane, n - 1)
@@ -103,6 +103,7 @@ def slopes_of_groups(
     variants: Any,
     before: Any,
     algorithm: Any,
+    table: Any,
     taps: Any,
     start: Any,
     stop: Any,
@@ -132,8 +133,8 @@ def slopes_of_groups(
         Which of these tables a frame is measured with.
     before : int
         NOTHING, SMOOTH or DENOISE.
-    algorithm : int
-        Of the denoising.
+    algorithm, table
+        Of the denoising, see `denoise_group`.
     taps : (n_subapertures, 2, 1 + reach) float32
         Of the smoothing along x and y, the central one first.
     scratch : tuple of arrays, from `new_scratch`
@@ -173,21 +174,24 @@ def slopes_of_groups(
             centroid_numbers,
         )
         _read_settings(width, first, settings, numbers, counts, centroid_numbers)
+        denoised = output
         if before == DENOISE:
-            denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
+            denoise_group(lanes, algorithm, table, ny, nx, image, output, state, rows, numbers, counts)
         elif before == SMOOTH:
             gather_taps(width, first, taps, rows)
             smooth_group(lanes, image, ny, nx, taps.shape[2] - 1, rows, state, output)
         else:
-            for i in range(0, ny * nx * width, width):
-                store(output, i, load(lanes, image, i))
+            denoised = image
         if stages.shape[0] > 0:
             store_stage(width, image, stages[CALIBRATED, f], first)
-            store_stage(width, output, stages[DENOISED, f], first)
-        _locate(lanes, output, ny, nx, centroid_numbers)
+            store_stage(width, denoised, stages[DENOISED, f], first)
+        _set_threshold(lanes, denoised, ny * nx, centroid_numbers)
         if settings[VARIANCE, first] >= 0.0:
-            _noise_of_centroid(lanes, image, output, ny, nx, centroid_numbers)
+            _centre_and_error(lanes, image, denoised, ny, nx, centroid_numbers)
+        else:
+            _centre_of_gravity(lanes, denoised, ny, nx, centroid_numbers)
         if stages.shape[0] > 0:
+            _subtract_background(lanes, denoised, ny * nx, centroid_numbers, output)
             store_stage(width, output, stages[BACKGROUND, f], first)
         for lane in range(min(width, n - first)):
             _store_slope(
@@ -227,14 +231,12 @@ def _read_settings(
 
 
 @compiled
-def _locate(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
-    """Background subtraction in place, and the centre of gravity. Without a RANK, THRESHOLD is given."""
+def _set_threshold(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
+    """Find THRESHOLD and LARGEST; without a RANK, THRESHOLD is given."""
     if numbers[brightest.RANK * width_of(lanes)] > 0.0:
-        _find_threshold(lanes, image, ny * nx, numbers)
+        _find_threshold(lanes, image, pixels, numbers)
     else:
-        _find_largest(lanes, image, ny * nx, numbers)
-    _subtract_background(lanes, image, ny * nx, numbers)
-    _centre_of_gravity(lanes, image, ny, nx, numbers)
+        _find_largest(lanes, image, pixels, numbers)
 
 
 @compiled
@@ -342,7 +344,7 @@ def light_of_groups(
 ) -> None:
     """Sum the pixels of every sub-aperture, electrons, bad ones as 0; parameters as `slopes_of_groups`."""
     width = width_of(lanes)
-    image, _, _, _, numbers, _, lane_counts = scratch
+    image, block, _, _, numbers, _, lane_counts = scratch
     n = corners.shape[0]
     n_groups = (n + width - 1) // width
     for item in range(start, stop):
@@ -350,7 +352,7 @@ def light_of_groups(
         for lane in range(width):
             s = min(group * width + lane, n - 1)
             lane_counts[lane] = corners[s, 0] * frames.shape[2] + corners[s, 1]
-        gather_raw(lanes, frames, f, lane_counts, ny, nx, image)
+        gather_raw(lanes, frames, f, lane_counts, ny, nx, block, image)
         calibrate(lanes, image, ny * nx, calibration, group * 2 * ny * nx * width, saturation, numbers)
         total, zero = splat(lanes, 0.0), splat(lanes, 0.0)
         for i in range(ny * nx):
@@ -369,6 +371,7 @@ def denoise_stack(
     nx: Any,
     settings: Any,
     algorithm: Any,
+    table: Any,
     start: Any,
     stop: Any,
     scratch: Any,
@@ -391,7 +394,7 @@ def denoise_stack(
             numbers[total_variation.STRENGTH * width + lane] = settings[0, s]
             numbers[total_variation.TOLERANCE * width + lane] = settings[1, s]
             counts[total_variation.LIMIT * width + lane] = int(settings[2, s])
-        denoise_group(lanes, algorithm, ny, nx, image, output, state, rows, numbers, counts)
+        denoise_group(lanes, algorithm, table, ny, nx, image, output, state, rows, numbers, counts)
         for lane in range(min(width, n - first)):
             s = first + lane
             scatter_image(width, output, lane, denoised, s)
@@ -417,7 +420,7 @@ def subtract_stack(
             numbers[brightest.RANK * width + lane] = rank[s]
             numbers[brightest.SUBTRACT * width + lane] = subtract
         _find_threshold(lanes, image, pixels, numbers)
-        _subtract_background(lanes, image, pixels, numbers)
+        _subtract_background(lanes, image, pixels, numbers, image)
         for lane in range(min(width, n - first)):
             scatter_image(width, image, lane, result, first + lane)
 
@@ -430,6 +433,8 @@ def centroid_stack(
     width = width_of(lanes)
     image, _, _, _, numbers, _, _ = scratch
     n = images.shape[0]
+    store(numbers, brightest.THRESHOLD * width, splat(lanes, -math.inf))
+    store(numbers, brightest.SUBTRACT * width, splat(lanes, 0.0))
     for group in range(start, stop):
         first = group * width
         for lane in range(width):

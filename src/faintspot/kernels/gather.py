@@ -11,7 +11,9 @@ from faintspot.kernels.simd import absolute, copy_transposed, get, load, put, se
 
 
 @compiled
-def gather_raw(lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, image: Any) -> None:
+def gather_raw(
+    lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: Any, block: Any, image: Any
+) -> None:
     """Copy W sub-apertures of a frame into the lanes, as they are.
 
     Parameters
@@ -20,19 +22,29 @@ def gather_raw(lanes: Any, frames: Any, frame: Any, corners: Any, ny: Any, nx: A
     frame : int
     corners : (W,) int64
         Flat offset of each sub-aperture's first pixel in its frame.
+    block : array
+        Scratch; with W * W numbers, windows whose width W does not divide are gathered faster.
     image : (ny * nx * W,) array
         Written.
     """
     width = width_of(lanes)
     height, line = frames.shape[1:]
-    whole = nx - nx % width
+    whole, last = nx - nx % width, 0
+    for lane in range(width):
+        last = max(last, get(corners, lane))
     for y in range(ny):
         start, to = (frame * height + y) * line, y * nx * width
         for x in range(0, whole, width):
             copy_transposed(lanes, frames, corners, start + x, image, to + x * width)
-        for x in range(whole, nx):
-            for lane in range(width):
-                put(image, to + x * width + lane, get(frames, get(corners, lane) + start + x))
+        if whole < nx and last + start + whole + width <= frames.size and block.size >= width * width:
+            # More columns than the window still has, of which only those are used.
+            copy_transposed(lanes, frames, corners, start + whole, block, 0)
+            for x in range(whole, nx):
+                store(image, to + x * width, load(lanes, block, (x - whole) * width))
+        else:
+            for x in range(whole, nx):
+                for lane in range(width):
+                    put(image, to + x * width + lane, get(frames, get(corners, lane) + start + x))
 
 
 @compiled

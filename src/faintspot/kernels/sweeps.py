@@ -5,7 +5,8 @@ field p = (px, py), which take turns as the current and the previous one, and th
 stored is 2 p, of length at most 2, since 2 / sqrt(a) is cheaper than 1 / sqrt(a).
 
 v = div q - g / lambda of row y is all that row y - 1 still lacks for its update, so a rolling row of vectors
-in scratch replaces every other intermediate image.
+in scratch replaces every other intermediate image. Rows are swept in pairs, so that every second row only
+passes through it, and a pixel's work is spread over four turns of the loop: see `_turn`.
 
 References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 (IEEE Trans. Image Process.
 18, 2419).
@@ -37,102 +38,210 @@ CHAMBOLLE_STEP = 0.25
 def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any, momentum: Any) -> Any:
     """Extrapolate: q = p + momentum * (p - p_previous) at one pixel."""
     width = width_of(lanes)
-    px = load(lanes, state, place + current * width)
-    py = load(lanes, state, place + (current + 1) * width)
-    qx = multiply_add(momentum, px - load(lanes, state, place + previous * width), px)
-    qy = multiply_add(momentum, py - load(lanes, state, place + (previous + 1) * width), py)
+    px = load(lanes, state, place + current)
+    py = load(lanes, state, place + current + width)
+    qx = multiply_add(momentum, px - load(lanes, state, place + previous), px)
+    qy = multiply_add(momentum, py - load(lanes, state, place + previous + width), py)
     return qx, qy
 
 
 @inlined
-def _project(px: Any, py: Any, four: Any) -> Any:
-    """The nearest dual vector of length at most two."""
-    shrink = twice_reciprocal_square_root(maximum(multiply_add(px, px, py * py), four))
-    return px * shrink, py * shrink
+def _bounded_square(lanes: Any, px: Any, py: Any) -> Any:
+    """|p|^2, but at least four: what `_store_projected` divides by."""
+    return maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
 
 
 @inlined
-def _sweep(
+def _store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any, square: Any) -> None:
+    """Store the nearest dual vector of length at most two."""
+    shrink = twice_reciprocal_square_root(square)
+    store(state, target, px * shrink)
+    store(state, target + width_of(lanes), py * shrink)
+
+
+@inlined
+def _advance(
+    lanes: Any, state: Any, line: Any, previous: Any, top: Any, targets: Any, steps: Any, bounded: Any
+) -> Any:
+    """Project and store the oldest steps, and bound those after them."""
+    fx, fy, f_square, hx, hy, h_square = bounded
+    if not top:
+        _store_projected(lanes, state, targets[0] - line + previous, fx, fy, f_square)
+    _store_projected(lanes, state, targets[1] + previous, hx, hy, h_square)
+    fx, fy, hx, hy = steps
+    return fx, fy, _bounded_square(lanes, fx, fy), hx, hy, _bounded_square(lanes, hx, hy)
+
+
+@inlined
+def _turn(
     lanes: Any,
     state: Any,
     rows: Any,
-    ny: Any,
-    nx: Any,
-    current: Any,
-    previous: Any,
-    momentum: Any,
-    inverse: Any,
+    x: Any,
+    places: Any,
+    line: Any,
+    versions: Any,
+    factors: Any,
+    top: Any,
+    left_edge: Any,
+    carried: Any,
 ) -> Any:
-    """One accelerated projected-gradient iteration on every pixel; return ||2 div q||^2 per lane.
+    """One column of a pair of rows, at four stages of the work; return what the next turn needs.
 
-    The new p replaces the previous one. `inverse` is 1 / lambda; `rows` has room for 3 (nx + 1) vectors: qx,
-    qy, v of every pixel of the row above, side by side.
+    Extrapolate column x + 1; complete v of column x; from that, take the steps of p in the row above the pair
+    (column x) and in its upper row (column x - 1); bound the steps of one turn before, and project and store
+    those of two turns before. No stage waits for another of the same turn: a processor that looks some 150
+    instructions ahead would otherwise wait for the whole chain of a pixel, which takes longer than its work.
     """
     width = width_of(lanes)
-    step, four, zero = splat(lanes, FGP_STEP), splat(lanes, 4.0), splat(lanes, 0.0)
-    minus_inverse = splat(lanes, -2.0) * inverse
-    pixel, line, slot = STATE_VECTORS * width, nx * STATE_VECTORS * width, 3 * width
-    norm = zero
-    q_left = zero
-    for x in range(nx):
-        place = x * pixel
-        qx, qy = _extrapolate(lanes, state, place, current, previous, momentum)
-        d = qx - q_left + qy
-        norm = multiply_add(d, d, norm)
-        v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
-        store(rows, x * slot, qx)
-        store(rows, x * slot + width, qy)
-        store(rows, x * slot + 2 * width, v)
-        q_left = qx
-    # A copy of the last v beyond the right edge: no gradient across it.
-    store(rows, nx * slot + 2 * width, load(lanes, rows, nx * slot - width))
-    for y in range(1, ny):
-        v_above = load(lanes, rows, 2 * width)
-        q_left = zero
-        for x in range(nx):
-            place = y * line + x * pixel
-            above = place - line
-            qx, qy = _extrapolate(lanes, state, place, current, previous, momentum)
-            qy_above = load(lanes, rows, x * slot + width)
-            d = (qx - q_left) + (qy - qy_above)
-            norm = multiply_add(d, d, norm)
-            v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
-            v_right = load(lanes, rows, x * slot + slot + 2 * width)
-            px = multiply_add(step, v_right - v_above, load(lanes, rows, x * slot))
-            py = multiply_add(step, v - v_above, qy_above)
-            px, py = _project(px, py, four)
-            store(state, above + previous * width, px)
-            store(state, above + (previous + 1) * width, py)
-            store(rows, x * slot, qx)
-            store(rows, x * slot + width, qy)
-            store(rows, x * slot + 2 * width, v)
-            q_left, v_above = qx, v_right
-        store(rows, nx * slot + 2 * width, load(lanes, rows, nx * slot - width))
-    last = (ny - 1) * line
-    v_above = load(lanes, rows, 2 * width)
-    for x in range(nx):  # no gradient across the lower edge: py stays zero
-        v_right = load(lanes, rows, x * slot + slot + 2 * width)
-        px = multiply_add(step, v_right - v_above, load(lanes, rows, x * slot))
-        px, py = _project(px, zero, four)
-        store(state, last + x * pixel + previous * width, px)
-        store(state, last + x * pixel + (previous + 1) * width, py)
+    current, previous = versions
+    momentum, minus_inverse, step = factors
+    place, following = places
+    norm, v_above, (qx, qy, rx, ry), (ax, ay, av, bx, bv), (p1, p2, p3), steps, bounded = carried
+    bounded = _advance(lanes, state, line, previous, top, (p2, p3), steps, bounded)
+    fx, fy, _, _ = steps
+    here = x * 3 * width
+    dx, ex = (qx, rx) if left_edge else (qx - ax, rx - bx)
+    if top:
+        d = dx + qy
+    else:
+        qy_above = load(lanes, rows, here + width)
+        d = dx + (qy - qy_above)
+    e = ex + (ry - qy)
+    v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d * step)
+    w = multiply_add(load(lanes, state, place + line + IMAGE * width), minus_inverse, e * step)
+    norm = multiply_add(e, e, multiply_add(d, d, norm))
+    if not top:
+        v_right = load(lanes, rows, here + 5 * width)
+        fx = (v_right - v_above) + load(lanes, rows, here)
+        fy = (v - v_above) + qy_above
         v_above = v_right
+    # At the left edge: the rightmost pixel of the pair above, which has no gradient along x.
+    hx = ax if left_edge else (v - av) + ax
+    hy = (bv - av) + ay
+    store(rows, here, rx)
+    store(rows, here + width, ry)
+    store(rows, here + 2 * width, w)
+    next_qx, next_qy = _extrapolate(lanes, state, following, current, previous, momentum)
+    next_rx, next_ry = _extrapolate(lanes, state, following + line, current, previous, momentum)
+    ahead = next_qx, next_qy, next_rx, next_ry
+    return norm, v_above, ahead, (qx, qy, v, rx, w), (place, p1, p2), (fx, fy, hx, hy), bounded
+
+
+@inlined
+def _no_work(lanes: Any, norm: Any, place: Any) -> Any:
+    """What the first turn of all finds: steps that are zero, of a pixel that is written again."""
+    zero, four = splat(lanes, 0.0), splat(lanes, 4.0)
+    nothing = zero, zero, zero, zero
+    bounded = zero, zero, four, zero, zero, four
+    left = zero, zero, zero, zero, zero
+    return norm, zero, nothing, left, (place, place, place), nothing, bounded
+
+
+@inlined
+def _sweep_pair(
+    lanes: Any, state: Any, rows: Any, y: Any, nx: Any, versions: Any, factors: Any, top: Any, carried: Any
+) -> Any:
+    """All turns of rows y and y + 1, `top` when y = 0; `rows`: those of row y - 1, then of row y + 1."""
+    width = width_of(lanes)
+    pixel, line = STATE_VECTORS * width, nx * STATE_VECTORS * width
+    current, previous = versions
+    place, last = y * line, y * line + line - pixel
+    norm, v_above, _, left, where, steps, bounded = carried
+    qx, qy = _extrapolate(lanes, state, place, current, previous, factors[0])
+    rx, ry = _extrapolate(lanes, state, place + line, current, previous, factors[0])
+    if not top:
+        v_above = load(lanes, rows, 2 * width)
+    carried = norm, v_above, (qx, qy, rx, ry), left, where, steps, bounded
+    places = place, min(place + pixel, last)
+    carried = _turn(lanes, state, rows, 0, places, line, versions, factors, top, True, carried)
+    for x in range(1, nx):
+        place += pixel
+        places = place, min(place + pixel, last)
+        carried = _turn(lanes, state, rows, x, places, line, versions, factors, top, False, carried)
+    # A copy of the last v beyond the right edge: no gradient across it.
+    store(rows, (3 * nx + 2) * width, carried[3][4])
+    return carried
+
+
+@inlined
+def _finish(lanes: Any, state: Any, line: Any, previous: Any, top: Any, carried: Any) -> Any:
+    """Store what is still on its way after the last turn; return the norm."""
+    norm, _, _, (ax, ay, av, _, bv), (p1, p2, p3), (gx, gy, ix, iy), bounded = carried
+    fx, fy, f_square, hx, hy, h_square = bounded
+    if not top:
+        _store_projected(lanes, state, p2 - line + previous, fx, fy, f_square)
+        _store_projected(lanes, state, p1 - line + previous, gx, gy, _bounded_square(lanes, gx, gy))
+    _store_projected(lanes, state, p3 + previous, hx, hy, h_square)
+    _store_projected(lanes, state, p2 + previous, ix, iy, _bounded_square(lanes, ix, iy))
+    ay = (bv - av) + ay
+    _store_projected(lanes, state, p1 + previous, ax, ay, _bounded_square(lanes, ax, ay))
     return norm
+
+
+@inlined
+def _first_row(lanes: Any, state: Any, rows: Any, nx: Any, versions: Any, factors: Any) -> Any:
+    """Put the first row into `rows`; return the norm."""
+    width = width_of(lanes)
+    momentum, minus_inverse, step = factors
+    norm, q_left, v = splat(lanes, 0.0), splat(lanes, 0.0), splat(lanes, 0.0)
+    for x in range(nx):
+        place, here = x * STATE_VECTORS * width, x * 3 * width
+        qx, qy = _extrapolate(lanes, state, place, versions[0], versions[1], momentum)
+        d = (qx - q_left) + qy
+        norm = multiply_add(d, d, norm)
+        v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d * step)
+        store(rows, here, qx)
+        store(rows, here + width, qy)
+        store(rows, here + 2 * width, v)
+        q_left = qx
+    store(rows, 3 * nx * width + 2 * width, v)
+    return norm
+
+
+@inlined
+def _update_last_row(lanes: Any, state: Any, rows: Any, target: Any, nx: Any) -> None:
+    """Update p of the row in `rows`, the image's last: no gradient across the lower edge, py stays zero."""
+    width = width_of(lanes)
+    zero, v = splat(lanes, 0.0), load(lanes, rows, 2 * width)
+    for x in range(nx):
+        here = x * 3 * width
+        v_right = load(lanes, rows, here + 5 * width)
+        px = (v_right - v) + load(lanes, rows, here)
+        _store_projected(
+            lanes, state, target + x * STATE_VECTORS * width, px, zero, _bounded_square(lanes, px, zero)
+        )
+        v = v_right
 
 
 @compiled
 def sweep_fgp(
     lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, momentum: Any, inverse: Any
 ) -> Any:
-    """One iteration of "fgp"; return ||div q||^2 per lane. See `_sweep`.
+    """One accelerated projected-gradient iteration on every pixel; return ||div q||^2 per lane.
 
-    `current` (0 or 2) says where the current p is: a constant in each branch, so that all of a pixel's
-    vectors lie at fixed distances from one address.
+    `current` (0 or 2) says where the current p is; the new one replaces the other. `inverse` is 1 / lambda;
+    `rows` has room for 3 (nx + 1) vectors: qx, qy and step * v of every pixel of one row, side by side.
     """
-    if current == 0:
-        norm = _sweep(lanes, state, rows, ny, nx, 0, 2, momentum, inverse)
+    width = width_of(lanes)
+    line = nx * STATE_VECTORS * width
+    versions = current * width, (2 - current) * width
+    factors = momentum, splat(lanes, -2.0 * FGP_STEP) * inverse, splat(lanes, FGP_STEP)
+    if ny % 2 == 0:
+        carried = _no_work(lanes, splat(lanes, 0.0), 0)
+        carried = _sweep_pair(lanes, state, rows, 0, nx, versions, factors, True, carried)
+        norm = _finish(lanes, state, line, versions[1], True, carried)
+        y = 2
     else:
-        norm = _sweep(lanes, state, rows, ny, nx, 2, 0, momentum, inverse)
+        norm = _first_row(lanes, state, rows, nx, versions, factors)
+        y = 1
+    if y < ny:
+        carried = _no_work(lanes, norm, y * line)
+        while y < ny:
+            carried = _sweep_pair(lanes, state, rows, y, nx, versions, factors, False, carried)
+            y += 2
+        norm = _finish(lanes, state, line, versions[1], False, carried)
+    _update_last_row(lanes, state, rows, (ny - 1) * line + versions[1], nx)
     return norm * splat(lanes, 0.25)
 
 

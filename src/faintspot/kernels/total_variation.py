@@ -14,6 +14,7 @@ import math
 from typing import Any
 
 from faintspot.kernels.compiling import compiled
+from faintspot.kernels.flat_start import MOMENTUM_AGE, start_flat
 from faintspot.kernels.simd import (
     load,
     maximum,
@@ -208,6 +209,7 @@ def _mark_finished(width: Any, iteration: Any, measured: Any, numbers: Any, coun
 def denoise_group(
     lanes: Any,
     algorithm: Any,
+    table: Any,
     ny: Any,
     nx: Any,
     image: Any,
@@ -224,6 +226,8 @@ def denoise_group(
     lanes : Lanes
     algorithm : int
         FGP or CHAMBOLLE.
+    table : array
+        From `flat_start_table`; without elements, the iteration starts from p = 0.
     ny, nx : int
     image, output : (ny * nx * W,) arrays
         Input, kept as it is, and result: all lanes of a pixel side by side.
@@ -247,8 +251,12 @@ def denoise_group(
     zero = splat(lanes, 0.0)
     inverse_radius = splat(lanes, 1.0) / load(lanes, numbers, RADIUS * width)
     inverse = inverse_radius * splat(lanes, math.sqrt(ny * nx) / FIRST_MULTIPLIER)
+    momentum_age = 1.0
+    if table.shape[0] > 0:
+        inverse = start_flat(lanes, state, rows, ny, nx, table, inverse_radius)
+        momentum_age = MOMENTUM_AGE
     limit = _next_limit(width, counts)
-    momentum_age, momentum, current, iteration = 1.0, 0.0, 0, 0
+    momentum, current, iteration = 0.0, 0, 0
     while active > 0:
         iteration += 1
         if algorithm == FGP:

@@ -8,6 +8,7 @@ from typing import Any
 
 from faintspot.planner.answer import Answer, ArmResult
 from faintspot.planner.arms import SPOT
+from faintspot.presets import of_denoising
 from faintspot.sensor.settings import Settings
 from faintspot.study.metric import Estimate
 
@@ -50,6 +51,8 @@ def settings_in_words(settings: Settings) -> str:
         pairs.append("denoise false")
     for name in _SHOWN:
         value = getattr(settings, name)
+        if name in _ONLY_OF_TV and value is None:
+            value = of_denoising(settings.preset)[name]
         wanted = denoises if name in _ONLY_OF_TV else value != defaults[name]
         if wanted and value is not None:
             pairs.append(f"{name} {value:g}")

@@ -46,6 +46,7 @@ _WRITTEN_FOR_GRAVITY = (
     "rule",
     "denoise",
     "algorithm",
+    "preset",
 )
 _CALIBRATION_MAPS = ("dark", "flat", "bad_pixels")
 

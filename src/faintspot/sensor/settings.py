@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.presets import PRESETS, of_denoising
 
 ALGORITHMS = ("fgp", "chambolle")
 RULES = ("subtract_next", "threshold", "subtract_kth")
@@ -46,6 +47,8 @@ PER_SUBAPERTURE = (
 )
 _OPTIONAL = (
     "noise_std",
+    "tolerance",
+    "max_iterations",
     "keep_brightest",
     "threshold_e",
     "smoothing_px",
@@ -97,7 +100,8 @@ class PerSubaperture:
 class Settings:
     """How each sub-aperture's image is turned into a position; immutable.
 
-    Every value but `estimator`, `algorithm` and `steps` is a scalar or holds one value per sub-aperture.
+    Every value but `estimator`, `algorithm`, `preset` and `steps` is a scalar or holds one value per
+    sub-aperture.
 
     Parameters
     ----------
@@ -105,10 +109,11 @@ class Settings:
         Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from
         read noise, light and spot, by `faintspot.estimate.automatic.automatic_strength`. Needed by the
         estimator "cog" where `denoise` is true.
-    tolerance : float or array
-        Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`.
-    max_iterations : int or array
-        Its iteration limit.
+    tolerance : float or array, optional
+        Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. Default:
+        that of the preset, 0.01 or, with "fast", 0: only the limit stops it.
+    max_iterations : int or array, optional
+        Its iteration limit. Default: that of the preset, 200 or 8.
     keep_brightest : int or array or "auto", optional
         Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at
         least 5. "auto": by `faintspot.estimate.automatic.automatic_kept_pixels`.
@@ -118,6 +123,10 @@ class Settings:
         Whether to denoise at all.
     algorithm : str
         "fgp" | "chambolle".
+    preset : str
+        "accurate" | "fast". "fast" does as little work as keeps slopes as good: the denoising begins at the
+        solution of the flat image and makes 8 iterations, see `faintspot.tv_denoise`; "ml", "matched" and
+        "weighted" make fewer steps. What else is given here goes before it.
     flux_floor : float or array
         A sub-aperture is flagged NO_LIGHT when the flux that is left after the background subtraction is not
         above this fraction of its image's largest pixel.
@@ -138,7 +147,7 @@ class Settings:
         Full width at half maximum of the weight of "weighted", geometric mean of both axes; it is elongated
         like the spot. Default: that of the spot.
     steps : int
-        Of "ml", "matched" and "map" (default 3) or of "weighted" (default 8).
+        Of "ml", "matched" and "map" (default 3; "fast": 2) or of "weighted" (default 8; "fast": 4).
     model_error : float or array
         How far the spots differ from the PSF, as a fraction of each pixel's light: "ml" and "map" trust
         bright pixels no more than that. 0.1 to 0.5 for speckled spots.
@@ -163,12 +172,13 @@ class Settings:
     """
 
     noise_std: Any = None
-    tolerance: Any = 1e-2
-    max_iterations: Any = 200
+    tolerance: Any = None
+    max_iterations: Any = None
     keep_brightest: Any = None
     rule: Any = "subtract_next"
     denoise: Any = True
     algorithm: str = "fgp"
+    preset: str = "accurate"
     flux_floor: Any = 1e-4
     max_bad_fraction: Any = 0.25
     estimator: str = "cog"
@@ -187,6 +197,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         one_of("algorithm", self.algorithm, ALGORITHMS)
+        one_of("preset", self.preset, PRESETS)
         one_of("estimator", self.estimator, ESTIMATORS)
         if self.steps is not None:
             object.__setattr__(self, "steps", int(number_between("steps", self.steps, 1, 100, integer=True)))
@@ -275,8 +286,10 @@ class Settings:
             return np.array([value.others.get(i, default) for i in range(n_subapertures)])
         return np.full(n_subapertures, self._default(name, pixels) if value is None else value)
 
-    @staticmethod
-    def _default(name: str, pixels: int) -> Any:
+    def _default(self, name: str, pixels: int) -> Any:
+        of_preset = of_denoising(self.preset)
+        if name in of_preset:
+            return of_preset[name]
         if name == "keep_brightest":
             return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
         if name == "smoothing_px":
