@@ -64,6 +64,7 @@ def tv_denoise(
     algorithm: str = "fgp",
     tolerance: float = 1e-2,
     max_iterations: int = 200,
+    flat_start: bool = False,
 ) -> Denoised:
     """Constrained TV of one image: minimise TV(u) subject to ||u - g||^2 = N noise_std^2."""
     g = np.asarray(g, np.float64)
@@ -83,8 +84,11 @@ def tv_denoise(
     multiplier = 0.4 * strength
     zero = np.zeros_like(g)
     p: tuple[Floats, Floats] = (zero, zero)
-    previous = p
     age, momentum, converged = 1.0, 0.0, False
+    if flat_start:
+        p, multiplier = flat_field(gc, strength)
+        age = 4.0
+    previous = p
     for iteration in range(1, max_iterations + 1):
         if algorithm == "fgp":
             q = (p[0] + momentum * (p[0] - previous[0]), p[1] + momentum * (p[1] - previous[1]))
@@ -116,6 +120,29 @@ def tv_denoise(
     multiplier = radius / np.linalg.norm(d)
     image = mean + scale * (gc - multiplier * d)
     return Denoised(image, iteration, multiplier * scale, converged, False, p, margin)
+
+
+def flat_field(g: Floats, strength: float) -> tuple[tuple[Floats, Floats], float]:
+    """The dual field that a solution without structure has, cut to length 1, and its multiplier."""
+    pixels = np.eye(g.size).reshape(-1, *g.shape)
+    laplacian = np.array([divergence(*gradient(pixel)).ravel() for pixel in pixels]).T
+    field = gradient(np.linalg.lstsq(laplacian, g.ravel())[0].reshape(g.shape))
+    radius = np.sqrt(g.size) * strength
+
+    def cut(multiplier: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        px, py = field[0] / multiplier, field[1] / multiplier
+        length = np.maximum(1.0, np.hypot(px, py))
+        return px / length, py / length, length == 1.0
+
+    # Newton's step for f = ||div p|| - radius / lambda = 0 in the inverse multiplier.
+    inverse = 1.0 / (1.6 * strength)
+    px, py, free = cut(1.0 / inverse)
+    d = divergence(px, py)
+    norm = np.linalg.norm(d)
+    slope = np.sum(d * divergence(px * free, py * free)) / (norm * inverse)
+    step = (norm - radius * inverse) / max(radius - slope, 0.3 * radius)
+    inverse = float(np.clip(inverse + step, inverse / 4, inverse * 4))
+    return cut(1.0 / inverse)[:2], 1.0 / inverse
 
 
 # Background and centroid ----------------------------------------------------------------------------
@@ -238,6 +265,7 @@ def slopes(
             settings.algorithm,
             float(value["tolerance"]),
             int(value["max_iterations"]),
+            settings.preset == "fast",
         )
         if denoised.infeasible:
             flags |= Flag.INFEASIBLE_STRENGTH

@@ -58,6 +58,7 @@ def random_settings(rng: np.random.Generator, n: int, pixels: int) -> fs.Setting
         rule=rule,
         denoise=(rule != "threshold") & (rng.random(n) < 0.8),
         algorithm=str(rng.choice(["fgp", "chambolle"])),
+        preset=str(rng.choice(["accurate", "fast"])),
         flux_floor=rng.choice([1e-4, 0.1], n),
         max_bad_fraction=rng.choice([0.0, 0.05, 0.25, 1.0], n),
     )

@@ -55,6 +55,7 @@ class TestAgainstOracle:
                 stages.calibrated[s],
                 each("noise_std")[s] if each("denoise")[s] else 0.0,
                 algorithm=case.settings.algorithm,
+                preset=case.settings.preset,
                 tolerance=each("tolerance")[s],
                 max_iterations=each("max_iterations")[s],
             )

@@ -61,6 +61,26 @@ class TestAgainstOracle:
 
     @every_dtype
     @every_algorithm
+    @given(images(), fractions, st.sampled_from([1, 2, 8, 40]))
+    def test_fast_preset(
+        self, algorithm: str, dtype: Any, stack: Any, fraction: float, iterations: int
+    ) -> None:
+        """The transform adds its own rounding: sums over whole rows, solved along columns."""
+        stack = stack.astype(dtype)
+        strength = strengths_of(stack, fraction)
+        result = fs.tv_denoise(
+            stack, strength, algorithm=algorithm, preset="fast", max_iterations=iterations, full_output=True
+        )
+        for i, g in enumerate(stack):
+            expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, iterations, flat_start=True)
+            bound = 10 * tolerance_of(dtype) * largest(g) + 1e-29
+            assert np.max(np.abs(result.images[i] - expected.image)) <= bound
+            if largest(g) > 1e-20:
+                assert result.iterations[i] == expected.iterations
+                assert result.infeasible[i] == expected.infeasible
+
+    @every_dtype
+    @every_algorithm
     @given(images(), st.floats(0.05, 0.98), st.sampled_from([1e-3, 1e-2, 0.3]))
     def test_stops_at_the_same_iteration(
         self, algorithm: str, dtype: Any, stack: Any, fraction: float, tolerance: float
@@ -111,7 +131,8 @@ class TestSolution:
         assert np.all(error[feasible] <= tolerance_of(dtype))
 
     @every_algorithm
-    def test_is_the_minimum_of_the_penalised_problem(self, algorithm: str) -> None:
+    @pytest.mark.parametrize("preset", ["accurate", "fast"])
+    def test_is_the_minimum_of_the_penalised_problem(self, preset: str, algorithm: str) -> None:
         """u minimises ||u - g||^2 / 2 + lambda TV(u) exactly when v = (g - u) / lambda has <v, u> = TV(u)
         and <v, w> <= TV(w) for every w; the duality gap is lambda (TV(u) - <v, u>).
         """
@@ -119,7 +140,13 @@ class TestSolution:
         for shape in ((2, 2), (3, 9), (8, 8), (11, 5)):
             g = rng.normal(size=shape) + 4 * np.exp(-(np.linspace(-2, 2, shape[0])[:, None] ** 2))
             result = fs.tv_denoise(
-                g, 0.7 * g.std(), algorithm=algorithm, tolerance=0, max_iterations=20_000, full_output=True
+                g,
+                0.7 * g.std(),
+                algorithm=algorithm,
+                preset=preset,
+                tolerance=0,
+                max_iterations=20_000,
+                full_output=True,
             )
             u, multiplier = result.images, float(result.multiplier)
             v = (g - u) / multiplier

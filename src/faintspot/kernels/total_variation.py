@@ -72,7 +72,7 @@ def _measure_change(
 
 @compiled
 def _write_finished(
-    lanes: Any, state: Any, output: Any, ny: Any, nx: Any, current: Any, numbers: Any
+    lanes: Any, state: Any, rows: Any, output: Any, ny: Any, nx: Any, current: Any, numbers: Any
 ) -> None:
     """Write u = g - lambda div p of the lanes that finish now, with lambda such that the constraint holds."""
     width = width_of(lanes)
@@ -83,26 +83,22 @@ def _write_finished(
         for x in range(nx):
             d = twice_divergence(lanes, state, y * line + x * pixel, current * width, y, x, line, pixel)
             norm = multiply_add(d, d, norm)
+            store(rows, (y * nx + x) * width, d)
     finishing = load(lanes, numbers, FINISHING * width) > zero
     mean, scale = load(lanes, numbers, MEAN * width), load(lanes, numbers, SCALE * width)
     half_multiplier = load(lanes, numbers, RADIUS * width) / square_root(norm)
     half_multiplier = select(norm > zero, half_multiplier, zero)
     old = load(lanes, numbers, MULTIPLIER * width)
     store(numbers, MULTIPLIER * width, select(finishing, (half_multiplier + half_multiplier) * scale, old))
-    for y in range(ny):
-        for x in range(nx):
-            place = y * line + x * pixel
-            d = twice_divergence(lanes, state, place, current * width, y, x, line, pixel)
-            u = load(lanes, state, place + IMAGE * width) - half_multiplier * d
-            here = (y * nx + x) * width
-            store(output, here, select(finishing, multiply_add(u, scale, mean), load(lanes, output, here)))
+    for here in range(0, ny * nx * width, width):
+        g = load(lanes, state, here * STATE_VECTORS + IMAGE * width)
+        u = multiply_add(g - half_multiplier * load(lanes, rows, here), scale, mean)
+        store(output, here, select(finishing, u, load(lanes, output, here)))
 
 
 @compiled
-def _prepare(
-    lanes: Any, image: Any, state: Any, output: Any, ny: Any, nx: Any, smallest_range: Any, numbers: Any
-) -> None:
-    """Normalise the images into the state, with p = 0, and copy them to the output.
+def _prepare(lanes: Any, image: Any, state: Any, ny: Any, nx: Any, smallest_range: Any, numbers: Any) -> None:
+    """Normalise the images into the state.
 
     Normalisation (mean to zero, largest deviation to one) keeps every intermediate of order one, whatever
     the unit of the images; a range below `smallest_range` counts as constant. Leaves the sum of squared
@@ -123,23 +119,37 @@ def _prepare(
     mean = total / pixels
     scale = maximum(high - mean, mean - low)
     scale = select((high - low) > splat(lanes, smallest_range), scale, zero)
-    inverse = one / select(scale > zero, scale, one)
+    inverse = select(scale > zero, one / select(scale > zero, scale, one), zero)
     squares = zero
-    for i in range(ny * nx):
-        g = load(lanes, image, i * width)
-        store(output, i * width, g)
-        g = (g - mean) * inverse
+    for here in range(0, ny * nx * width, width):
+        g = (load(lanes, image, here) - mean) * inverse
         squares = multiply_add(g, g, squares)
-        for j in range(IMAGE):
-            store(state, (i * STATE_VECTORS + j) * width, zero)
-        store(state, (i * STATE_VECTORS + IMAGE) * width, g)
+        store(state, here * STATE_VECTORS + IMAGE * width, g)
     store(numbers, MEAN * width, mean)
     store(numbers, SCALE * width, scale)
     store(numbers, SIZE * width, squares)
 
 
 @compiled
-def _decide_beforehand(width: Any, pixels: Any, smallest: Any, output: Any, numbers: Any, counts: Any) -> Any:
+def _start_zero(lanes: Any, state: Any, ny: Any, nx: Any) -> None:
+    """Set the current p to 0. The previous one, if finite, does not matter: the first two momenta are 0."""
+    width = width_of(lanes)
+    zero = splat(lanes, 0.0)
+    for place in range(0, ny * nx * STATE_VECTORS * width, STATE_VECTORS * width):
+        store(state, place, zero)
+        store(state, place + width, zero)
+
+
+@compiled
+def _copy_lane(width: Any, lane: Any, pixels: Any, image: Any, output: Any) -> None:
+    for i in range(lane, pixels * width, width):
+        output[i] = image[i]
+
+
+@compiled
+def _decide_beforehand(
+    width: Any, pixels: Any, smallest: Any, image: Any, output: Any, numbers: Any, counts: Any
+) -> Any:
     """Settle the lanes that need no iteration; return how many remain active.
 
     Constant images and strength zero (or below the rounding error of the image) return the image itself;
@@ -155,6 +165,7 @@ def _decide_beforehand(width: Any, pixels: Any, smallest: Any, output: Any, numb
         numbers[MULTIPLIER * width + lane] = 0.0
         numbers[RADIUS * width + lane] = 1.0
         if scale <= 0.0 or strength <= smallest * scale:
+            _copy_lane(width, lane, pixels, image, output)
             if scale <= 0.0 and strength > 0.0:
                 counts[INFEASIBLE * width + lane] = 1
                 numbers[MULTIPLIER * width + lane] = math.inf
@@ -168,6 +179,7 @@ def _decide_beforehand(width: Any, pixels: Any, smallest: Any, output: Any, numb
             continue
         numbers[RADIUS * width + lane] = radius
         if counts[LIMIT * width + lane] <= 0:
+            _copy_lane(width, lane, pixels, image, output)
             counts[CONVERGED * width + lane] = 0
             continue
         counts[ACTIVE * width + lane] = 1
@@ -241,8 +253,8 @@ def denoise_group(
     width = width_of(lanes)
     # Strengths below the images' rounding error count as zero; ranges whose inverse overflows, as constant.
     smallest, smallest_range = (1e-8, 1e-30) if image.itemsize == 4 else (1e-17, 1e-290)
-    _prepare(lanes, image, state, output, ny, nx, smallest_range, numbers)
-    active = _decide_beforehand(width, ny * nx, smallest, output, numbers, counts)
+    _prepare(lanes, image, state, ny, nx, smallest_range, numbers)
+    active = _decide_beforehand(width, ny * nx, smallest, image, output, numbers, counts)
     if active == 0:
         return
     test_change = False
@@ -255,6 +267,8 @@ def denoise_group(
     if table.shape[0] > 0:
         inverse = start_flat(lanes, state, rows, ny, nx, table, inverse_radius)
         momentum_age = MOMENTUM_AGE
+    else:
+        _start_zero(lanes, state, ny, nx)
     limit = _next_limit(width, counts)
     momentum, current, iteration = 0.0, 0, 0
     while active > 0:
@@ -273,6 +287,6 @@ def denoise_group(
         if measured or iteration >= limit:
             finished = _mark_finished(width, iteration, measured, numbers, counts)
             if finished > 0:
-                _write_finished(lanes, state, output, ny, nx, current, numbers)
+                _write_finished(lanes, state, rows, output, ny, nx, current, numbers)
                 active -= finished
                 limit = _next_limit(width, counts)
