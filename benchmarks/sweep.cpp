@@ -1,5 +1,5 @@
-// The sweep of faintspot.kernels.sweeps.sweep_fgp in C++: same layout, same arithmetic, GCC's vector
-// extensions. `state` holds five vectors a pixel (2 px, 2 py of both versions, g), `rows` qx, qy, v of the row above.
+// The sweep of faintspot.kernels.sweeps.sweep_fgp in C++: same layout and algorithm, a row at a time as one would
+// write it, where the Numba kernel takes rows in pairs and in stages; GCC's vector extensions. `state` holds five vectors a pixel (2 px, 2 py of both versions, g), `rows` qx, qy, v of the row above.
 
 #include <cstddef>
 #include <cstring>
