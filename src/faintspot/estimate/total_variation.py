@@ -91,8 +91,8 @@ def tv_denoise(
         deviation, ``lambda ||div p - div p_previous|| <= tolerance * ||u - mean(u)||``; looked at every 5
         iterations. 0 never stops early. The default, 0.01, brings the centre of gravity of a spot within
         0.01 px of the converged one, also where the strength is close to the image's own rms (60 to 80
-        iterations there, 15 to 30 elsewhere). Tolerances of different algorithms and packages are not comparable:
-        "chambolle" moves less in an iteration and stops farther from the solution.
+        iterations there, 15 to 30 elsewhere). Tolerances of different algorithms and packages are not
+        comparable: "chambolle" moves less in an iteration and stops farther from the solution.
     max_iterations : int, optional
         At most so many iterations for each image. Default 200.
     preset : {"accurate", "fast"}
