@@ -269,7 +269,7 @@ def slopes(
         )
         if denoised.infeasible:
             flags |= Flag.INFEASIBLE_STRENGTH
-        if not denoised.converged:
+        if not denoised.converged and value["tolerance"] > 0:
             flags |= Flag.NOT_CONVERGED
         results.append(_located(denoised, value, flags, bad, layout.centres[s], layout.corners[s]))
         if reference is not None and results[-1].flags & (Flag.NO_LIGHT | Flag.TOO_MANY_BAD_PIXELS) == 0:

@@ -21,7 +21,7 @@ class SubapertureFlag(IntFlag):
     INFEASIBLE_STRENGTH = 16
     """The strength is at or above the image's own rms: the denoised image is constant."""
     NOT_CONVERGED = 32
-    """The iteration limit came before the tolerance was reached."""
+    """The iteration limit came before the tolerance was reached. Not where the tolerance is 0."""
     OUTLIER_LIKELY = 64
     """The spot is so faint that more than about 1 % of such slopes are those of noise, not of the spot."""
 

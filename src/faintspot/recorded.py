@@ -56,6 +56,8 @@ def measure_recorded(
     output: str | Path,
     *,
     denoise: bool = True,
+    preset: str | None = None,
+    device: str = "cpu",
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
@@ -77,6 +79,10 @@ def measure_recorded(
         .zarr, .fits, .npz or .csv.
     denoise : bool
         False switches the denoising off for all sub-apertures.
+    preset : str, optional
+        "accurate" or "fast", instead of that in the configuration.
+    device : str
+        "cpu" or "cuda", see `SlopePipeline`.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key".
     key : str, optional
@@ -98,10 +104,12 @@ def measure_recorded(
     layout, settings, calibration, psf, score = configuration.load_all(configuration_file)
     if not denoise:
         settings = settings.replace(denoise=False)
+    if preset is not None:
+        settings = settings.replace(preset=preset)
     positions = read_array(reference) if isinstance(reference, str | Path) else reference
     try:
         pipeline = SlopePipeline(
-            layout, settings, calibration, positions, psf=psf, score=score, threads=threads
+            layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
         )
     except InputError as error:
         about_reference = positions is not None and str(error).startswith("reference")

@@ -72,6 +72,22 @@ def test_no_denoise_is_the_other_arm(folder: Path, run: Commands) -> None:
     assert read_slopes(folder / "s.npz").variables["iterations"].max() == 0
 
 
+def test_preset_goes_before_the_configuration(folder: Path, run: Commands) -> None:
+    frames = simulated()
+    np.save("a.npy", frames)
+    SETTINGS.replace(preset="fast").save("faintspot.toml")
+    assert 'preset = "fast"' in Path("faintspot.toml").read_text()
+    run.ok("slopes", "a.npy", "-o", "s.npz")
+    assert_equal(folder / "s.npz", SlopePipeline(LAYOUT, SETTINGS.replace(preset="fast"))(frames))
+    run.ok("slopes", "a.npy", "-o", "t.npz", "--preset", "accurate")
+    assert_equal(folder / "t.npz", expected(frames))
+
+
+def test_device(folder: Path, run: Commands) -> None:
+    np.save("a.npy", simulated())
+    run.refused("slopes", "a.npy", "-o", "s.npz", "--device", "tpu", naming=("device", "tpu", "cuda"))
+
+
 def test_reference(folder: Path, run: Commands) -> None:
     frames = simulated()
     reference = np.random.default_rng(4).normal(0, 0.3, (16, 2))

@@ -37,6 +37,10 @@ class TestSettings:
         assert settings.values("keep_brightest", 3, 256).tolist() == [20] * 3
         assert settings.values("keep_brightest", 1, 16).tolist() == [5]
         assert settings.values("tolerance", 2, 16).tolist() == [0.01, 0.01]
+        fast = settings.replace(preset="fast")
+        assert fast.values("tolerance", 2, 16).tolist() == [0.0, 0.0]
+        assert fast.values("max_iterations", 2, 16).tolist() == [8, 8]
+        assert fast.replace(max_iterations=5).values("max_iterations", 1, 16).tolist() == [5]
         assert fs.Settings(denoise=False).values("noise_std", 2, 16).tolist() == [0.0, 0.0]
 
     @pytest.mark.parametrize(
@@ -51,7 +55,8 @@ class TestSettings:
             ("noise_std", {"noise_std": [[1.0]]}),
             ("noise_std", {"noise_std": []}),
             ("tolerance = 2", {"tolerance": 2.0}),
-            ("tolerance", {"tolerance": None}),
+            ("flux_floor", {"flux_floor": None}),
+            ("preset = 'slow': expected", {"preset": "slow"}),
             ("max_iterations = 0", {"max_iterations": 0}),
             ("max_iterations = 1.5", {"max_iterations": 1.5}),
             ("max_iterations", {"max_iterations": 1e9}),

@@ -9,6 +9,7 @@ import click
 
 from faintspot.cli.progress import progress_bar
 from faintspot.flags import SubapertureFlag
+from faintspot.presets import PRESETS
 from faintspot.recorded import Summary, measure_recorded
 
 
@@ -31,6 +32,12 @@ from faintspot.recorded import Summary, measure_recorded
     help="What to write, by its ending: .zarr, .fits, .fits.gz, .npz or .csv.",
 )
 @click.option("--no-denoise", is_flag=True, help="Switch the denoising off: the other arm of a comparison.")
+@click.option(
+    "--preset", type=click.Choice(PRESETS), help="How much work to do. Default: as the configuration says."
+)
+@click.option(
+    "--device", default="cpu", show_default=True, help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`)."
+)
 @click.option("--reference", metavar="FILE", help="Reference positions, (n, 2) px, as FILE or FILE:ARRAY.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option("--threads", type=click.IntRange(1), help="Most threads to use. Default: all processors.")
@@ -43,6 +50,8 @@ def command(
     config: str,
     output: str,
     no_denoise: bool,
+    preset: str | None,
+    device: str,
     reference: str | None,
     key: str | None,
     threads: int | None,
@@ -62,6 +71,7 @@ def command(
     Examples:
       faintspot slopes night1.fits night2.fits.gz -c faintspot.toml -o slopes.zarr
       faintspot slopes night1.fits -o plain.zarr --no-denoise
+      faintspot slopes night1.fits -o slopes.zarr --preset fast
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
     with progress_bar("slopes") as advance:
@@ -70,6 +80,8 @@ def command(
             config,
             output,
             denoise=not no_denoise,
+            preset=preset,
+            device=device,
             reference=reference,
             key=key,
             threads=threads,

@@ -266,7 +266,7 @@ def _store_slope(
     if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
         if counts[total_variation.INFEASIBLE * width + lane]:
             bits |= INFEASIBLE_STRENGTH
-        if not counts[total_variation.CONVERGED * width + lane]:
+        if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:
             bits |= NOT_CONVERGED
     slopes[4][f, s] = counts[total_variation.ITERATIONS * width + lane]
     slopes[5][f, s] = bad_counts[lane]

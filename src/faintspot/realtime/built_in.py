@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import LARGEST_FLOAT32
 from faintspot.kernels import fused, located, thresholded
+from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
 from faintspot.sensor.layout import Layout
@@ -112,7 +113,7 @@ def _call(
             return function, (), arguments, shape
         denoise = background = False
         no_taps = np.ones((len(pipeline.layout), 2, 1), np.float32)
-        arguments[_BEFORE:] = [fused.NOTHING, 0, no_taps]
+        arguments[_BEFORE:] = [fused.NOTHING, 0, NO_TABLE, no_taps]
     if not denoise:
         arguments[_BEFORE] = fused.NOTHING
     if not background:
