@@ -94,7 +94,9 @@ def test_gains_beyond_the_range_are_said_to_be_so() -> None:
 
 def test_settings_in_words_name_what_matters() -> None:
     tv = wording.settings_in_words(Settings(noise_std=1.5, keep_brightest=12, max_iterations=25))
-    assert tv == 'estimator "cog", noise_std 1.5, tolerance 0.01, max_iterations 25, keep_brightest 12'
+    assert tv == 'estimator "cog", noise_std 1.5, max_iterations 25, keep_brightest 12'
+    fast = wording.settings_in_words(Settings(noise_std=1.5, keep_brightest=12, preset="fast"))
+    assert fast == 'estimator "cog", preset "fast", noise_std 1.5, keep_brightest 12'
     plain = wording.settings_in_words(Settings(denoise=False, keep_brightest=9))
     assert plain == 'estimator "cog", denoise false, keep_brightest 9'
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from faintspot.errors import InputError
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao
 from faintspot.pipeline import Slopes
 from faintspot.planner.answer import Answer, ArmResult
-from faintspot.planner.arms import ARMS, COST_OF_TV_ITERATION, Arm, Choice, Workshop
+from faintspot.planner.arms import ARMS, Arm, Choice, Workshop
 from faintspot.planner.curves import Curve, limiting_flux, magnitude_gain
 from faintspot.planner.question import Question
 from faintspot.planner.scene import Sample, Scene
@@ -34,8 +34,6 @@ _STEPS_EACH_SIDE = 4
 _ROUNDS = 2  # of looking along each axis in turn
 _BLOCKS = 16  # of the scored spots, whose scatter says how sure a difference is
 _TIE_ERRORS = 2.0  # standard errors of the difference within which two arms are equally good
-_LIMIT_QUANTILE = 0.99  # of the iterations that denoising took, for the limit
-_LIMIT_STEP, _SMALLEST_LIMIT = 5, 10
 _OUTLIER_PX = 1.0
 _ERROR_TOLERANCE = 0.05  # of the standard errors, below which they need no factor
 _TRAINING_SHARE = 0.75  # of the scored spots, to train each class on
@@ -121,7 +119,6 @@ class _Scored:
     statistics: SlopeStatistics
     blocks: Floats
     """Logarithm of the gain-corrected rms of each block of spots."""
-    cost: float
 
 
 class _Steps:
@@ -189,12 +186,6 @@ def _chosen_and_scored(
 
     choice = _best_choice(workshop.axes(arm, flux_e), along)
     settings, parts = workshop.settings(arm, choice), workshop.parts(arm, choice)
-    cost = arm.cost
-    if arm.name == "tv":
-        iterations = scene.measure(choosing, settings).iterations
-        limit = _LIMIT_STEP * math.ceil(np.quantile(iterations, _LIMIT_QUANTILE) / _LIMIT_STEP)
-        settings = settings.replace(max_iterations=max(limit, _SMALLEST_LIMIT))
-        cost += COST_OF_TV_ITERATION * float(np.minimum(iterations, limit).mean())
     scale = _error_scale(scene.measure(choosing, settings, **parts), choosing.truth)
     settings = settings.replace(error_scale=scale)
     slopes = scene.measure(scoring, settings, **parts)
@@ -204,7 +195,6 @@ def _chosen_and_scored(
         absolute_errors(slopes.x, slopes.y, scoring.truth).ravel(),
         slope_statistics(slopes.x, slopes.y, scoring.truth),
         _by_blocks(slopes, scoring.truth),
-        cost,
     )
 
 
@@ -272,7 +262,7 @@ def _answer(
         own, curve = scored[arm.name][star], curves[arm.name]
         results.append(
             ArmResult(
-                arm=replace(arm, cost=own.cost),
+                arm=arm,
                 settings=own.settings,
                 statistics=own.statistics,
                 curve=curve,

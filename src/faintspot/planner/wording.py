@@ -8,7 +8,6 @@ from typing import Any
 
 from faintspot.planner.answer import Answer, ArmResult
 from faintspot.planner.arms import SPOT
-from faintspot.presets import of_denoising
 from faintspot.sensor.settings import Settings
 from faintspot.study.metric import Estimate
 
@@ -49,12 +48,11 @@ def settings_in_words(settings: Settings) -> str:
     pairs = [f'estimator "{settings.estimator}"']
     if settings.estimator == "cog" and not settings.denoise:
         pairs.append("denoise false")
+    if denoises and settings.preset != "accurate":
+        pairs.append(f'preset "{settings.preset}"')
     for name in _SHOWN:
         value = getattr(settings, name)
-        if name in _ONLY_OF_TV and value is None:
-            value = of_denoising(settings.preset)[name]
-        wanted = denoises if name in _ONLY_OF_TV else value != defaults[name]
-        if wanted and value is not None:
+        if value is not None and (denoises if name in _ONLY_OF_TV else value != defaults[name]):
             pairs.append(f"{name} {value:g}")
     return ", ".join(pairs)
 
