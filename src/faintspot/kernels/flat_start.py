@@ -104,27 +104,43 @@ def _transform_back(lanes: Any, rows: Any, nx: Any, table: Any, source: Any, to:
     """Turn the cosine transform of a row back into the row."""
     width = width_of(lanes)
     zero, half = splat(lanes, 0.0), (nx + 1) // 2
-    for i in range(half):
-        even, odd = zero, zero
-        even_next, odd_next = zero, zero  # sums that do not wait for each other
-        k = 0
-        while k + 3 < nx:
+    i = 0
+    while i + 3 < half:  # four at a time, as above
+        a, b, c, d, e, f, g, h = zero, zero, zero, zero, zero, zero, zero, zero
+        for k in range(0, nx, 2):
             entry, place = k * half + i, source + k * width
-            even = _product(lanes, table, entry, rows, place, even)
-            odd = _product(lanes, table, entry + half, rows, place + width, odd)
-            even_next = _product(lanes, table, entry + 2 * half, rows, place + 2 * width, even_next)
-            odd_next = _product(lanes, table, entry + 3 * half, rows, place + 3 * width, odd_next)
-            k += 4
-        while k < nx:
+            a = _product(lanes, table, entry, rows, place, a)
+            b = _product(lanes, table, entry + 1, rows, place, b)
+            c = _product(lanes, table, entry + 2, rows, place, c)
+            d = _product(lanes, table, entry + 3, rows, place, d)
+            if k + 1 < nx:
+                entry, place = entry + half, place + width
+                e = _product(lanes, table, entry, rows, place, e)
+                f = _product(lanes, table, entry + 1, rows, place, f)
+                g = _product(lanes, table, entry + 2, rows, place, g)
+                h = _product(lanes, table, entry + 3, rows, place, h)
+        _store_mirrored(lanes, rows, nx, to, i, a, e)
+        _store_mirrored(lanes, rows, nx, to, i + 1, b, f)
+        _store_mirrored(lanes, rows, nx, to, i + 2, c, g)
+        _store_mirrored(lanes, rows, nx, to, i + 3, d, h)
+        i += 4
+    while i < half:
+        even, odd = zero, zero
+        for k in range(0, nx, 2):
             entry, place = k * half + i, source + k * width
             even = _product(lanes, table, entry, rows, place, even)
             if k + 1 < nx:
                 odd = _product(lanes, table, entry + half, rows, place + width, odd)
-            k += 2
-        even, odd = even + even_next, odd + odd_next
-        store(rows, to + i * width, even + odd)
-        if 2 * i != nx - 1:
-            store(rows, to + (nx - 1 - i) * width, even - odd)
+        _store_mirrored(lanes, rows, nx, to, i, even, odd)
+        i += 1
+
+
+@inlined
+def _store_mirrored(lanes: Any, rows: Any, nx: Any, to: Any, i: Any, even: Any, odd: Any) -> None:
+    """Store pixel i of a row and its mirror image; in the middle of a row, what is odd is zero."""
+    width = width_of(lanes)
+    store(rows, to + (nx - 1 - i) * width, even - odd)
+    store(rows, to + i * width, even + odd)
 
 
 @compiled
