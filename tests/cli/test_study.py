@@ -113,3 +113,12 @@ def test_report_of_a_study(folder: Path, run: Commands) -> None:
     assert "small" in page
     assert "2 of 2" in page
     run.refused("report", "my-study.zarr", "my-study.zarr", naming=("my-study.zarr",))
+
+
+def test_device(folder: Path, run: Commands) -> None:
+    Path("my-study.toml").write_text(SMALL)
+    run.refused("study", "run", "my-study.toml", "--device", "tpu", naming=("device = 'tpu'", "'cuda'"))
+    both = ("--device", "cuda", "--scheduler", "tcp://localhost:1")
+    run.refused("study", "run", "my-study.toml", *both, naming=("scheduler", "not on a cluster"))
+    assert not Path("my-study.zarr").exists()
+    run.ok("study", "run", "my-study.toml", "--device", "cpu", "--workers", 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -16,43 +17,47 @@ class _Device:
     compute_capability = HOPPER
 
 
-def assembly(window: tuple[int, int], before: int, algorithm: int, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Compile a kernel for frames of uint16 to the GPU's intermediate language."""
+def array(kind: Any, dimensions: int) -> Any:
+    """Numba's type of a contiguous array."""
+    from numba.cuda import types
+
+    return types.Array(getattr(types, kind), dimensions, "C")
+
+
+def assembly(make: Callable[[], Any], arguments: list[Any], monkeypatch: pytest.MonkeyPatch) -> str:
+    """Compile a kernel to the GPU's intermediate language."""
     pytest.importorskip("numba_cuda", reason="needs the extra gpu")
     from numba import cuda
     from numba.cuda import dispatcher, types
 
     from faintspot.cuda.availability import simulated
-    from faintspot.cuda.fused import slopes_kernel
 
     if simulated():
         pytest.skip("the simulator compiles nothing")
     if not cuda.is_available():  # otherwise the GPU that is here decides
         monkeypatch.setattr(dispatcher, "get_current_device", _Device)
-
-    def array(kind: Any, dimensions: int) -> Any:
-        return types.Array(kind, dimensions, "C")
-
-    real, whole = types.float32, types.int32
-    signature = (
-        array(types.uint16, 2),
-        whole,
-        array(whole, 1),
-        array(real, 2),
-        real,
-        array(real, 3),
-        array(whole, 1),
-        array(real, 3),
-        array(real, 3),
-        array(whole, 3),
-        array(types.uint8, 2),
-    )
-    kernel = slopes_kernel(window, before, algorithm).py_func
+    kinds = [getattr(types, each) if isinstance(each, str) else array(*each) for each in arguments]
     try:
-        text, _ = cuda.compile(kernel, signature, device=False, abi="numba", cc=HOPPER)
+        text, _ = cuda.compile(make().py_func, tuple(kinds), device=False, abi="numba", cc=HOPPER)
     except (ImportError, OSError, RuntimeError) as error:
         pytest.skip(f"needs NVIDIA's compiler library: {error}")
     return str(text)
+
+
+SLOPES: list[Any] = [
+    ("uint16", 2),
+    "int32",
+    ("int32", 1),
+    ("float32", 2),
+    "float32",
+    ("float32", 3),
+    ("int32", 1),
+    ("float32", 3),
+    ("float32", 1),
+    ("float32", 3),
+    ("int32", 3),
+    ("uint8", 2),
+]
 
 
 def linked(text: str) -> str:
@@ -68,17 +73,36 @@ def linked(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("window", "before", "algorithm"),
+    ("window", "before", "algorithm", "flat"),
     [
-        ((8, 8), DENOISE, FGP),
-        ((16, 16), DENOISE, FGP),
-        ((10, 10), SMOOTH, CHAMBOLLE),
+        ((16, 16), DENOISE, FGP, True),
+        ((16, 16), DENOISE, FGP, False),
+        ((10, 10), SMOOTH, CHAMBOLLE, False),
     ],
 )
 def test_nothing_spills(
-    window: tuple[int, int], before: int, algorithm: int, monkeypatch: pytest.MonkeyPatch
+    window: tuple[int, int], before: int, algorithm: int, flat: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = assembly(window, before, algorithm, monkeypatch)
+    pytest.importorskip("numba_cuda", reason="needs the extra gpu")
+    from faintspot.cuda.fused import slopes_kernel
+
+    text = assembly(lambda: slopes_kernel(window, before, algorithm, flat), SLOPES, monkeypatch)
     assert "__local_depot" not in text
     assert ".f64 \t" not in text  # no double precision, which small GPUs do 64 times slower
     assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in linked(text)
+
+
+def test_studies_spill_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Positions for every k, after the denoising; drawing. Double precision there is on purpose."""
+    pytest.importorskip("numba_cuda", reason="needs the extra gpu")
+    from faintspot.cuda import drawing, every_k
+
+    tables = [("float32", 3), ("uint8", 2)]
+    positions = [("float32", 3), "float32", "float32", "int32", ("float32", 2), "float64", "float64", *tables]
+    text = assembly(lambda: every_k.positions_kernel(16, every_k.DENOISE, 0), positions, monkeypatch)
+    assert "__local_depot" not in text
+    assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in linked(text)
+    spots = [("uint64", 1), "int64", "float64", ("float32", 2), ("float32", 1), "float64", "float64"]
+    images = [("float32", 2), ("float64", 2)]
+    drawn = linked(assembly(lambda: drawing.drawing_kernel(16), [*spots, *images], monkeypatch))
+    assert "0 bytes spill stores, 0 bytes spill loads" in drawn

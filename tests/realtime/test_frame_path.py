@@ -140,3 +140,13 @@ def test_light_must_be_known_beforehand() -> None:
     automatic = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
     with pytest.raises(fs.InputError, match=r"settings\.flux_e"):
         FramePath(fs.SlopePipeline(LAYOUT, automatic, NOISE), source.slots, source.progress)
+
+
+def test_a_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rather than silently measured on the CPU."""
+    source, work = Source(), pipeline("plain")
+    monkeypatch.setattr(work, "device", "cuda")
+    monkeypatch.setattr(work, "on_device", object())
+    with pytest.raises(fs.InputError, match=r"measures on the CPU; .*faintspot\.cuda\.FrameStream") as raised:
+        FramePath(work, source.slots, source.progress)
+    assert "\n" not in str(raised.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,12 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--workers",
             type=click.IntRange(0),
             metavar="N",
-            help="Processes on this machine. Default: all processors. 0: this process, without Dask.",
+            help="Processes on this machine. Default: all processors. 0: this process alone.",
+        ),
+        click.option(
+            "--device",
+            metavar="NAME",
+            help="cpu or cuda: an NVIDIA GPU. Default: what the specification says, else cpu.",
         ),
         click.option(
             "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use instead: tcp://HOST:PORT."
@@ -58,7 +64,12 @@ def command() -> None:
 )
 @_run_options
 def run(
-    specification: str, output: str | None, scheduler: str | None, workers: int | None, overwrite: bool
+    specification: str,
+    output: str | None,
+    device: str | None,
+    scheduler: str | None,
+    workers: int | None,
+    overwrite: bool,
 ) -> None:
     """Run a study of your own.
 
@@ -72,12 +83,13 @@ def run(
     Examples:
       faintspot study run my-study.toml -o my-study.zarr
       faintspot study run my-study.toml --scheduler tcp://head-node:8786
+      faintspot study run my-study.toml --device cuda
     """
     from faintspot.study.specification import StudySpecification
 
     described = StudySpecification.from_file(specification)
     target = output or str(Path(specification).with_suffix(".zarr"))
-    _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
@@ -97,6 +109,7 @@ def paper(
     quick: bool,
     figures: tuple[str, ...],
     output: str | None,
+    device: str | None,
     scheduler: str | None,
     workers: int | None,
     overwrite: bool,
@@ -116,7 +129,7 @@ def paper(
 
     described = study_of_paper.specification(quick, figures or None)
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
-    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    results = _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = Path(target).with_suffix(".html")
     study_of_paper.report(results, page)
     click.echo(f"{page}: open it in a browser")
@@ -136,6 +149,7 @@ def estimators(
     quick: bool,
     output: str | None,
     table: str | None,
+    device: str | None,
     scheduler: str | None,
     workers: int | None,
     overwrite: bool,
@@ -156,7 +170,7 @@ def estimators(
 
     described = study_of_estimators.specification(quick)
     target = output or f"estimators{'-quick' if quick else ''}.zarr"
-    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    results = _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = Path(target).with_suffix(".html")
     study_of_estimators.report(results, page)
     click.echo(f"{page}: open it in a browser")
@@ -167,10 +181,14 @@ def estimators(
         click.echo(f"{table}: tables")
 
 
-def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:
+def _measure(
+    described: StudySpecification, target: str, device: str | None, **options: Any
+) -> xarray.Dataset:
     """Run a study with a progress bar."""
     from faintspot.study.running import run as run_study
 
+    if device is not None:
+        described = replace(described, device=device)
     realisations, measured = described.realisations, 0
 
     def advance_by_cells(finished: int, total: int) -> None:

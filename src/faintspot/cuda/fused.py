@@ -22,6 +22,7 @@ from faintspot.cuda.brightest import (
     make_threshold,
 )
 from faintspot.cuda.compiling import device, kernel
+from faintspot.cuda.flat_start import pitch_of
 from faintspot.cuda.gather import make_fill, make_gather, make_recall, make_share, make_smooth
 from faintspot.cuda.strips import WARP, Strips, strips_of
 from faintspot.cuda.total_variation import make_denoise
@@ -139,13 +140,16 @@ def make_locate(strips: Strips) -> Any:
 
 
 @cache
-def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: int = WARPS) -> Any:
+def slopes_kernel(
+    window: tuple[int, int], before: int, algorithm: int, flat: bool = False, warps: int = WARPS
+) -> Any:
     """Return the kernel for a window (ny, nx).
 
     Launch it with `warps` * 32 threads a block; blocks along x are a frame's, along y the frames. It takes
     frames (n_frames, h * w) uint16 or float32; w and places (n,), each window's first pixel, both int32;
     maps of dark and electrons per ADU (2, h * w), saturation, tables (n_variants, rows, n) and taps
-    (n, 2, 1 + reach), all float32; variants (n_frames,) int32; and writes numbers (5, n_frames, n) float32,
+    (n, 2, 1 + reach), inverse pivots (h * w,), of which `flat` asks (`faintspot.kernels.flat_start`), all
+    float32; variants (n_frames,) int32; and writes numbers (5, n_frames, n) float32,
     counts (2, n_frames, n) int32 and flags (n_frames, n) uint8.
 
     Raises
@@ -157,9 +161,10 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: i
     ny, nx, rows, threads, last = strips.ny, strips.nx, strips.rows, strips.threads, strips.strips - 1
     centre_x, centre_y = 0.5 * (nx - 1), 0.5 * (ny - 1)
     full = strips.full
+    pitch, flat_rows = pitch_of(nx), ny if flat else 1
     planes = 3 if before == SMOOTH else 2
     gather, share, fill = make_gather(strips), make_share(strips), make_fill(strips)
-    recall, smooth, denoise = make_recall(strips), make_smooth(strips), make_denoise(strips, algorithm)
+    recall, smooth, denoise = make_recall(strips), make_smooth(strips), make_denoise(strips, algorithm, flat)
     locate, store = make_locate(strips), make_store(strips)
 
     @kernel
@@ -172,6 +177,7 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: i
         tables: Any,
         variants: Any,
         taps: Any,
+        pivots: Any,
         numbers: Any,
         counts: Any,
         flags: Any,
@@ -197,6 +203,7 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: i
             recall(scratch, top, column, present, image)
             share(image, top, column, present, tile)
         iterations, converged, infeasible = int32(0), True, False
+        plane = cuda.shared.array((warps, flat_rows, pitch), float32)[block_warp]
         if before == DENOISE:
             iterations, converged, infeasible = denoise(
                 image,
@@ -207,6 +214,8 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: i
                 table[STRENGTH, s],
                 table[TOLERANCE, s],
                 int32(table[LIMIT, s]),
+                plane,
+                pivots,
             )
         elif before == SMOOTH:
             smoothed = tiles[planes - 1, block_warp]
@@ -215,7 +224,8 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: i
         away = (float32(column) - float32(centre_x), float32(top) - float32(centre_y))
         brightest, found, errors = locate(image, tile, table, s, top, column, present, away)
         if lane == 0:
-            bits = judge(bad, saturated, table[MOST_BAD, s], converged, infeasible)
+            settled = converged or table[TOLERANCE, s] <= float32(0.0)  # without a tolerance, nothing fails
+            bits = judge(bad, saturated, table[MOST_BAD, s], settled, infeasible)
             counts[ITERATIONS, f, s] = iterations
             counts[BAD_COUNT, f, s] = int32(bad)
             store(table, f, s, bits, brightest, found, errors, numbers, flags)

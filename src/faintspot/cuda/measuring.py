@@ -9,6 +9,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import DTypeLike, NDArray
 
+from faintspot.cuda.flat_start import inverse_pivots
 from faintspot.cuda.fused import (
     BAD_COUNT,
     ERROR_X,
@@ -127,7 +128,8 @@ class DevicePipeline:
         self.calibration = calibration
         self._preparation = preparation
         algorithm = ALGORITHMS[settings.algorithm]
-        self._kernel = slopes_kernel(layout.window, preparation.before, algorithm)
+        flat = preparation.start.size > 0
+        self._kernel = slopes_kernel(layout.window, preparation.before, algorithm, flat)
         height, line = layout.frame_shape
         if height * line > MOST_FRAME_PIXELS:
             raise InputError(
@@ -139,6 +141,7 @@ class DevicePipeline:
         maps = np.asarray(calibration.maps(layout.frame_shape), np.float32)
         self._maps = cuda.to_device(np.ascontiguousarray(maps.reshape(2, -1)))
         self._taps = cuda.to_device(np.ascontiguousarray(preparation.taps, np.float32))
+        self._pivots = cuda.to_device(inverse_pivots(layout.window) if flat else np.zeros(1, np.float32))
         self._tables: tuple[NDArray[np.float32], Any] | None = None
         self._first_variants = cuda.to_device(np.zeros(1, np.int32))
 
@@ -229,6 +232,7 @@ class DevicePipeline:
             self._tables_on_device(),
             variants,
             self._taps,
+            self._pivots,
             results.numbers,
             results.counts,
             results.flags,

@@ -22,6 +22,7 @@ from numba import cuda, float32, int32
 
 from faintspot.cuda import warp
 from faintspot.cuda.compiling import device
+from faintspot.cuda.flat_start import FIRST_AGE, make_start_flat
 from faintspot.cuda.strips import WARP, Strips
 from faintspot.kernels.sweeps import CHAMBOLLE_STEP, FGP_STEP
 from faintspot.kernels.total_variation import CHAMBOLLE, CHECK_INTERVAL, FGP, FIRST_MULTIPLIER
@@ -143,17 +144,25 @@ def make_change(strips: Strips, algorithm: int) -> Any:
 
 def make_iterations(strips: Strips, algorithm: int) -> Any:
     """Return the function that iterates on p and q until the image has converged or the limit is reached."""
-    pixels = strips.ny * strips.nx
     sweep, has_converged = make_sweep(strips, algorithm), make_change(strips, algorithm)
 
     @device
     def iterate(
-        q: Any, p: Any, g: Any, lane: Any, in_row: Any, in_last: Any, radius: Any, tolerance: Any, limit: Any
+        q: Any,
+        p: Any,
+        g: Any,
+        lane: Any,
+        in_row: Any,
+        in_last: Any,
+        inverse: Any,
+        age: Any,
+        radius: Any,
+        tolerance: Any,
+        limit: Any,
     ) -> Any:
-        """Return the number of iterations and whether they converged."""
+        """`inverse`: 1 / lambda; `age`: the momentum's. Return the iterations and whether they converged."""
         inverse_radius = float32(1.0) / radius
-        inverse = first_inverse_multiplier(pixels, radius)
-        age, momentum = float32(1.0), float32(0.0)
+        momentum = float32(0.0)
         converged, check_after = False, float32(CHECK_INTERVAL)
         iteration, last, until_check = float32(0.0), float32(limit), check_after  # no 64-bit integers
         while iteration < last and not converged:
@@ -198,12 +207,43 @@ def make_normalise(strips: Strips) -> Any:
     return normalise
 
 
-def make_denoise(strips: Strips, algorithm: int) -> Any:
-    """Return the function that denoises an image, (rows,) per thread, in place."""
+def make_start(strips: Strips, flat: bool) -> Any:
+    """Return the function that writes the first p and q and returns the first 1 / lambda."""
+    if flat:
+        return make_start_flat(strips)
+    rows, pixels = strips.rows, strips.ny * strips.nx
+
+    @device
+    def start_at_zero(
+        g: Any,
+        plane: Any,
+        pivots: Any,
+        lane: Any,
+        present: Any,
+        in_row: Any,
+        in_last: Any,
+        radius: Any,
+        p: Any,
+        q: Any,
+    ) -> Any:
+        for r in range(rows):
+            for axis in range(2):
+                p[axis, r] = q[axis, r] = float32(0.0)
+        return first_inverse_multiplier(pixels, radius)
+
+    return start_at_zero
+
+
+def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
+    """Return the function that denoises an image, (rows,) per thread, in place.
+
+    `flat`: whether it begins at the flat solution's dual field, else at zero.
+    """
     rows, pixels = strips.rows, strips.ny * strips.nx
     normalise, divergence = make_normalise(strips), make_divergence(strips)
-    iterate = make_iterations(strips, algorithm)
+    start, iterate = make_start(strips, flat), make_iterations(strips, algorithm)
     chambolle = algorithm == CHAMBOLLE
+    first_age = FIRST_AGE if flat else 1.0
 
     @device
     def denoise(
@@ -215,8 +255,13 @@ def make_denoise(strips: Strips, algorithm: int) -> Any:
         strength: Any,
         tolerance: Any,
         limit: Any,
+        plane: Any,
+        pivots: Any,
     ) -> Any:
-        """Return the number of iterations, and whether they converged and the strength is infeasible."""
+        """`plane` and `pivots`: see `make_laplace`; used where the start is flat.
+
+        Return the number of iterations, and whether they converged and the strength is infeasible.
+        """
         g = cuda.local.array(rows, float32)
         mean, scale, squares = normalise(image, present, g)
         if scale <= float32(0.0):
@@ -232,10 +277,10 @@ def make_denoise(strips: Strips, algorithm: int) -> Any:
         if limit <= 0:
             return int32(0), False, False
         p, q = cuda.local.array((2, rows), float32), cuda.local.array((2, rows), float32)
-        for r in range(rows):
-            for axis in range(2):
-                p[axis, r] = q[axis, r] = float32(0.0)
-        iterations, converged = iterate(q, p, g, lane, in_row, in_last, radius, tolerance, limit)
+        inverse = start(g, plane, pivots, lane, present, in_row, in_last, radius, p, q)
+        iterations, converged = iterate(
+            q, p, g, lane, in_row, in_last, inverse, float32(first_age), radius, tolerance, limit
+        )
         d = cuda.local.array(rows, float32)
         if chambolle:
             divergence(q, lane, d)

@@ -229,11 +229,16 @@ class FramePath:
                     f"stream: expected contiguous frames of {shape}, uint16 or float32, "
                     f"got {slot.shape} {slot.dtype}"
                 )
-        check_light_is_known(self.pipeline)
+        check_real_time(self.pipeline)
 
 
-def check_light_is_known(pipeline: SlopePipeline) -> None:
-    """Refuse settings that follow the light of a frame, which is not known before its last row."""
+def check_real_time(pipeline: SlopePipeline) -> None:
+    """Refuse a GPU, and settings that follow the light of a frame, which is not known before its last row."""
+    if pipeline.on_device is not None:
+        raise InputError(
+            f"pipeline: device = {pipeline.device!r}, but the real-time engine measures on the CPU; leave "
+            "device out, or measure frames on the GPU with faintspot.cuda.FrameStream"
+        )
     if pipeline.needs_light:
         raise InputError(
             "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "

@@ -18,7 +18,7 @@ from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.kernels import fused
 from faintspot.pipeline import SlopePipeline, Slopes
 from faintspot.realtime.built_in import BuiltIn
-from faintspot.realtime.frame_path import check_light_is_known
+from faintspot.realtime.frame_path import check_real_time
 from faintspot.realtime.module_loading import STAGES, Module, StageFunction, one_line
 from faintspot.realtime.module_trial import trial_frames, typical_frame
 from faintspot.realtime.time_limit import call_within
@@ -62,7 +62,7 @@ class ModularPipeline:
     def __init__(
         self, pipeline: SlopePipeline, modules: Mapping[str, Module], *, budget_s: float | None = None
     ) -> None:
-        check_light_is_known(pipeline)
+        check_real_time(pipeline)
         for stage, module in modules.items():
             if stage != module.stage:
                 raise InputError(f"{title_of(module)}: expected one for {stage!r}")

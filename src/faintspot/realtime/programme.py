@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.pipeline import SlopePipeline, Slopes
-from faintspot.realtime.frame_path import FramePath, Progress, check_light_is_known
+from faintspot.realtime.frame_path import FramePath, Progress, check_real_time
 from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.modular import ModularPipeline
 from faintspot.realtime.modular_path import ModularPath
@@ -151,7 +151,7 @@ class Programmes:
             for arm in self._interleaving.arms
         ]
         for each in pipelines:
-            check_light_is_known(each)
+            check_real_time(each)
         programme = Programme(pipelines, self.modules, self._workers, self._budget_s)
         ring = self.ring
         if ring is not None:

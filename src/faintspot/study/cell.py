@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 from faintspot.simulate import subapertures
-from faintspot.study.arms import Images, position_table
+from faintspot.study.arms import Images
 from faintspot.study.estimator_arms import EstimatorArms, detector_of
 from faintspot.study.metric import OUTLIER_PX, slope_statistics
 from faintspot.study.specification import (
@@ -26,13 +26,12 @@ from faintspot.study.specification import (
     StudySpecification,
 )
 from faintspot.study.sweep import Cell
+from faintspot.study.tables import Block, Floats, HostTables, Tables, errors_of
 from faintspot.study.tuning import Choice, Tuning
 
 _BLOCK_PIXELS = 1 << 18  # small enough for the processor's cache
 _STACK_PIXELS = 1 << 21  # that an estimator measures at once
 
-Floats = NDArray[np.float64]
-Block = tuple[Images, Floats]
 
 STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
 """Variables beside R that are made with their standard errors, from `slope_statistics`."""
@@ -55,19 +54,43 @@ def realisations(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[B
             detector=detector,
             rng=rng,
         )
-        yield images - np.float32(cell.background_e), truth
+        yield Block(images - np.float32(cell.background_e), truth)
 
 
-def _stacks(blocks: Iterator[Block]) -> Iterator[list[Block]]:
-    """Yield several blocks at a time."""
-    stack: list[Block] = []
-    for block in blocks:
-        stack.append(block)
-        if sum(images.size for images, _ in stack) >= _STACK_PIXELS:
+class _Source:
+    """Blocks of a cell's images, and the tables that measure them, on the CPU or on a GPU."""
+
+    def __init__(self, cell: Cell, specification: StudySpecification) -> None:
+        self._cell, self._seed = cell, specification.seed
+        self._rng = np.random.default_rng(cell.seed(specification.seed))
+        self._on_device: Any = None
+        search, self._drawn = specification.search_range_of(cell), 0
+        self.tables: Tables = HostTables(cell, search)
+        if specification.device == "cuda":
+            from faintspot.study import on_device
+
+            self._on_device = on_device
+            self.tables = on_device.DeviceTables(cell, search)
+
+    def stacks(self, count: int) -> Iterator[list[Any]]:
+        """Yield the next images, several blocks at a time."""
+        stack: list[Any] = []
+        for block in self._blocks(count):
+            stack.append(block)
+            if sum(len(each.truth) for each in stack) * self._cell.pixels**2 >= _STACK_PIXELS:
+                yield stack
+                stack = []
+        if stack:
             yield stack
-            stack = []
-    if stack:
-        yield stack
+
+    def _blocks(self, count: int) -> Iterator[Any]:
+        if self._on_device is None:
+            yield from realisations(self._cell, count, self._rng)
+        elif self._on_device.draws(self._cell):
+            yield from self._on_device.realisations(self._cell, self._seed, self._drawn, count)
+        else:
+            yield from map(self._on_device.brought, realisations(self._cell, count, self._rng))
+        self._drawn += count
 
 
 def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDArray[Any]]:
@@ -84,34 +107,39 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
         The variables of the study's dataset for this cell, see `faintspot.study.store.VARIABLES`, without
         the dimension cell; K = pixels^2 - 1. NaN in modes that keep more pixels than the window can.
     """
-    rng = np.random.default_rng(cell.seed(specification.seed))
+    return results_of(cell, specification, score_cell(cell, specification))
+
+
+def score_cell(cell: Cell, specification: StudySpecification) -> Scores:
+    """Choose each arm's settings on the first half of a cell's images, measure the second half with them."""
     half = specification.realisations // 2
-    search = specification.search_range_of(cell)
-    tuning, estimators = Tuning(cell, specification), None
-    for stack in _stacks(realisations(cell, half, rng)):
+    source, estimators = _Source(cell, specification), None
+    tuning = Tuning(cell, specification, source.tables)
+    for stack in source.stacks(half):
         if estimators is None:
-            light = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
-            estimators = EstimatorArms(cell, specification.seed, search, float(light.mean()))
+            estimators = _estimators(cell, specification, stack)
         tuning.add(stack, estimators)
     assert estimators is not None
-    scores = _Scores(cell, tuning.choices(), estimators, search)
-    for stack in _stacks(realisations(cell, specification.realisations - half, rng)):
-        scores.add(stack)
-    return _results(cell, specification, scores)
+    scores = Scores(tuning.choices())
+    for stack in source.stacks(specification.realisations - half):
+        scores.add(stack, source.tables, estimators)
+    return scores
 
 
-class _Scores:
+def _estimators(cell: Cell, specification: StudySpecification, stack: list[Any]) -> EstimatorArms:
+    """Return the arms that know the spot, and the mean light of images that they are told."""
+    light_e = 0.0
+    if set(specification.arms) & set(ESTIMATOR_ARMS):  # else images may stay where they are
+        light = np.concatenate([block.images.sum(axis=(1, 2), dtype=np.float64) for block in stack])
+        light_e = float(light.mean())
+    return EstimatorArms(cell, specification.seed, specification.search_range_of(cell), light_e)
+
+
+class Scores:
     """Positions with the chosen settings, stack after stack."""
 
-    def __init__(
-        self,
-        cell: Cell,
-        choices: dict[tuple[str, str], Choice],
-        estimators: EstimatorArms,
-        search_range_px: float,
-    ) -> None:
+    def __init__(self, choices: dict[tuple[str, str], Choice]) -> None:
         self.choices = choices
-        self._cell, self._estimators, self._search_range_px = cell, estimators, search_range_px
         self._truth: list[Floats] = []
         self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
         self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
@@ -123,23 +151,26 @@ class _Scores:
         """True positions (n, 2), px."""
         return np.concatenate(self._truth)
 
-    def add(self, blocks: list[Block]) -> None:
+    def add(self, blocks: list[Any], tables: Tables, estimators: EstimatorArms) -> None:
         """Score images."""
-        self._truth += [truth for _, truth in blocks]
+        self._truth += [block.truth for block in blocks]
         for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
             if arm in ESTIMATOR_ARMS:
-                self._add_estimator(arm, candidate, np.concatenate([images for images, _ in blocks]))
+                images = np.concatenate([block.images for block in blocks])
+                self._add_estimator(arm, candidate, images, estimators)
             else:
-                for images, truth in blocks:
-                    self._add_table(arm, candidate, images, truth)
+                for block in blocks:
+                    self._add_table(arm, candidate, block, tables)
 
     def _modes(self, arm: str, candidate: Candidate) -> list[str]:
         """Modes in which an arm chose a candidate."""
         same = (arm, candidate)
         return [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
 
-    def _add_estimator(self, arm: str, candidate: Candidate, images: Images) -> None:
-        slopes = self._estimators.measure(arm, candidate, images)
+    def _add_estimator(
+        self, arm: str, candidate: Candidate, images: Images, estimators: EstimatorArms
+    ) -> None:
+        slopes = estimators.measure(arm, candidate, images)
         modes = self._modes(arm, candidate)
         for mode in modes:
             self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
@@ -148,16 +179,15 @@ class _Scores:
             stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
             self._stated.setdefault(arm, []).append(stated.astype(np.float64))
 
-    def _add_table(self, arm: str, candidate: Any, images: Images, truth: Floats) -> None:
-        positions, valid = position_table(arm, candidate, self._cell, images, self._search_range_px)
-        for mode in self._modes(arm, candidate):
-            column = self.choices[arm, mode].column
-            self._positions[arm, mode].append(positions[:, column].copy())
-            self._valid[arm, mode].append(valid[:, column].copy())
-            if mode == BEST and arm in KEEPING_ARMS:
-                errors = _errors(positions, truth[:, None])
-                sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
-                self.sums[arm] = self.sums.get(arm, 0.0) + sums
+    def _add_table(self, arm: str, candidate: Any, block: Any, tables: Tables) -> None:
+        modes = self._modes(arm, candidate)
+        columns = [self.choices[arm, mode].column for mode in modes]
+        scored = tables.scored(arm, candidate, block, columns)
+        for i, mode in enumerate(modes):
+            self._positions[arm, mode].append(scored.positions[:, i])
+            self._valid[arm, mode].append(scored.valid[:, i])
+        if BEST in modes and arm in KEEPING_ARMS:
+            self.sums[arm] = self.sums.get(arm, 0.0) + scored.sums
 
     def positions(self, arm: str, mode: str) -> Floats:
         """Return the positions of all realisations, (n, 2) px."""
@@ -172,13 +202,7 @@ class _Scores:
         return np.concatenate(self._stated[arm]) if arm in self._stated else None
 
 
-def _errors(positions: Floats, truth: Floats) -> Floats:
-    """(|dx| + |dy|) / 2, to the precision of `faintspot.study.arms.error_table`."""
-    errors: NDArray[np.float32] = np.abs(positions - truth).mean(axis=-1).astype(np.float32)
-    return errors.astype(np.float64)
-
-
-def _results(cell: Cell, specification: StudySpecification, scores: _Scores) -> dict[str, NDArray[Any]]:
+def results_of(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
     """Arrange choices and scores as the dataset has them."""
     arms, modes, truth = specification.arms, specification.modes, scores.truth
     names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]
@@ -189,7 +213,7 @@ def _results(cell: Cell, specification: StudySpecification, scores: _Scores) -> 
         if (arms[0], mode) not in scores.choices:
             continue
         positions = [scores.positions(arm, mode) for arm in arms]
-        errors = np.stack([_errors(part, truth) for part in positions])
+        errors = np.stack([errors_of(part, truth) for part in positions])
         covariance = _covariance_of_means(errors)
         results["error"][:, j] = errors.mean(axis=1)
         results["error_se"][:, j] = np.sqrt(np.diag(covariance))
@@ -211,7 +235,7 @@ def _results(cell: Cell, specification: StudySpecification, scores: _Scores) -> 
     return results | _results_at_k(cell, arms, scores) | _against_the_bound(cell, results["error"])
 
 
-def _stated_over_actual(arms: Any, scores: _Scores) -> dict[str, NDArray[Any]]:
+def _stated_over_actual(arms: Any, scores: Scores) -> dict[str, NDArray[Any]]:
     """Root mean squares of stated standard errors and of errors: their ratio, without outliers and with."""
     without, whole = np.full((2, len(arms)), np.nan)
     for i, arm in enumerate(arms):
@@ -248,7 +272,7 @@ def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
     return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
 
 
-def _results_at_k(cell: Cell, arms: Any, scores: _Scores) -> dict[str, NDArray[Any]]:
+def _results_at_k(cell: Cell, arms: Any, scores: Scores) -> dict[str, NDArray[Any]]:
     """R and its standard error for every k, at the candidate of mode "best"."""
     errors, standard_errors = np.full((2, len(arms), cell.pixels**2 - 1), np.nan)
     count = len(scores.truth)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import logging
+import multiprocessing
 from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from faintspot.checks import number_between
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.kernels.parallel import available_cpus
-from faintspot.study.cell import measure_cell
+from faintspot.study.cell import measure_cell, results_of, score_cell
 from faintspot.study.specification import StudySpecification
 from faintspot.study.store import MemoryResults, StoredResults
 from faintspot.study.sweep import Cell
@@ -60,7 +62,8 @@ def run(
         Called with the number of cells measured in this run and the number to measure.
     workers : int, optional
         Processes of the cluster on this machine; all processors by default. 0 works in this process,
-        without Dask.
+        without Dask. Of a study on a GPU, which one process drives: processes (without Dask) that work out
+        the statistics of measured cells.
     overwrite : bool
         Replace the store, if it is one of a study.
     announce : callable, optional
@@ -74,14 +77,17 @@ def run(
     Raises
     ------
     InputError
-        When the store belongs to another study or cannot be written, or the scheduler is not to be reached.
+        When the store belongs to another study or cannot be written, or the scheduler is not to be reached;
+        for a study on a GPU without one, with a scheduler, or with images of more than 32 x 32 pixels.
     MissingExtraError
-        When Dask is needed and not installed.
+        When Dask or, for a GPU, numba-cuda is needed and not installed.
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
     if workers is not None:
         workers = int(number_between("workers", workers, 0, 10_000, integer=True))
+    if specification.device != "cpu":
+        _check_device(specification, scheduler)
     results: MemoryResults | StoredResults
     if store is None:
         results = MemoryResults(specification)
@@ -105,6 +111,9 @@ def _finished_cells(
     announce: Callable[[str], None],
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield index and results of every cell as it finishes."""
+    if specification.device != "cpu":
+        yield from _cells_on_device(specification, cells, workers, announce)
+        return
     if workers == 0 and scheduler is None:
         for index, cell in cells.items():
             yield index, measure_cell(cell, specification)
@@ -125,6 +134,47 @@ def _finished_cells(
             raise InputError(f"workers died repeatedly, perhaps of lack of memory: {error}") from None
         finally:
             client.cancel(list(futures))
+
+
+def _check_device(specification: StudySpecification, scheduler: str | None) -> None:
+    """Refuse a study that this machine's GPU cannot run."""
+    if scheduler is not None:
+        raise InputError(
+            f"scheduler = {scheduler!r}: device = {specification.device!r} works on this machine's GPU, "
+            "not on a cluster; leave one of both out"
+        )
+    from faintspot.cuda.availability import check_cuda
+    from faintspot.cuda.strips import strips_of
+
+    for cell in specification.cells():
+        strips_of((cell.pixels, cell.pixels))
+    check_cuda()
+
+
+def _cells_on_device(
+    specification: StudySpecification,
+    cells: dict[int, Cell],
+    workers: int | None,
+    announce: Callable[[str], None],
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Measure cell after cell on the GPU, while other processes work out the results of those before."""
+    processes = min(available_cpus() if workers is None else workers, len(cells))
+    if processes == 0:
+        for index, cell in cells.items():
+            yield index, results_of(cell, specification, score_cell(cell, specification))
+        return
+    announce(f"GPU, and {processes} processes for the statistics")
+    # A process that was forked could not go on with the driver's threads.
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        pending: dict[Future[dict[str, Any]], int] = {}
+        for index, cell in cells.items():
+            scores = score_cell(cell, specification)
+            pending[pool.submit(results_of, cell, specification, scores)] = index
+            patience_s = None if len(pending) > 2 * processes else 0.0
+            for future in wait(pending, patience_s, FIRST_COMPLETED).done:
+                yield pending.pop(future), future.result()
+        for future in as_completed(pending):
+            yield pending[future], future.result()
 
 
 def dask_distributed() -> Any:

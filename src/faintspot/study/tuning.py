@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.study.arms import Images, error_table, position_table
+from faintspot.study.arms import Images, error_table
 from faintspot.study.estimator_arms import EstimatorArms
 from faintspot.study.specification import (
     CORRECTED,
@@ -20,6 +20,7 @@ from faintspot.study.specification import (
     StudySpecification,
 )
 from faintspot.study.sweep import Cell
+from faintspot.study.tables import HostTables, Tables, moments_of
 
 Floats = NDArray[np.float64]
 Blocks = Iterable[tuple[Images, Floats]]
@@ -51,16 +52,6 @@ def mean_errors(
     return {arm: total / count for arm, total in sums.items()}
 
 
-def _moments(positions: Floats, truth: Floats) -> Floats:
-    """Sums that a regression of (n, K, 2) positions on the truth needs, (8, K)."""
-    x, y = positions[..., 0], positions[..., 1]
-    n, k = x.shape
-    whole = [n, *truth.sum(axis=0), np.square(truth).sum()]
-    own = [x.sum(axis=0), y.sum(axis=0), np.square(positions).sum(axis=(0, 2))]
-    across = (x * truth[:, :1]).sum(axis=0) + (y * truth[:, 1:]).sum(axis=0)
-    return np.stack([*(np.full(k, value) for value in whole), *own, across])
-
-
 def _corrected_rms(moments: Floats) -> Floats:
     """Root mean square of the residuals over the gain, as `faintspot.study.metric.slope_statistics`."""
     n, true_x, true_y, true_squares, x, y, squares, across = moments
@@ -84,32 +75,28 @@ def choose(arm: str, candidates: Sequence[Candidate], errors: Floats, kept: int 
 class Tuning:
     """Errors of all candidates on the first half of a cell's images, and what follows from them."""
 
-    def __init__(self, cell: Cell, specification: StudySpecification) -> None:
-        self._cell, self._modes = cell, specification.kept_pixels(cell)
+    def __init__(self, cell: Cell, specification: StudySpecification, tables: Tables | None = None) -> None:
+        self._modes = specification.kept_pixels(cell)
         self._candidates = {arm: specification.candidates(arm, cell) for arm in specification.arms}
-        self._search_range_px = specification.search_range_of(cell)
+        self._tables = HostTables(cell, specification.search_range_of(cell)) if tables is None else tables
         self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
         self._moments: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)
 
-    def add(self, blocks: list[tuple[Images, Floats]], estimators: EstimatorArms) -> None:
-        """Add images and their true positions."""
+    def add(self, blocks: list[Any], estimators: EstimatorArms) -> None:
+        """Add images and their true positions, in a form that the tables take."""
         for arm, candidates in self._candidates.items():
             if arm not in ESTIMATOR_ARMS:
-                for images, truth in blocks:
-                    self._add_tables(arm, candidates, images, truth)
+                for block in blocks:
+                    self._add_tables(arm, candidates, block)
             elif len(candidates) > 1:  # else there is nothing to choose
                 images, truth = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
                 self._add_estimator(arm, candidates, images, truth, estimators)
 
-    def _add_tables(self, arm: str, candidates: Sequence[Any], images: Images, truth: Floats) -> None:
-        where = (self._cell, images)
-        tables = (error_table(arm, c, *where, truth, self._search_range_px)[0] for c in candidates)
-        sums = np.stack([table.sum(axis=0, dtype=np.float64) for table in tables])
+    def _add_tables(self, arm: str, candidates: Sequence[Any], block: Any) -> None:
+        sums, moments = self._tables.sums(arm, candidates, block, moments=CORRECTED in self._modes)
         self._errors[arm] = self._errors[arm] + sums
-        if CORRECTED in self._modes:
-            positions = (position_table(arm, c, *where, self._search_range_px)[0] for c in candidates)
-            moments = [_moments(table, truth) for table in positions]
-            self._moments[arm] = self._moments[arm] + np.stack(moments, axis=1)
+        if moments is not None:
+            self._moments[arm] = self._moments[arm] + moments
 
     def _add_estimator(
         self,
@@ -123,7 +110,7 @@ class Tuning:
         positions = [np.stack([s.x, s.y], axis=-1).astype(np.float64) for s in slopes]
         sums = np.array([[np.abs(part - truth).mean(axis=1).sum()] for part in positions])
         self._errors[arm] = self._errors[arm] + sums
-        moments = [_moments(part[:, None], truth) for part in positions]
+        moments = [moments_of(part[:, None], truth) for part in positions]
         self._moments[arm] = self._moments[arm] + np.stack(moments, axis=1)
 
     def choices(self) -> dict[tuple[str, str], Choice]:

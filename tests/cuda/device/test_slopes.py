@@ -50,6 +50,26 @@ def test_algorithms_and_rules(algorithm: str, rule: str) -> None:
     assert_near(case, on_gpu(case), case.pipeline()(case.frame))
 
 
+@pytest.mark.parametrize(
+    ("window", "algorithm"), [((5, 7), "fgp"), ((5, 7), "chambolle"), ((8, 8), "fgp"), ((16, 16), "fgp")]
+)
+def test_preset_fast(window: tuple[int, int], algorithm: str) -> None:
+    """The denoising begins where the CPU's does; a strength near the image's own rms, where it matters."""
+    rng = np.random.default_rng(4)
+    layout = fs.Layout.grid((1, 2), pixels=window)
+    frame = np.concatenate(list(fs.simulate.subapertures(2, shape=window, flux_e=60, rng=rng)[0]), axis=1)
+    frame += rng.normal(0.0, 1.0, frame.shape).astype(np.float32)
+    settings = fs.Settings(noise_std=[1.0, 0.6], keep_brightest=12, preset="fast", algorithm=algorithm)
+    expected = fs.SlopePipeline(layout, settings)(frame)
+    found = fs.SlopePipeline(layout, settings, device="cuda")(frame)
+    assert np.all(found.iterations == 8)
+    assert np.array_equal(found.flags, expected.flags)
+    assert np.abs(found.vector - expected.vector).max() < 1e-5
+    assert np.allclose(found.flux, expected.flux, rtol=1e-5)
+    from_zero = fs.Settings(noise_std=[1.0, 0.6], keep_brightest=12, tolerance=0.0, max_iterations=8)
+    assert np.abs(fs.SlopePipeline(layout, from_zero)(frame).vector - expected.vector).max() > 1e-3
+
+
 @pytest.mark.parametrize("estimator", ["cog", "smoothed", "thresholded"])
 def test_estimators(estimator: str) -> None:
     layout = fs.Layout.grid((1, 3), pixels=(7, 9))
