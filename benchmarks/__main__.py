@@ -32,10 +32,11 @@ _ORDER = (
     "study",
     "startup",
     "gpu",
+    "schedules",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained"}
-"""Run only when named, or with --full: 12 minutes."""
+LONG = {"realtime_sustained", "schedules"}
+"""Run only when named, or with --full: 12 and 30 minutes."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",

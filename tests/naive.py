@@ -103,6 +103,8 @@ def tv_denoise(
             new = (q[0] + gx / 4, q[1] + gy / 4)
             shrink = 1.0 + np.hypot(gx, gy) / 4
         previous, p = p, (new[0] / shrink, new[1] / shrink)
+        if algorithm == "chambolle":  # with an old norm the multiplier would oscillate
+            d = divergence(*p)
         next_age = (1.0 + np.sqrt(1.0 + 4.0 * age**2)) / 2
         momentum, age = (age - 1.0) / next_age, next_age
         if np.linalg.norm(d) > 0:

@@ -75,7 +75,7 @@ class TestAgainstOracle:
         )
         for i, g in enumerate(stack):
             expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, iterations, flat_start=True)
-            bound = 10 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype) * largest(g) + 1e-29
+            bound = 50 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype) * largest(g) + 1e-29
             assert np.max(np.abs(result.images[i] - expected.image)) <= bound
             if largest(g) > 1e-20:
                 assert result.iterations[i] == expected.iterations
@@ -158,6 +158,20 @@ class TestSolution:
             for w in (*rng.normal(size=(200, *shape)), g, u, u**2, rng.random(shape) < 0.5):
                 w = np.asarray(w, float)
                 assert np.sum(v * w) <= naive.total_variation(w) * (1 + 1e-9)
+
+    def test_both_algorithms_agree_near_the_limit_of_feasibility(self) -> None:
+        """There the multiplier would oscillate if "chambolle" took the norm of one iteration before."""
+        images, _ = fs.simulate.subapertures(
+            20, flux_e=80, detector=fs.simulate.Detector(read_noise_e=3.0), rng=np.random.default_rng(5)
+        )
+        strength = 0.97 * spread(images)
+        exact = fs.tv_denoise(images.astype(float), strength, tolerance=0, max_iterations=5000)
+        slow = fs.tv_denoise(
+            images.astype(float), strength, algorithm="chambolle", tolerance=0, max_iterations=5000
+        )
+        for u, other in zip(exact, slow, strict=True):
+            # It converges like 1 / iterations; the oscillation left 8 to 13 times the variation.
+            assert naive.total_variation(other) <= 1.1 * naive.total_variation(u)
 
     @every_algorithm
     def test_no_feasible_competitor_varies_less(self, algorithm: str) -> None:

@@ -145,6 +145,7 @@ def make_change(strips: Strips, algorithm: int) -> Any:
 def make_iterations(strips: Strips, algorithm: int) -> Any:
     """Return the function that iterates on p and q until the image has converged or the limit is reached."""
     sweep, has_converged = make_sweep(strips, algorithm), make_change(strips, algorithm)
+    divergence, rows, chambolle = make_divergence(strips), strips.rows, algorithm == CHAMBOLLE
 
     @device
     def iterate(
@@ -170,7 +171,14 @@ def make_iterations(strips: Strips, algorithm: int) -> Any:
             until_check -= float32(1.0)
             # A sweep extrapolates for the next one: its momentum.
             age, momentum = next_momentum(age)
-            norm = warp_total(sweep(q, p, g, lane, in_row, in_last, inverse, momentum))
+            norm = sweep(q, p, g, lane, in_row, in_last, inverse, momentum)
+            if chambolle:  # with the old norm the multiplier would oscillate
+                norm = float32(0.0)
+                d = cuda.local.array(rows, float32)
+                divergence(q, lane, d)
+                for r in range(rows):
+                    norm += d[r] * d[r]
+            norm = warp_total(norm)
             if norm > float32(0.0):
                 inverse = norm * inverse_root(norm) * inverse_radius
             if until_check == float32(0.0):

@@ -247,7 +247,9 @@ def sweep_fgp(
 
 @compiled
 def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any) -> Any:
-    """One iteration of "chambolle" on every pixel; return ||div p||^2 per lane.
+    """One iteration of "chambolle" on every pixel; return ||div p||^2 per lane, of the new p.
+
+    With the norm of the p before, one iteration late, the multiplier would oscillate near infeasibility.
 
     `rows` has room for ny * nx vectors: v of the whole image. Meant to be compared with, not to be fast.
     """
@@ -261,7 +263,6 @@ def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current
         for x in range(nx):
             place = y * line + x * pixel
             d = twice_divergence(lanes, state, place, current * width, y, x, line, pixel)
-            norm = multiply_add(d, d, norm)
             v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
             store(rows, (y * nx + x) * width, v)
     for y in range(ny):
@@ -276,6 +277,8 @@ def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current
                 old = load(lanes, state, place + (current + axis) * width)
                 new = multiply_add(step, gradient, old) * shrink
                 store(state, place + (2 - current + axis) * width, new)
+            d = twice_divergence(lanes, state, place, (2 - current) * width, y, x, line, pixel)
+            norm = multiply_add(d, d, norm)
     return norm * splat(lanes, 0.25)
 
 

@@ -1,8 +1,8 @@
 """Constrained total-variation denoising of a group of W sub-apertures, one in each SIMD lane.
 
 The multiplier follows from the constraint, lambda = sqrt(N) noise_std / ||div q||, renewed in every
-iteration from the norm that the preceding sweep has summed up; the fixed point is the same as with the
-norm of the running iteration, and one sweep is enough.
+iteration from the norm that the preceding sweep has summed up; the accelerated iteration tolerates that it
+is one iteration old, so that one sweep is enough.
 
 References: Chambolle 2004 (J. Math. Imaging Vis. 20, 89), Beck & Teboulle 2009 (IEEE Trans. Image Process.
 18, 2419).

@@ -124,9 +124,9 @@ class Settings:
     algorithm : str
         "fgp" | "chambolle".
     preset : str
-        "accurate" | "fast". "fast" does as little work as keeps slopes as good: the denoising begins at the
-        solution of the flat image and makes 8 iterations, see `faintspot.tv_denoise`; "ml", "matched" and
-        "weighted" make fewer steps. What else is given here goes before it.
+        "accurate" | "fast". "fast" does little work, and the same for every image: the denoising begins at
+        the dual field of a flat solution and makes 8 iterations, see `faintspot.tv_denoise`; "map" and
+        "weighted" make fewer steps. What else is given here goes before it. docs/fast.md says what it costs.
     flux_floor : float or array
         A sub-aperture is flagged NO_LIGHT when the flux that is left after the background subtraction is not
         above this fraction of its image's largest pixel.
@@ -147,7 +147,7 @@ class Settings:
         Full width at half maximum of the weight of "weighted", geometric mean of both axes; it is elongated
         like the spot. Default: that of the spot.
     steps : int
-        Of "ml", "matched" and "map" (default 3; "fast": 2) or of "weighted" (default 8; "fast": 4).
+        Of "ml" and "matched" (default 3), "map" (3; "fast": 2) or "weighted" (8; "fast": 3).
     model_error : float or array
         How far the spots differ from the PSF, as a fraction of each pixel's light: "ml" and "map" trust
         bright pixels no more than that. 0.1 to 0.5 for speckled spots.
