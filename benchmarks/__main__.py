@@ -21,6 +21,7 @@ from benchmarks.measuring import Table
 _ORDER = (
     "rivals",
     "scale",
+    "projection",
     "estimators",
     "roofline",
     "breakdown",

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, ratio
-from benchmarks.rivals import GRIDS, ITERATIONS, problem
+from benchmarks.rivals import GRIDS, problem
 from faintspot.kernels.parallel import available_cpus
 
 SMALLEST, LARGEST = min(GRIDS), max(GRIDS)
@@ -28,13 +28,13 @@ SECONDS = 10.0
 
 
 def settings() -> dict[str, Any]:
-    """Return the denoising that all frames get: a fixed number of iterations."""
-    return {"max_iterations": ITERATIONS, "tolerance": 0.0}
+    """Return the denoising that all frames get: that of the preset "fast"."""
+    return {"preset": "fast", "max_iterations": None, "tolerance": None}
 
 
 def settings_in_words() -> str:
     """Return the settings for a note."""
-    return ", ".join(f"{name} = {value}" for name, value in settings().items())
+    return ", ".join(f"{name} = {value}" for name, value in settings().items() if value is not None)
 
 
 def _times(side: int) -> Times:

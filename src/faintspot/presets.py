@@ -1,7 +1,7 @@
 """Presets: how much work an estimator does, where nothing else is said.
 
-"accurate" goes on until more work changes little. "fast" does a small fixed amount, after which the slope error
-is within 1 % of the converged one at the strength that suits the spots: docs/fast.md says where it is not.
+"accurate" goes on until more work changes little. "fast" does a small fixed amount, after which the slope
+error is within 1 % of the converged one at the strength that suits the spots: docs/fast.md says where not.
 """
 
 from __future__ import annotations
