@@ -2,10 +2,10 @@
 
 One 4616-sub-aperture frame is measured on all processors that the process may use, with each way of measuring
 in turn. From that: cores = sensors x frames/s x time x processors, as if every sensor had its own cores and
-they scaled as the measured ones do (`scale` says how they do). A core that is busy all the time has no reserve
-for the tail: build with one half more. Beside it, what must be moved: pixels from the cameras, and, where
-several sensors' calibration maps do not stay in the cache, these in every frame; against the memory's bandwidth
-as a plain copy has it. The larger one of both fractions of a processor's time is the limit.
+they scaled as the measured ones do (`scale` says how they do). A core that is busy all the time has no
+reserve for the tail: build with one half more. Beside it, what must be moved: pixels from the cameras, and,
+where several sensors' calibration maps do not stay in the cache, these in every frame; against the memory's
+bandwidth as a plain copy has it. The larger one of both fractions of a processor's time is the limit.
 """
 
 from __future__ import annotations
