@@ -17,6 +17,7 @@ from numba import njit
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from benchmarks.rivals import ITERATIONS, KEEP, NOISE_STD, Problem, problem
 from faintspot.kernels import brightest, total_variation
+from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import available_cpus, new_scratch
 
@@ -33,10 +34,10 @@ _denoise_group = total_variation.denoise_group
 
 
 @njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
-def _denoise(count: Any, lanes: Any, ny: Any, nx: Any, scratch: Any) -> None:
+def _denoise(count: Any, lanes: Any, table: Any, ny: Any, nx: Any, scratch: Any) -> None:
     image, output, state, rows, numbers, counts, _ = scratch
     for _ in range(count):
-        _denoise_group(lanes, total_variation.FGP, ny, nx, image, output, state, rows, numbers, counts)
+        _denoise_group(lanes, total_variation.FGP, table, ny, nx, image, output, state, rows, numbers, counts)
 
 
 @njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
@@ -69,11 +70,11 @@ def _stages(case: Problem, side: int, width: int) -> dict[str, Candidate]:
     rows = rows[total_variation.LANE_ROWS :]
     rows[brightest.RANK], rows[brightest.SUBTRACT] = KEEP + 1, 1.0
     centroid = rows.reshape(-1)
-    _denoise(1, lanes, side, side, scratch)
+    _denoise(1, lanes, NO_TABLE, side, side, scratch)
     denoised, left = output.copy(), output.copy()
     _threshold(1, lanes, pixels, denoised, centroid)
     return {
-        "denoise": lambda: _denoise(_REPEATS, lanes, side, side, scratch),
+        "denoise": lambda: _denoise(_REPEATS, lanes, NO_TABLE, side, side, scratch),
         "threshold": lambda: _threshold(_REPEATS, lanes, pixels, denoised, centroid),
         "subtract": lambda: _subtract(_REPEATS, lanes, pixels, left, centroid),
         "centroid": lambda: _centroid(_REPEATS, lanes, side, side, left, centroid),
