@@ -305,7 +305,7 @@ def _against_cpp() -> Table:
         "rivals_cpp",
         title,
         rows,
-        ["ns for one pixel of all W images; the C++ one takes a row at a time, as one would write it"],
+        ["ns for one pixel of all W images; C++: a row at a time"],
     )
 
 
