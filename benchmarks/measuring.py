@@ -88,8 +88,14 @@ def _seconds(candidate: Candidate, calls: int) -> float:
     return (time.perf_counter() - start) / calls
 
 
-def interleaved(candidates: dict[str, Candidate], *, seconds: float = 3.0, fewest: int = 5) -> Times:
-    """Time candidates in turn until `seconds` have passed, but at least `fewest` turns.
+def interleaved(
+    candidates: dict[str, Candidate],
+    *,
+    seconds: float = 3.0,
+    fewest: int = 5,
+    sample_s: float = _SHORTEST_SAMPLE_S,
+) -> Times:
+    """Time candidates in turn until `seconds` have passed, but at least `fewest` turns of `sample_s` each.
 
     Returns
     -------
@@ -99,7 +105,7 @@ def interleaved(candidates: dict[str, Candidate], *, seconds: float = 3.0, fewes
     calls = {}
     for name, candidate in candidates.items():
         candidate()  # compile, fill caches
-        calls[name] = max(1, round(_SHORTEST_SAMPLE_S / max(_seconds(candidate, 1), 1e-9)))
+        calls[name] = max(1, round(sample_s / max(_seconds(candidate, 1), 1e-9)))
     times: dict[str, list[float]] = {name: [] for name in candidates}
     collecting = gc.isenabled()
     gc.disable()

@@ -95,7 +95,7 @@ def run_groups(
         start, stop = n_groups * share // shares, n_groups * (share + 1) // shares
         job(start, stop, _thread_scratch(make, arguments))
 
-    if shares == 1:
-        work(0)
-    else:
-        list(_pool(os.getpid(), wanted).map(work, range(shares)))
+    others = [_pool(os.getpid(), wanted).submit(work, share) for share in range(1, shares)]
+    work(0)  # the caller is awake already
+    for other in others:
+        other.result()
