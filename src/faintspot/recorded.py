@@ -112,6 +112,8 @@ def measure_recorded(
             layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
         )
     except InputError as error:
+        if str(error).startswith("device"):
+            raise
         about_reference = positions is not None and str(error).startswith("reference")
         where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
         raise InputError(f"{where}: {error}") from None
