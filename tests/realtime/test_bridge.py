@@ -245,14 +245,14 @@ def test_bad_number_of_frames(name: str) -> None:
 
 
 def test_idle_leaves_the_processor_alone(name: str, running: Running) -> None:
-    """Without frames less than a tenth of a processor is used: a loop without pauses would use one."""
+    """Without frames less than half of a processor is used: a loop without pauses would use one."""
     stream = created(name)
     running.said("6 x 5 pixels")
     stream.write(frame(0))
     time.sleep(0.2)
     start, processor = time.monotonic(), time.process_time()
     time.sleep(1.0)
-    assert time.process_time() - processor < 0.1 * (time.monotonic() - start)
+    assert time.process_time() - processor < 0.5 * (time.monotonic() - start)
     stream.unlink()
 
 
