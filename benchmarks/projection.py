@@ -16,16 +16,16 @@ import numpy as np
 
 from benchmarks.measuring import Candidate, Row, Table, absolute_spread, best, interleaved
 from benchmarks.rivals import problem
+from benchmarks.scale import settings as fast
 from faintspot.kernels.parallel import available_cpus
 
 SENSORS, RATES_HZ, LIT = 6, (500.0, 1000.0), 4616
 _COPIED_BYTES = 256 * 2**20
 _PIXEL_BYTES, _MAP_BYTES = 2, 8  # uint16 from the camera; dark and scale, float32
-_FAST: dict[str, Any] = {"preset": "fast", "max_iterations": None, "tolerance": None}
 WAYS: dict[str, tuple[int, dict[str, Any]]] = {
-    "TV, preset fast, 16 x 16": (16, _FAST),
-    "TV, preset fast, 10 x 10": (10, _FAST),
-    "TV, preset fast, 8 x 8": (8, _FAST),
+    "TV, preset fast, 16 x 16": (16, fast()),
+    "TV, preset fast, 10 x 10": (10, fast()),
+    "TV, preset fast, 8 x 8": (8, fast()),
     "TV, 20 iterations, 16 x 16": (16, {}),
     "smoothed, 16 x 16": (16, {"estimator": "smoothed"}),
     "brightest pixels, 16 x 16": (16, {"denoise": False}),

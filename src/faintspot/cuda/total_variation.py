@@ -22,8 +22,9 @@ from numba import cuda, float32, int32
 
 from faintspot.cuda import warp
 from faintspot.cuda.compiling import device
-from faintspot.cuda.flat_start import FIRST_AGE, make_start_flat
+from faintspot.cuda.flat_start import make_start_flat
 from faintspot.cuda.strips import WARP, Strips
+from faintspot.kernels.flat_start import MOMENTUM_AGE
 from faintspot.kernels.sweeps import CHAMBOLLE_STEP, FGP_STEP
 from faintspot.kernels.total_variation import CHAMBOLLE, CHECK_INTERVAL, FGP, FIRST_MULTIPLIER
 
@@ -251,7 +252,7 @@ def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
     normalise, divergence = make_normalise(strips), make_divergence(strips)
     start, iterate = make_start(strips, flat), make_iterations(strips, algorithm)
     chambolle = algorithm == CHAMBOLLE
-    first_age = FIRST_AGE if flat else 1.0
+    first_age = MOMENTUM_AGE if flat else 1.0
 
     @device
     def denoise(

@@ -32,7 +32,7 @@ from faintspot.kernels.simd import (
     twice_reciprocal_square_root,
     width_of,
 )
-from faintspot.kernels.sweeps import IMAGE, STATE_VECTORS
+from faintspot.kernels.sweeps import IMAGE, STATE_VECTORS, bounded_square, store_projected
 
 FIRST_GUESS = 1.6  # of the multiplier, in units of the strength: the middle of what occurs, 0.5 to 3.5
 MOMENTUM_AGE = 4.0  # the accelerated iteration begins as if it had run for some time
@@ -229,7 +229,7 @@ def start_flat(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, table: Any, 
     """
     width = width_of(lanes)
     zero, one, half = splat(lanes, 0.0), splat(lanes, 1.0), splat(lanes, 0.5)
-    four, twice = splat(lanes, 4.0), splat(lanes, 2.0)
+    twice = splat(lanes, 2.0)
     _solve_laplace(lanes, state, rows, ny, nx, table)
     inverse = inverse_radius * splat(lanes, math.sqrt(ny * nx) / FIRST_GUESS)
     norm, slope = _norm_and_slope(lanes, rows, ny, nx, twice * inverse)
@@ -245,8 +245,6 @@ def start_flat(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, table: Any, 
     for y in range(ny):
         for x in range(nx):
             px, py = _field(lanes, rows, y, x, ny, nx, twice * inverse)
-            shrink = twice_reciprocal_square_root(maximum(multiply_add(px, px, py * py), four))
             place = (y * nx + x) * STATE_VECTORS * width
-            store(state, place, px * shrink)
-            store(state, place + width, py * shrink)
+            store_projected(lanes, state, place, px, py, bounded_square(lanes, px, py))
     return inverse

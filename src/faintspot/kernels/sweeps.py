@@ -46,13 +46,13 @@ def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any
 
 
 @inlined
-def _bounded_square(lanes: Any, px: Any, py: Any) -> Any:
-    """|p|^2, but at least four: what `_store_projected` divides by."""
+def bounded_square(lanes: Any, px: Any, py: Any) -> Any:
+    """|p|^2, but at least four: what `store_projected` divides by."""
     return maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
 
 
 @inlined
-def _store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any, square: Any) -> None:
+def store_projected(lanes: Any, state: Any, target: Any, px: Any, py: Any, square: Any) -> None:
     """Store the nearest dual vector of length at most two."""
     shrink = twice_reciprocal_square_root(square)
     store(state, target, px * shrink)
@@ -66,10 +66,10 @@ def _advance(
     """Project and store the oldest steps, and bound those after them."""
     fx, fy, f_square, hx, hy, h_square = bounded
     if not top:
-        _store_projected(lanes, state, targets[0] - line + previous, fx, fy, f_square)
-    _store_projected(lanes, state, targets[1] + previous, hx, hy, h_square)
+        store_projected(lanes, state, targets[0] - line + previous, fx, fy, f_square)
+    store_projected(lanes, state, targets[1] + previous, hx, hy, h_square)
     fx, fy, hx, hy = steps
-    return fx, fy, _bounded_square(lanes, fx, fy), hx, hy, _bounded_square(lanes, hx, hy)
+    return fx, fy, bounded_square(lanes, fx, fy), hx, hy, bounded_square(lanes, hx, hy)
 
 
 @inlined
@@ -170,12 +170,12 @@ def _finish(lanes: Any, state: Any, line: Any, previous: Any, top: Any, carried:
     norm, _, _, (ax, ay, av, _, bv), (p1, p2, p3), (gx, gy, ix, iy), bounded = carried
     fx, fy, f_square, hx, hy, h_square = bounded
     if not top:
-        _store_projected(lanes, state, p2 - line + previous, fx, fy, f_square)
-        _store_projected(lanes, state, p1 - line + previous, gx, gy, _bounded_square(lanes, gx, gy))
-    _store_projected(lanes, state, p3 + previous, hx, hy, h_square)
-    _store_projected(lanes, state, p2 + previous, ix, iy, _bounded_square(lanes, ix, iy))
+        store_projected(lanes, state, p2 - line + previous, fx, fy, f_square)
+        store_projected(lanes, state, p1 - line + previous, gx, gy, bounded_square(lanes, gx, gy))
+    store_projected(lanes, state, p3 + previous, hx, hy, h_square)
+    store_projected(lanes, state, p2 + previous, ix, iy, bounded_square(lanes, ix, iy))
     ay = (bv - av) + ay
-    _store_projected(lanes, state, p1 + previous, ax, ay, _bounded_square(lanes, ax, ay))
+    store_projected(lanes, state, p1 + previous, ax, ay, bounded_square(lanes, ax, ay))
     return norm
 
 
@@ -208,8 +208,8 @@ def _update_last_row(lanes: Any, state: Any, rows: Any, target: Any, nx: Any) ->
         here = x * 3 * width
         v_right = load(lanes, rows, here + 5 * width)
         px = (v_right - v) + load(lanes, rows, here)
-        _store_projected(
-            lanes, state, target + x * STATE_VECTORS * width, px, zero, _bounded_square(lanes, px, zero)
+        store_projected(
+            lanes, state, target + x * STATE_VECTORS * width, px, zero, bounded_square(lanes, px, zero)
         )
         v = v_right
 
