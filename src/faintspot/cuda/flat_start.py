@@ -17,11 +17,9 @@ from numpy.typing import NDArray
 from faintspot.cuda import warp
 from faintspot.cuda.compiling import device
 from faintspot.cuda.strips import WARP, Strips
-from faintspot.kernels.flat_start import FIRST_GUESS, flat_start_table
+from faintspot.kernels.flat_start import FIRST_GUESS, LARGEST_STEP, LEAST_SLOPE, flat_start_table
 
 shuffle, warp_total, synchronise, inverse_root = warp.shuffle, warp.total, warp.synchronise, warp.inverse_root
-
-LEAST_SLOPE, LARGEST_STEP = 0.3, 4.0  # as on the CPU: they keep Newton's step in hand
 
 
 def pitch_of(nx: int) -> int:

@@ -36,7 +36,7 @@ from faintspot.kernels.sweeps import IMAGE, STATE_VECTORS, bounded_square, store
 
 FIRST_GUESS = 1.6  # of the multiplier, in units of the strength: the middle of what occurs, 0.5 to 3.5
 MOMENTUM_AGE = 4.0  # the accelerated iteration begins as if it had run for some time
-_LEAST_SLOPE, _LARGEST_STEP = 0.3, 4.0  # keep Newton's step in hand
+LEAST_SLOPE, LARGEST_STEP = 0.3, 4.0  # keep Newton's step in hand
 
 
 @cache
@@ -237,10 +237,10 @@ def start_flat(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, table: Any, 
     norm = half * square_root(select(lit, norm, one))
     radius = one / inverse_radius
     steepness = half * half * slope / (norm * inverse)
-    denominator = maximum(radius - steepness, splat(lanes, _LEAST_SLOPE) * radius)
+    denominator = maximum(radius - steepness, splat(lanes, LEAST_SLOPE) * radius)
     better = inverse + (norm - radius * inverse) / denominator
-    better = minimum(better, splat(lanes, _LARGEST_STEP) * inverse)
-    better = maximum(better, splat(lanes, 1.0 / _LARGEST_STEP) * inverse)
+    better = minimum(better, splat(lanes, LARGEST_STEP) * inverse)
+    better = maximum(better, splat(lanes, 1.0 / LARGEST_STEP) * inverse)
     inverse = select(lit, better, inverse)
     for y in range(ny):
         for x in range(nx):
