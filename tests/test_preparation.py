@@ -11,7 +11,7 @@ import pytest
 
 import faintspot as fs
 from faintspot import spot_tables
-from faintspot.sensor import configuration
+from faintspot import configuration
 
 LAYOUT = fs.Layout.grid((3, 4), pixels=12)
 NOISE = fs.Calibration(read_noise_e=1.0)

@@ -18,8 +18,9 @@ from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.io.locations import split_location
 from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.pipeline import SlopePipeline, Slopes
-from faintspot.sensor import configuration
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Slopes
+from faintspot import configuration
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 

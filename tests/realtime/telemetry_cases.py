@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.pipeline import RESULT_TYPES, Slopes
+from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.sensor.layout import Layout
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.pipeline import SlopePipeline, Stages
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Stages
 from faintspot.report.statistics import Arm
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate import sensor_frames
 
 SETTINGS = Settings(noise_std=0.3, keep_brightest=10)

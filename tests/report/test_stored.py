@@ -16,10 +16,10 @@ from faintspot.io import create_writer
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded, slopes_as_variables
 from faintspot.report import report_of_stored
-from faintspot.sensor import configuration
+from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 PLAIN = SETTINGS.replace(denoise=False)

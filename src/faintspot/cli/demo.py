@@ -15,7 +15,7 @@ from faintspot.errors import InputError
 from faintspot.io.slopes import read_slopes
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
-from faintspot.sensor import configuration
+from faintspot import configuration
 from faintspot.study import demonstration
 from faintspot.study.demonstration import Comparison
 from faintspot.study.metric import magnitudes

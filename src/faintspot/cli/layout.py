@@ -15,11 +15,11 @@ from faintspot.errors import InputError, MissingExtraError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.pipeline import SlopePipeline
-from faintspot.sensor import configuration
+from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.layout import GEOMETRIES, Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings

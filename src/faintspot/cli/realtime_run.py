@@ -86,7 +86,7 @@ def run(
     from faintspot.realtime.live import parse_subapertures
     from faintspot.realtime.manners import real_time
     from faintspot.realtime.module_loading import load_module
-    from faintspot.sensor import configuration
+    from faintspot import configuration
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     processors = parse_subapertures(cpus) if cpus else None

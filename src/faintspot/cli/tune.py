@@ -26,7 +26,7 @@ from faintspot.planner.photometry import (
     ZERO_POINTS,
 )
 from faintspot.planner.question import PROFILES
-from faintspot.sensor import configuration
+from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 

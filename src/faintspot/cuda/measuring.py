@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from faintspot.preparation import Preparation
     from faintspot.sensor.calibration import Calibration
     from faintspot.sensor.layout import Layout
-    from faintspot.sensor.settings import Settings
+    from faintspot.settings import Settings
 
 ESTIMATORS = ("cog", "smoothed", "thresholded")
 """Estimators that run on the GPU."""

@@ -25,8 +25,9 @@ from faintspot.loop.mirror import DeformableMirror, make_mirror
 from faintspot.loop.record import Arm, LoopRecord
 from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pupil
 from faintspot.loop.wavefront_sensor import ShackHartmann, make_sensor
-from faintspot.pipeline import SlopePipeline, Slopes
-from faintspot.sensor import configuration as configuration_file
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Slopes
+from faintspot import configuration as configuration_file
 
 _MOST_ARMS = 127
 

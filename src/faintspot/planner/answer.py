@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.planner.arms import SPOT, Arm
 from faintspot.planner.curves import Curve
 from faintspot.planner.question import Question
-from faintspot.sensor import configuration
+from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.study.metric import Estimate, SlopeStatistics
 
 if TYPE_CHECKING:

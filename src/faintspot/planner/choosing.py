@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao
-from faintspot.pipeline import Slopes
+from faintspot.slopes import Slopes
 from faintspot.planner.answer import Answer, ArmResult
 from faintspot.planner.arms import ARMS, Arm, Choice, Workshop
 from faintspot.planner.curves import Curve, limiting_flux, magnitude_gain

@@ -12,7 +12,8 @@ from faintspot.checks import LARGEST_FLOAT32
 from faintspot.kernels import fused, located, thresholded
 from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
-from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.sensor.layout import Layout
 
 # Places in the arguments of `SlopePipeline.kernel_call`.

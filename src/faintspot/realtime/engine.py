@@ -20,8 +20,8 @@ from faintspot.realtime.programme import Path, Programmes
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
 from faintspot.realtime.workers import Workers
-from faintspot.sensor.configuration import to_text
-from faintspot.sensor.settings import Settings
+from faintspot.configuration import to_text
+from faintspot.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher
 _LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer

@@ -18,7 +18,8 @@ from faintspot.kernels import fused, located, streaming, thresholded
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
-from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.preparation import METHODS
 from faintspot.realtime.workers import Workers
 

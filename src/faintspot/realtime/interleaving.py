@@ -8,7 +8,7 @@ from typing import Any
 from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.realtime.live import parse_changes
-from faintspot.sensor.settings import ESTIMATORS
+from faintspot.settings import ESTIMATORS
 
 _WORDS: dict[str, dict[str, Any]] = {"set": {}, "none": {"denoise": False}, "tv": {"denoise": True}}
 

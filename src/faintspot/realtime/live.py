@@ -17,7 +17,7 @@ import numpy as np
 from faintspot.checks import number_between, numbers_between, one_of
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
-from faintspot.sensor.settings import AUTO, PER_SUBAPERTURE, PerSubaperture, Settings
+from faintspot.settings import AUTO, PER_SUBAPERTURE, PerSubaperture, Settings
 
 NAMES = tuple(field.name for field in fields(Settings))
 """The names of all settings."""

@@ -16,7 +16,8 @@ from faintspot.checks import real_array
 from faintspot.errors import InputError
 from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.kernels import fused
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Slopes
 from faintspot.realtime.built_in import BuiltIn
 from faintspot.realtime.frame_path import check_real_time
 from faintspot.realtime.module_loading import STAGES, Module, StageFunction, one_line

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.kernels import streaming
-from faintspot.pipeline import Slopes
+from faintspot.slopes import Slopes
 from faintspot.realtime.frame_path import STOP_CELL, FramePath, Progress
 from faintspot.realtime.modular import TRIAL_LIMIT_S, ModularPipeline, title_of
 from faintspot.realtime.module_loading import one_line

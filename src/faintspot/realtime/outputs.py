@@ -11,7 +11,7 @@ import numpy as np
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.details import fill_details
-from faintspot.pipeline import Slopes
+from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""

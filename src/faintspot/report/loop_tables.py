@@ -20,8 +20,8 @@ from faintspot.loop.results import InterleavedResult, MagnitudeResult
 from faintspot.loop.statistics import paired_mean
 from faintspot.loop.verdict import gain_in_words, in_words
 from faintspot.report.sections import Table
-from faintspot.sensor.configuration import to_text
-from faintspot.sensor.settings import Settings
+from faintspot.configuration import to_text
+from faintspot.settings import Settings
 
 
 def strehl_groups_table(result: InterleavedResult, table: Measurements) -> Table:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 import faintspot
 from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.pipeline import Stages
+from faintspot.slopes import Stages
 from faintspot.report.pictures import write_file
 from faintspot.report.sections import all_sections, make_run
 from faintspot.report.statistics import Arm

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.errors import InputError
 from faintspot.io.slopes_format import output_errors
-from faintspot.pipeline import Stages
+from faintspot.slopes import Stages
 from faintspot.report.drawing import (
     LIGHT_GREY,
     TRUTH_COLOUR,

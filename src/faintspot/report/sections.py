@@ -31,7 +31,7 @@ from faintspot.sensor.layout import Layout
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from faintspot.pipeline import Stages
+    from faintspot.slopes import Stages
 
 _CSS_PIXELS_PER_INCH = 100
 NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."

@@ -15,14 +15,15 @@ from tomlkit.exceptions import TOMLKitError
 
 from faintspot.errors import InputError
 from faintspot.io import StoredSlopes, open_frames, read_slopes
-from faintspot.pipeline import SlopePipeline, Stages
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Stages
 from faintspot.report.page import slopes_report
 from faintspot.report.statistics import Arm
 from faintspot.report.wording import settings_in_words
-from faintspot.sensor import configuration
+from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02

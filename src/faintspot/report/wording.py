@@ -9,7 +9,7 @@ import numpy as np
 from faintspot.flags import SubapertureFlag
 from faintspot.report.statistics import Arm, Summary
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 FLAG_MEANINGS = {
     SubapertureFlag.NO_LIGHT: "Nothing usable was left after the background subtraction: invalid, slope 0.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.tables import check_fields, chosen_fields, errors_of_table, read_tables, save_tables, table_of
+from faintspot.toml_files import check_keys, checked_table
 
+GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
 GEOMETRIES = ("square", "hexagonal")
 SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
 _LARGEST_SHIFT = 0.35  # of a window's side, by which windows are moved off the spots
@@ -237,15 +241,38 @@ class Layout:
     @classmethod
     def load(cls, path: str | Path) -> Layout:
         """Read the table [layout] of a configuration file (TOML)."""
-        from faintspot.sensor import configuration
-
-        return configuration.load(path, "layout")  # type: ignore[no-any-return]
+        values = table_of(path, read_tables(path), "layout")
+        with errors_of_table(path, "layout"):
+            return cls.from_table(values)
 
     def save(self, path: str | Path) -> None:
         """Write the table [layout] of a configuration file (TOML); other tables stay as they are."""
-        from faintspot.sensor import configuration
+        save_tables(path, {"layout": self.to_table()})
 
-        configuration.save(path, self)
+    def to_table(self) -> dict[str, Any]:
+        """Return the table of a configuration file."""
+        return chosen_fields(self)
+
+    @classmethod
+    def from_table(cls, values: Mapping[str, Any]) -> Layout:
+        """Make a layout from a table of a configuration file, which may hold the arguments of `grid`.
+
+        Raises
+        ------
+        InputError
+            For an unknown key, a missing or a bad value.
+        """
+        if "grid" not in values:
+            check_fields("layout", cls, values)
+            return cls(**values)
+        check_keys("layout.", values, ["grid"], what="key beside grid")
+        grid = checked_table("layout.grid", values["grid"])
+        check_keys("layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
+        try:
+            return cls.grid(**grid)
+        except InputError as error:
+            text = str(error)
+            raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None
 
     def images(self, frame: ArrayLike) -> NDArray[Any]:
         """Cut the windows out of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""

@@ -1,20 +1,4 @@
-"""Estimators of a spot's position, for stacks of images.
-
-========== ============================================================================ ====================
-name       how                                                                          needs
-========== ============================================================================ ====================
-cog        TV denoising (where asked for), brightest pixels, centre of gravity          strength
-smoothed   linear Gaussian smoothing, brightest pixels, centre of gravity
-thresholded centre of gravity of what is above a level                                  level
-weighted   centre of gravity under a Gaussian weight that follows the spot              spot's width
-matched    matched filter: least squares with the PSF                                   PSF
-ml         maximum likelihood for Poisson and Gaussian noise                            PSF, read noise
-map        the same with a prior on the position; posterior mean at very low light      PSF, read noise
-trained    a linear score learnt for the sensor, applied in a few passes                trained score
-========== ============================================================================ ====================
-
-`SlopePipeline` uses them on frames; the name is `Settings.estimator`.
-"""
+"""Estimators for stacks of images, each image a sub-aperture of its own."""
 
 from __future__ import annotations
 
@@ -23,19 +7,19 @@ from numpy.typing import ArrayLike
 
 from faintspot.checks import real_array
 from faintspot.errors import InputError
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.estimators.base import Estimator
+from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import ESTIMATORS, Settings
-
-__all__ = ["ESTIMATORS", "measure"]
+from faintspot.settings import Settings
+from faintspot.slopes import Slopes
 
 
 def measure(
     images: ArrayLike,
-    settings: Settings,
+    settings: Settings | Estimator,
     *,
     calibration: Calibration | None = None,
     psf: PSF | None = None,
@@ -48,7 +32,7 @@ def measure(
     ----------
     images : (n, ny, nx) array
         ADU; electrons with the default calibration.
-    settings : Settings
+    settings : Settings or Estimator
         Its arrays hold one value per image. Light that is not given (`flux_e`) is the mean of the stack.
     calibration : Calibration, optional
         Without maps: gain, dark level, read noise.

@@ -206,7 +206,7 @@ def least_light(
 
 
 @dataclass(frozen=True)
-class PosteriorTables:
+class PosteriorGrid:
     """Log-likelihoods of the positions of a grid, see `faintspot.kernels.posterior`."""
 
     tables: NDArray[np.float32]
@@ -220,14 +220,14 @@ class PosteriorTables:
         return self.tables, self.constants, self.grid, self.spacing
 
 
-NO_POSTERIOR = PosteriorTables(
+NO_POSTERIOR = PosteriorGrid(
     np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1), np.float32), np.zeros((1, 2), np.float32), 1.0
 )
 
 
-def joined(parts: list[PosteriorTables]) -> PosteriorTables:
+def joined(parts: list[PosteriorGrid]) -> PosteriorGrid:
     """Return the tables of several levels of light, on one grid, one after the other."""
-    return PosteriorTables(
+    return PosteriorGrid(
         np.concatenate([part.tables for part in parts]),
         np.concatenate([part.constants for part in parts]),
         parts[0].grid,
@@ -258,7 +258,7 @@ def posterior_tables(
     spacing: float,
     window: tuple[int, int],
     width: int,
-) -> PosteriorTables:
+) -> PosteriorGrid:
     """Prepare the grid's tables for each triple of a PSF, a flux and a dark pixel's variance."""
     ny, nx = window
     padded = -(-nx // width) * width
@@ -270,7 +270,7 @@ def posterior_tables(
         logarithm = np.log1p(excess * mean / v)
         tables[i, :, :, :nx] = logarithm / excess
         constants[i] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))
-    return PosteriorTables(tables, constants, grid, spacing)
+    return PosteriorGrid(tables, constants, grid, spacing)
 
 
 # Trained score --------------------------------------------------------------------------------------
