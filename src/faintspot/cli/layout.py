@@ -162,10 +162,10 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
 
 def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
     """Draw frame and windows and say where; without matplotlib only a picture that was asked for fails."""
-    from faintspot.report import layout_picture
-
     path = picture or str(target.with_suffix(".png"))
     try:
+        from faintspot.report import layout_picture
+
         layout_picture(frame, layout, path)
     except MissingExtraError as error:
         if picture is not None:

@@ -138,7 +138,7 @@ class Answer:
         MissingExtraError
             Without matplotlib.
         """
-        from faintspot.report.tune_figure import tune_figure
+        from faintspot.planner.figure import tune_figure
 
         return tune_figure(self)
 

@@ -19,7 +19,7 @@ from faintspot.loop.analysis import (
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
 from faintspot.loop.statistics import paired_mean
 from faintspot.loop.verdict import gain_in_words, in_words
-from faintspot.report.sections import Table
+from faintspot.report.page import Table
 from faintspot.sensor.configuration import to_text
 from faintspot.sensor.settings import Settings
 

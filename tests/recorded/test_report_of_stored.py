@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.report.report_cases import SETTINGS, Page, sensor, simulated
+from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
 
 from faintspot.errors import InputError
 from faintspot.io import create_writer
