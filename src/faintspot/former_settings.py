@@ -54,8 +54,23 @@ def without_foreign(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 ALL_FORMER = frozenset(
-    "noise_std tolerance max_iterations keep_brightest rule algorithm preset flux_floor threshold_e "
-    "smoothing_px weight_fwhm_px steps model_error weight_floor prior_std_px".split()
+    [
+        "noise_std",
+        "tolerance",
+        "max_iterations",
+        "keep_brightest",
+        "rule",
+        "algorithm",
+        "preset",
+        "flux_floor",
+        "threshold_e",
+        "smoothing_px",
+        "weight_fwhm_px",
+        "steps",
+        "model_error",
+        "weight_floor",
+        "prior_std_px",
+    ]
 )
 """Options of estimators in version 0.1."""
 

@@ -52,7 +52,9 @@ class _Shared(Options):
         low=0.1,
         high=64.0,
     )
-    spot_fwhm_y_px: Any = option(None, "The same along y. Default: as along x.", unit="px", low=0.1, high=64.0)
+    spot_fwhm_y_px: Any = option(
+        None, "The same along y. Default: as along x.", unit="px", low=0.1, high=64.0
+    )
 
 
 class Settings:
@@ -92,7 +94,9 @@ class Settings:
         if isinstance(estimator, Estimator):
             foreign = [name for name in options if name not in self.SHARED]
             if foreign:
-                raise InputError(f"{foreign[0]}: give it to the estimator's own object, as option of its class")
+                raise InputError(
+                    f"{foreign[0]}: give it to the estimator's own object, as option of its class"
+                )
             made = estimator
         else:
             name, options = current_options(estimator, options)

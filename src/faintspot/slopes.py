@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from faintspot.flags import INVALID
 
-
 RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
 
 

@@ -11,12 +11,12 @@ from faintspot.adapters.base import UnitAdapter, largest_window, layout_around, 
 from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.settings import Settings
+from faintspot.slopes import Slopes
 
 try:
     import hcipy

@@ -11,11 +11,11 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot import configuration
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.pipeline import SlopePipeline
-from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.layout import GEOMETRIES, Layout
@@ -162,10 +162,10 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
 
 def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
     """Draw frame and windows and say where; without matplotlib only a picture that was asked for fails."""
-    from faintspot.report import layout_picture
-
     path = picture or str(target.with_suffix(".png"))
     try:
+        from faintspot.report import layout_picture
+
         layout_picture(frame, layout, path)
     except MissingExtraError as error:
         if picture is not None:

@@ -78,6 +78,7 @@ def run(
     On sky, with and without, 50 frames each (NAME_marks says which):
       faintspot realtime run --interleave none,tv --every 50
     """
+    from faintspot import configuration
     from faintspot.pipeline import SlopePipeline
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
@@ -86,7 +87,6 @@ def run(
     from faintspot.realtime.live import parse_subapertures
     from faintspot.realtime.manners import real_time
     from faintspot.realtime.module_loading import load_module
-    from faintspot import configuration
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     processors = parse_subapertures(cpus) if cpus else None

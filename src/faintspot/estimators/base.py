@@ -102,9 +102,7 @@ class Estimator(Options):
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """Say in one line what it does to each of n sub-apertures of so many pixels."""
-        options = ", ".join(
-            f"{name} {self._span(name, n_subapertures, pixels)}" for name in self.chosen()
-        )
+        options = ", ".join(f"{name} {self._span(name, n_subapertures, pixels)}" for name in self.chosen())
         return f"{self.method or self.label}{f' ({options})' if options else ''}"
 
     def for_scene(self, scene: Scene) -> Self:

@@ -54,7 +54,7 @@ class KeepingBrightest(Gravity):
 
     keep_brightest: Any = option(
         None,
-        'Number of pixels that the background subtraction keeps. Default: 8 % of the window\'s pixels, at '
+        "Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at "
         'least 5. "auto": by `faintspot.estimate.automatic.automatic_kept_pixels`.',
         low=1,
         high=2**24,
@@ -62,7 +62,8 @@ class KeepingBrightest(Gravity):
         automatic=True,
     )
     rule: Any = option(
-        "subtract_next", "What is taken off the pixels that are kept; see `faintspot.brightest_pixels`.",
+        "subtract_next",
+        "What is taken off the pixels that are kept; see `faintspot.brightest_pixels`.",
         choices=RULES,
     )
 
@@ -156,7 +157,9 @@ class GravityPrepared(Prepared):
         if not self._keeps:
             keep_all(table)
             return
-        keep = self.each("keep_brightest") if not is_auto(self._option("keep_brightest")) else self._kept(flux_e)
+        keep = (
+            self.each("keep_brightest") if not is_auto(self._option("keep_brightest")) else self._kept(flux_e)
+        )
         pixels, rules = self.sensor.pixels, self.each("rule")
         for rule in np.unique(rules):
             selected = rules == rule

@@ -72,7 +72,7 @@ class Scene:
 
     @property
     def lambda_over_d_px(self) -> float:
-        """lambda / d, px."""
+        """Lambda / d, px."""
         return self.spot_fwhm_px / 0.886 if self.diffraction_px is None else self.diffraction_px
 
     @property

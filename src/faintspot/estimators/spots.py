@@ -84,9 +84,7 @@ class SpotPrepared(Prepared):
         pairs, which = np.unique(table, axis=0, return_inverse=True)
         side = max(sensor.window)
         light = [
-            spot_tables.least_light(
-                spots, int(plane), self.variance, sensor.excess_noise, float(reach), side
-            )
+            spot_tables.least_light(spots, int(plane), self.variance, sensor.excess_noise, float(reach), side)
             for plane, reach in pairs
         ]
         least: Floats = np.array(light)[which.reshape(-1)]

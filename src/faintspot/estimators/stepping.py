@@ -14,9 +14,7 @@ from faintspot.options import option
 class Stepping(Estimator):
     """An estimator that makes the same number of steps for every image, so that the time is known."""
 
-    steps: Any = option(
-        None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False
-    )
+    steps: Any = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
 
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3}
     """By preset."""

@@ -46,7 +46,9 @@ class Thresholded(Gravity):
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Multiples of a dark pixel's noise, and fractions of a typical spot's peak."""
         peak = scene.flux_e / (2.5 * scene.seen_fwhm_px**2)
-        levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [factor * peak for factor in _OF_PEAK]
+        levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [
+            factor * peak for factor in _OF_PEAK
+        ]
         return {"threshold_e": list(dict.fromkeys(max(float(f"{e:.3g}"), _SMALLEST_E) for e in levels))}
 
     def check(self, sensor: Sensor) -> None:
@@ -77,9 +79,7 @@ class _Prepared(GravityPrepared):
         tables = super().tables
         if not self._widths:
             return tables
-        maps = np.ascontiguousarray(
-            self.sensor.calibration.maps(self.sensor.layout.frame_shape), np.float32
-        )
+        maps = np.ascontiguousarray(self.sensor.calibration.maps(self.sensor.layout.frame_shape), np.float32)
         columns = self.sensor.window[1]
         ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
         return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables)

@@ -36,7 +36,7 @@ class TotalVariation(KeepingBrightest):
 
     noise_std: Any = option(
         None,
-        "Strength of the denoising: the standard deviation of the noise to remove from a pixel. \"auto\": from "
+        'Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from '
         "read noise, light and spot, by `faintspot.estimate.automatic.automatic_strength`. 0: not denoised.",
         unit="e-",
         low=0.0,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from faintspot.flags import SubapertureFlag
-from faintspot.kernels import brightest, groups, total_variation
+from faintspot.kernels import brightest, total_variation
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     BACKGROUND,
@@ -27,7 +26,7 @@ from faintspot.kernels.groups import (
     store_stage,
 )
 from faintspot.kernels.host import aligned_zeros
-from faintspot.kernels.simd import Lanes, load, store, width_of
+from faintspot.kernels.simd import Lanes, width_of
 from faintspot.kernels.smoothing import gather_taps, smooth_group
 from faintspot.kernels.sweeps import STATE_VECTORS
 from faintspot.kernels.total_variation import denoise_group
@@ -126,9 +125,7 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 
 @compiled
-def _read_settings(
-    width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any
-) -> None:
+def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
     """Copy what the lanes' sub-apertures are set to."""
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)

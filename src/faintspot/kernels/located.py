@@ -334,7 +334,12 @@ def _is_lit(width: Any, lane: Any, expected: Any, numbers: Any) -> Any:
 @compiled
 def _finish(group: Any, steps: Any, expects_light: Any, scratch: Any) -> None:
     """Write the lanes' results, and the bits of their flags."""
-    width, settings, numbers, found = width_of(group.lanes), group.settings, scratch.own.numbers, scratch.results
+    width, settings, numbers, found = (
+        width_of(group.lanes),
+        group.settings,
+        scratch.own.numbers,
+        scratch.results,
+    )
     for lane in range(width):
         s = min(group.first + lane, settings.shape[1] - 1)
         bits = scratch.flags[lane]

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot import configuration as configuration_file
 from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
@@ -27,7 +28,6 @@ from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pu
 from faintspot.loop.wavefront_sensor import ShackHartmann, make_sensor
 from faintspot.pipeline import SlopePipeline
 from faintspot.slopes import Slopes
-from faintspot import configuration as configuration_file
 
 _MOST_ARMS = 127
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import Slopes
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
@@ -20,6 +19,7 @@ from faintspot.settings import Settings
 from faintspot.simulate.generators import spawn
 from faintspot.simulate.spots import spots
 from faintspot.simulate.turbulence import speckled_spots
+from faintspot.slopes import Slopes
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from faintspot.kernels import fused, located, thresholded
 from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.sensor.layout import Layout
+from faintspot.slopes import RESULT_TYPES, Slopes
 
 # Places in the arguments of `SlopePipeline.kernel_call`.
 _LANES, _FRAMES, _CORNERS, _, _, _CALIBRATION, _SATURATION, _TABLES, _, _BEFORE = range(10)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from faintspot.configuration import to_text
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.engine_modules import EngineModules
@@ -20,7 +21,6 @@ from faintspot.realtime.programme import Path, Programmes
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
 from faintspot.realtime.workers import Workers
-from faintspot.configuration import to_text
 from faintspot.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher

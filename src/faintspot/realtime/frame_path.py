@@ -19,9 +19,9 @@ from faintspot.kernels.compiling import Direct
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.parallel import new_scratch, new_spot_scratch
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.preparation import METHODS
 from faintspot.realtime.workers import Workers
+from faintspot.slopes import RESULT_TYPES, Slopes
 
 STOP_CELL = 0
 _STREAMED = {

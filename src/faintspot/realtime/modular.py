@@ -17,12 +17,12 @@ from faintspot.errors import InputError
 from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.kernels import fused
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import Slopes
 from faintspot.realtime.built_in import BuiltIn
 from faintspot.realtime.frame_path import check_real_time
 from faintspot.realtime.module_loading import STAGES, Module, StageFunction, one_line
 from faintspot.realtime.module_trial import trial_frames, typical_frame
 from faintspot.realtime.time_limit import call_within
+from faintspot.slopes import Slopes
 
 TRIAL_LIMIT_S = 60.0  # a module may compile
 _TIMED_CALLS = 10

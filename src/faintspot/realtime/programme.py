@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import Slopes
 from faintspot.realtime.frame_path import FramePath, Progress, check_real_time
 from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.modular import ModularPipeline
@@ -20,6 +19,7 @@ from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import ARRIVALS, ROWS
 from faintspot.realtime.workers import Workers
 from faintspot.settings import Settings
+from faintspot.slopes import Slopes
 
 
 class Path(Protocol):

@@ -32,7 +32,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
-from faintspot.slopes import Slopes
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import Header, create_segment, segment_path
 from faintspot.realtime.processes import process_start
@@ -49,6 +48,7 @@ from faintspot.realtime.telemetry_segment import (
     up_to_pages,
 )
 from faintspot.sensor.layout import Layout
+from faintspot.slopes import Slopes
 
 __all__ = ["TelemetryReader", "TelemetryRing"]
 

@@ -18,6 +18,7 @@ from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_ma
 
 _MAPS = ("dark", "flat", "bad_pixels")
 
+
 @dataclass(frozen=True)
 class Calibration:
     """From raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.

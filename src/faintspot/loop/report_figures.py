@@ -14,7 +14,7 @@ from faintspot.loop.statistics import paired_mean
 from faintspot.loop.telescope import PSF_SAMPLING
 from faintspot.loop.verdict import REFERENCE
 from faintspot.report.drawing import GREY, WIDTH, colour_bar, new_figure, styled
-from faintspot.study.figure_data import StudyFigure
+from faintspot.report.figure_data import FigureWithData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +47,7 @@ def strehl_axis(wavelength_m: float) -> str:
 
 
 @styled
-def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> StudyFigure:
+def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> FigureWithData:
     """Draw Strehl against magnitude for every arm, and what each gains over the reference."""
     figure = new_figure(WIDTH, 6.4)
     left, right = figure.subplots(1, 2)
@@ -95,11 +95,11 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Stu
     )
     header = ["arm", "magnitude", "photons", "strehl", "standard_error", "realisations"]
     header += ["difference_low", "difference", "difference_high"]
-    return StudyFigure("magnitude", "Strehl against magnitude", caption, figure, header, rows)
+    return FigureWithData("magnitude", "Strehl against magnitude", caption, figure, header, rows)
 
 
 @styled
-def gain_figure(result: MagnitudeResult) -> StudyFigure:
+def gain_figure(result: MagnitudeResult) -> FigureWithData:
     """Draw the centroid gain of every arm against the star's light."""
     figure = new_figure(WIDTH * 0.7, 5.2)
     panel = figure.subplots()
@@ -116,11 +116,11 @@ def gain_figure(result: MagnitudeResult) -> StudyFigure:
     figure.legend(loc="outside right upper", frameon=False)
     caption = "Slope measured for a displacement of 1 px, at the flux of the run, with spots as in the loop."
     header = ["arm", "photons", "centroid_gain"]
-    return StudyFigure("gain", "Centroid gain", caption, figure, header, rows)
+    return FigureWithData("gain", "Centroid gain", caption, figure, header, rows)
 
 
 @styled
-def psf_figure(images: Sequence[NDArray[Any]], names: Sequence[str], where: str) -> StudyFigure:
+def psf_figure(images: Sequence[NDArray[Any]], names: Sequence[str], where: str) -> FigureWithData:
     """Draw long-exposure images on one logarithmic scale, and their profiles.
 
     Parameters
@@ -155,11 +155,13 @@ def psf_figure(images: Sequence[NDArray[Any]], names: Sequence[str], where: str)
     panels[-1].legend(frameon=False)
     caption = f"{where}; the same logarithmic scale in both. Strehl ratio: intensity on the axis."
     rows = [[r, *p] for r, *p in zip(radius, *profiles, strict=True)]
-    return StudyFigure("psf", "Long-exposure image", caption, figure, ["radius_lambda_over_d", *names], rows)
+    return FigureWithData(
+        "psf", "Long-exposure image", caption, figure, ["radius_lambda_over_d", *names], rows
+    )
 
 
 @styled
-def budget_figure(result: BudgetResult, label: str) -> StudyFigure:
+def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
     """Draw the Strehl ratio of every arm with each term of the error budget switched off."""
     terms, arms = len(result.terms), len(result.labels)
     figure = new_figure(WIDTH * 0.8, 1.6 + 0.2 * terms * (arms + 1))
@@ -182,7 +184,7 @@ def budget_figure(result: BudgetResult, label: str) -> StudyFigure:
         "dotted: the whole loop."
     )
     header = ["arm", "switched_off", "strehl", "standard_error"]
-    return StudyFigure("budget", "Error budget", caption, figure, header, rows)
+    return FigureWithData("budget", "Error budget", caption, figure, header, rows)
 
 
 def standard_error(values: Floats) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from faintspot.configuration import to_text
 from faintspot.loop.analysis import (
     NO_TV,
     Measurements,
@@ -19,8 +20,7 @@ from faintspot.loop.analysis import (
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
 from faintspot.loop.statistics import paired_mean
 from faintspot.loop.verdict import gain_in_words, in_words
-from faintspot.report.sections import Table
-from faintspot.configuration import to_text
+from faintspot.report.page import Table
 from faintspot.settings import Settings
 
 

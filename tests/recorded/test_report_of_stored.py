@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.report.report_cases import SETTINGS, Page, sensor, simulated
+from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
 
+from faintspot import configuration
 from faintspot.errors import InputError
 from faintspot.io import create_writer
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded, slopes_as_variables
 from faintspot.report import report_of_stored
-from faintspot import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings

@@ -13,17 +13,17 @@ import tomlkit
 from numpy.typing import NDArray
 from tomlkit.exceptions import TOMLKitError
 
+from faintspot import configuration
 from faintspot.errors import InputError
 from faintspot.io import StoredSlopes, open_frames, read_slopes
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import Stages
-from faintspot.report.page import slopes_report
-from faintspot.report.statistics import Arm
-from faintspot.report.wording import settings_in_words
-from faintspot import configuration
+from faintspot.recorded.advice import settings_in_words
+from faintspot.recorded.page import slopes_report
+from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
+from faintspot.slopes import Stages
 
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
@@ -185,7 +185,7 @@ def _check_same_sensor(first: _Store, other: _Store) -> None:
         raise InputError(f"{other.path}: expected the layout of {first.path}, got another")
 
 
-def _arms(stores: Sequence[_Store]) -> tuple[list[Arm], list[str]]:
+def _arms(stores: Sequence[_Store]) -> tuple[list[MeasuredSlopes], list[str]]:
     """Return the slopes of the frames that all files have, and notes about it."""
     notes = []
     counts = [store.stored.n_finished for store in stores]
@@ -200,8 +200,8 @@ def _arms(stores: Sequence[_Store]) -> tuple[list[Arm], list[str]]:
     arms = []
     for name, store in zip(_names(stores), stores, strict=True):
         variables = store.stored.variables
-        arrays = [variables[field.name][: min(counts)] for field in fields(Arm)[1:]]
-        arms.append(Arm(name, *arrays))
+        arrays = [variables[field.name][: min(counts)] for field in fields(MeasuredSlopes)[1:]]
+        arms.append(MeasuredSlopes(name, *arrays))
     return arms, notes
 
 
@@ -227,7 +227,7 @@ def _arm_name(store: _Store) -> str:
 
 def _example(
     stores: Sequence[_Store],
-    arms: Sequence[Arm],
+    arms: Sequence[MeasuredSlopes],
     number: int,
     frames: Sequence[str | Path] | None,
     notes: list[str],
@@ -268,7 +268,7 @@ def _without_denoising(store: _Store, frame: NDArray[Any]) -> Stages:
     return SlopePipeline(store.layout, settings, store.calibration).explain(frame)
 
 
-def _disagreement(store: _Store, arm: Arm, frame: NDArray[Any], number: int) -> list[str]:
+def _disagreement(store: _Store, arm: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
     """Say so when the example frame, measured again, gives other slopes than are stored."""
     assert store.layout is not None
     assert store.settings is not None
@@ -294,7 +294,7 @@ def _median_standard_error(store: _Store) -> float:
     return float(np.median(known)) if known.size else np.nan
 
 
-def _facts(stores: Sequence[_Store], arms: Sequence[Arm]) -> dict[str, str]:
+def _facts(stores: Sequence[_Store], arms: Sequence[MeasuredSlopes]) -> dict[str, str]:
     sources = list(dict.fromkeys(source for store in stores for source in store.sources))
     shown = ", ".join(sources[:4]) + (f" and {len(sources) - 4} more" if len(sources) > 4 else "")
     versions = dict.fromkeys(

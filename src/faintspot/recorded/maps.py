@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from faintspot.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary, median
 from faintspot.report.drawing import (
     ARM_COLOURS,
     GREY,
@@ -21,7 +22,6 @@ from faintspot.report.drawing import (
     subaperture_map,
     subaperture_shapes,
 )
-from faintspot.report.statistics import Arm, Jitter, Summary, median
 from faintspot.sensor.layout import Layout
 
 _PANEL_HEIGHT = 5.0
@@ -30,7 +30,9 @@ _MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could
 
 
 @styled
-def flux_and_validity(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layout) -> Figure:
+def flux_and_validity(
+    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> Figure:
     """Draw median flux and fraction of valid frames, a row of maps for each arm."""
     figure, axes = _panels(len(arms), 2, layout)
     limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
@@ -44,7 +46,9 @@ def flux_and_validity(arms: Sequence[Arm], summaries: Sequence[Summary], layout:
 
 
 @styled
-def slope_arrows(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layout) -> Figure:
+def slope_arrows(
+    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> Figure:
     """Draw the mean slope of every sub-aperture, one panel per arm, all at one scale."""
     figure, axes = _panels(1, len(arms), layout)
     longest = _arrow_limit(summaries)
@@ -72,7 +76,9 @@ def slope_arrows(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layo
 
 
 @styled
-def iteration_counts(arms: Sequence[Arm], summaries: Sequence[Summary], layout: Layout) -> Figure:
+def iteration_counts(
+    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> Figure:
     """Draw the mean iterations of every sub-aperture (first arm) and how often each number occurred."""
     figure, axes = _panels(1, 2, layout)
     limits = limits_of(summaries[0].iterations, low=0.0)
@@ -99,7 +105,7 @@ def iteration_counts(arms: Sequence[Arm], summaries: Sequence[Summary], layout: 
 
 
 @styled
-def jitter_maps(arms: Sequence[Arm], jitters: Sequence[Jitter], layout: Layout) -> Figure:
+def jitter_maps(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], layout: Layout) -> Figure:
     """Draw the jitter of every sub-aperture, one map per arm, on one scale."""
     figure, axes = _panels(1, len(arms), layout)
     limits = limits_of(*(item.px for item in jitters), low=0.0)
@@ -110,7 +116,7 @@ def jitter_maps(arms: Sequence[Arm], jitters: Sequence[Jitter], layout: Layout) 
 
 
 @styled
-def jitter_plot(arms: Sequence[Arm], jitters: Sequence[Jitter]) -> Figure:
+def jitter_plot(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Figure:
     """Draw the jitter of the sub-apertures in order, and one arm against another where there are two."""
     pair = len(arms) == 2
     figure = new_figure(WIDTH, _PANEL_HEIGHT)
@@ -131,7 +137,7 @@ def jitter_plot(arms: Sequence[Arm], jitters: Sequence[Jitter]) -> Figure:
     return figure
 
 
-def _scatter(axes: Axes, arms: Sequence[Arm], jitters: Sequence[Jitter]) -> None:
+def _scatter(axes: Axes, arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> None:
     """Draw the second arm's jitter along x against the first's along y."""
     across, up = jitters[1].px, jitters[0].px
     axes.plot(across, up, ".", color=ARM_COLOURS[1], markersize=7 if len(up) < 500 else 3)
@@ -165,7 +171,7 @@ def _outlines(layout: Layout) -> Any:
     return PolyCollection(list(subaperture_shapes(layout)), facecolors="#f6f6f6", edgecolors=LIGHT_GREY)
 
 
-def _arrow_limit(summaries: Sequence[Summary]) -> float:
+def _arrow_limit(summaries: Sequence[SlopesSummary]) -> float:
     """Return the length, px, that sets the scale of the arrows: nearly the longest of all arms."""
     lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
     lengths = lengths[np.isfinite(lengths)]

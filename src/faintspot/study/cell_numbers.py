@@ -1,11 +1,8 @@
-"""What a figure of a study is, and its numbers as a table."""
+"""The cells of a study: their parameters in words, and their numbers as a table."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,35 +13,9 @@ from faintspot.study.sweep import PARAMETERS
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
 
 
 _STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction", "photon_efficiency")
-
-
-@dataclass(frozen=True)
-class StudyFigure:
-    """A figure, what it is in words, and its numbers."""
-
-    name: str
-    title: str
-    caption: str
-    figure: Figure
-    header: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-    def csv(self) -> str:
-        """Return the numbers as CSV text."""
-        return csv_text(self.header, self.rows)
-
-
-def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Return a table as CSV text."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return stream.getvalue()
 
 
 def mode_in_words(mode: str) -> str:

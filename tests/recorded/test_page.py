@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.report.report_cases import SETTINGS, Page, sensor, simulated, two_arms
+from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated, two_arms
 
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.pipeline import SlopePipeline
-from faintspot.report import Arm, slopes_report, write_report
+from faintspot.recorded.page import slopes_report
+from faintspot.recorded.statistics import MeasuredSlopes
+from faintspot.report import write_report
 from faintspot.sensor.layout import Layout
 
 SECTIONS = ["numbers", "frame", "flux", "slopes", "iterations", "jitter", "configuration"]
@@ -105,7 +107,7 @@ def test_one_arm_and_hexagonal_layout() -> None:
     corners = np.array([[0, 2], [0, 12], [9, 7]])
     layout = Layout((20, 22), (8, 8), corners, geometry="hexagonal", pitch_px=10.0)
     frames, _ = simulated(layout, 3)
-    arm = Arm.of("no TV", SlopePipeline(layout, SETTINGS.replace(denoise=False))(frames))
+    arm = MeasuredSlopes.of("no TV", SlopePipeline(layout, SETTINGS.replace(denoise=False))(frames))
     html = slopes_report([arm], layout=layout, stages=None, title="t", facts={}, configuration="")
     text = Page(html).text
     assert "hexagonal" in text
@@ -128,7 +130,7 @@ def test_warnings_say_what_to_do_next() -> None:
     flags[:, 0] = 1  # NO_LIGHT
     flags[:, 1] = 8  # SATURATED
     flags[:, 2] = 32  # NOT_CONVERGED
-    arm = Arm("TV", x, x, x + 5, flags, x.astype(int) + 7)
+    arm = MeasuredSlopes("TV", x, x, x + 5, flags, x.astype(int) + 7)
     html = slopes_report([arm], layout=None, stages=None, title="t", facts={}, configuration="")
     text = Page(html).text
     assert "20.0 % of the measurements had no light. Next: check that the windows lie on the spots" in text

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot
+from faintspot import configuration
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
 from faintspot.io.frames import FrameSource, open_frames, read_array
@@ -20,7 +21,6 @@ from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import VARIABLES
 from faintspot.pipeline import SlopePipeline
 from faintspot.slopes import Slopes
-from faintspot import configuration
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from faintspot.flags import SubapertureFlag
-from faintspot.report.statistics import Arm, Summary
+from faintspot.recorded.statistics import MeasuredSlopes, SlopesSummary
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 
@@ -80,7 +80,7 @@ def percentage(fraction: float) -> str:
     return f"{percent:.0f} %" if percent in (0, 100) else f"{percent:.1f} %"
 
 
-def warnings_in_words(arms: Sequence[Arm], summaries: Sequence[Summary]) -> list[str]:
+def warnings_in_words(arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary]) -> list[str]:
     """Return what is wrong with a run and what to do next, a sentence or two each."""
     lines = []
     for arm, summary in zip(arms, summaries, strict=True):
@@ -99,7 +99,7 @@ def warnings_in_words(arms: Sequence[Arm], summaries: Sequence[Summary]) -> list
     return lines
 
 
-def _of_arm(arm: Arm, summary: Summary) -> list[str]:
+def _of_arm(arm: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
     lines = _no_light(arm)
     if summary.valid_fraction == 0:
         lines.insert(0, "No measurement is valid, so there are no slopes.")
@@ -121,7 +121,7 @@ def _of_arm(arm: Arm, summary: Summary) -> list[str]:
     return lines
 
 
-def _no_light(arm: Arm) -> list[str]:
+def _no_light(arm: MeasuredSlopes) -> list[str]:
     dark = arm.flag_count(SubapertureFlag.NO_LIGHT)
     fraction = dark / arm.x.size
     if fraction <= 0.01:

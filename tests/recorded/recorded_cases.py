@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.pipeline import SlopePipeline
-from faintspot.slopes import Stages
-from faintspot.report.statistics import Arm
+from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.simulate import sensor_frames
+from faintspot.slopes import Stages
 
 SETTINGS = Settings(noise_std=0.3, keep_brightest=10)
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -29,11 +29,11 @@ def simulated(layout: Layout, n_frames: int) -> tuple[NDArray[Any], NDArray[np.f
     return sensor_frames(layout.corners, layout.window, layout.frame_shape, n_frames, rng=rng)
 
 
-def two_arms(layout: Layout, frames: NDArray[Any]) -> tuple[list[Arm], dict[str, Stages]]:
+def two_arms(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlopes], dict[str, Stages]]:
     arms, stages = [], {}
     for name, settings in (("TV", SETTINGS), ("no TV", SETTINGS.replace(denoise=False))):
         pipeline = SlopePipeline(layout, settings)
-        arms.append(Arm.of(name, pipeline(frames)))
+        arms.append(MeasuredSlopes.of(name, pipeline(frames)))
         stages[name] = pipeline.explain(frames[0])
     return arms, stages
 

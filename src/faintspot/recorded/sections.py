@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.flags import SubapertureFlag
-from faintspot.report import drawing, maps, pictures
-from faintspot.report.statistics import (
-    Arm,
+from faintspot.recorded import frame_pictures, maps
+from faintspot.recorded.advice import FLAG_MEANINGS, percentage
+from faintspot.recorded.statistics import (
     Floats,
     Jitter,
-    Summary,
+    MeasuredSlopes,
+    SlopesSummary,
     error_ratio,
     flux_gain,
     jitter,
@@ -25,68 +26,34 @@ from faintspot.report.statistics import (
     summarise,
     valid_in_all,
 )
-from faintspot.report.wording import FLAG_MEANINGS, percentage
+from faintspot.report.figure_data import FigureWithData
+from faintspot.report.page import Section, Table
 from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from faintspot.slopes import Stages
 
-_CSS_PIXELS_PER_INCH = 100
 NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A picture within the page: its data URI, its width in CSS pixels, and what it is in words."""
-
-    data: str
-    width: int
-    title: str
-    caption: str
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of texts; with `words` the last column is prose."""
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
-    words: bool = False
-
-
-@dataclass(frozen=True)
-class Section:
-    """A section of the page; `missing` says why something is not in it."""
-
-    name: str
-    title: str
-    text: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    pictures: Sequence[Picture] = ()
-    missing: str = ""
 
 
 @dataclass(frozen=True)
 class Run:
     """Everything that the sections are made of; see `make_run`."""
 
-    arms: Sequence[Arm]
+    arms: Sequence[MeasuredSlopes]
     layout: Layout | None
     stages: Mapping[str, Stages]
     truth: Floats | None
     example_frame: int
     why_no_stages: str
-    summaries: Sequence[Summary]
+    summaries: Sequence[SlopesSummary]
     jitters: Sequence[Jitter]
     valid: NDArray[np.bool_]
     """Measurements that are valid in every arm."""
 
 
 def make_run(
-    arms: Sequence[Arm],
+    arms: Sequence[MeasuredSlopes],
     layout: Layout | None,
     stages: Mapping[str, Stages],
     truth: Floats | None,
@@ -143,7 +110,7 @@ def _key_numbers(run: Run) -> Section:
     return Section("numbers", "Key numbers", tables=[table], text=notes)
 
 
-def _arm_numbers(arm: Arm, summary: Summary, scatter: Jitter) -> dict[str, str]:
+def _arm_numbers(arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter) -> dict[str, str]:
     return {
         "valid measurements": percentage(summary.valid_fraction),
         "median flux after background": _number(summary.median_flux_e, "e-", 3),
@@ -158,11 +125,11 @@ def _arm_numbers(arm: Arm, summary: Summary, scatter: Jitter) -> dict[str, str]:
     }
 
 
-def _iterated(arm: Arm, summary: Summary) -> bool:
+def _iterated(arm: MeasuredSlopes, summary: SlopesSummary) -> bool:
     return arm.is_denoised and bool(np.isfinite(summary.median_iterations))
 
 
-def _infeasible(arm: Arm) -> float:
+def _infeasible(arm: MeasuredSlopes) -> float:
     return arm.flag_count(SubapertureFlag.INFEASIBLE_STRENGTH) / arm.flags.size
 
 
@@ -196,7 +163,9 @@ def _truth_numbers(run: Run, truth: Floats) -> tuple[list[dict[str, str]], str]:
     return columns, note
 
 
-def _against(arm: Arm, last: Arm, truth: Floats, valid: NDArray[np.bool_]) -> dict[str, str]:
+def _against(
+    arm: MeasuredSlopes, last: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
+) -> dict[str, str]:
     ratio, error = error_ratio(arm, last, truth, valid)
     names = f"R of {last.name!r} / R", f"flux gain against {last.name!r}"
     if arm is last or not np.isfinite(ratio):
@@ -212,7 +181,7 @@ def _frame(run: Run) -> Section:
     if not run.stages:
         return Section("frame", title, missing=run.why_no_stages)
     truth = None if run.truth is None else run.truth[run.example_frame]
-    example = pictures.Example(run.layout, run.stages, truth)
+    example = frame_pictures.Example(run.layout, run.stages, truth)
     scale = (
         "The frames are in electrons already, so all four pictures share one colour scale."
         if example.raw_is_calibrated
@@ -221,7 +190,7 @@ def _frame(run: Run) -> Section:
     shown = next(iter(run.stages))
     circles = " and circles true ones" if truth is not None else ""
     marks = f"Images are those of {shown!r}. On the last one, crosses are measured positions{circles}. "
-    if len(run.layout) > pictures.MOST_MARKED:
+    if len(run.layout) > frame_pictures.MOST_MARKED:
         marks = f"Images are those of {shown!r}; positions are not marked in so many sub-apertures. "
     whole = (
         f"Frame {run.example_frame} with all windows at their places. {scale} {marks}Look for spots that "
@@ -234,9 +203,13 @@ def _frame(run: Run) -> Section:
     return Section(
         "frame",
         title,
-        pictures=[
-            _picture(pictures.whole_sensor(example), "The sensor after every step", whole),
-            _picture(pictures.zoom(example), "Three sub-apertures after every step", zoomed),
+        figures=[
+            FigureWithData(
+                "sensor", "The sensor after every step", whole, frame_pictures.whole_sensor(example)
+            ),
+            FigureWithData(
+                "subapertures", "Three sub-apertures after every step", zoomed, frame_pictures.zoom(example)
+            ),
         ],
     )
 
@@ -262,8 +235,8 @@ def _flux(run: Run) -> Section:
         "vignetted or off their spot, and a bright edge on one side means that the windows are shifted."
     )
     figure = maps.flux_and_validity(run.arms, run.summaries, run.layout)
-    picture = _picture(figure, "Maps of flux and validity", caption)
-    return Section("flux", "Flux and validity", tables=[table], pictures=[picture])
+    shown = FigureWithData("flux", "Maps of flux and validity", caption, figure)
+    return Section("flux", "Flux and validity", tables=[table], figures=[shown])
 
 
 def _slopes(run: Run) -> Section:
@@ -289,7 +262,8 @@ def _slopes(run: Run) -> Section:
         f"shifted layout, arrows to or from the middle are focus. Mean over the sensor: {tilts}.{noise}"
     )
     figure = maps.slope_arrows(run.arms, run.summaries, run.layout)
-    return Section("slopes", "Mean slopes", pictures=[_picture(figure, "Mean slopes as arrows", caption)])
+    shown = FigureWithData("slopes", "Mean slopes as arrows", caption, figure)
+    return Section("slopes", "Mean slopes", figures=[shown])
 
 
 def _iterations(run: Run) -> Section:
@@ -310,7 +284,8 @@ def _iterations(run: Run) -> Section:
     )
     arms, summaries = zip(*denoised, strict=True)
     figure = maps.iteration_counts(arms, summaries, run.layout)
-    return Section("iterations", "Iterations", pictures=[_picture(figure, "Iterations", caption)])
+    shown = FigureWithData("iterations", "Iterations", caption, figure)
+    return Section("iterations", "Iterations", figures=[shown])
 
 
 def _jitter(run: Run) -> Section:
@@ -336,21 +311,16 @@ def _jitter(run: Run) -> Section:
         "Dots: standard deviation over the frames. Line: the same from the median absolute deviation, which "
         "rare outliers do not touch: dots far above their line are outliers, not noise. Dotted: medians."
     )
-    shown = [_picture(maps.jitter_plot(run.arms, run.jitters), "Jitter of the sub-apertures", caption)]
+    plot = maps.jitter_plot(run.arms, run.jitters)
+    shown = [FigureWithData("jitter", "Jitter of the sub-apertures", caption, plot)]
     if run.layout is not None:
         where = (
             "Where the jitter is: rms of x and y over the frames, all maps on one scale. Look for the "
             "pupil's edge and for single sub-apertures that stand out (bad pixels, a neighbour's light)."
         )
-        shown.insert(
-            0, _picture(maps.jitter_maps(run.arms, run.jitters, run.layout), "Maps of the jitter", where)
-        )
-    return Section("jitter", title, text=text, pictures=shown)
-
-
-def _picture(figure: Figure, title: str, caption: str) -> Picture:
-    width = round(figure.get_size_inches()[0] * _CSS_PIXELS_PER_INCH)
-    return Picture(drawing.data_uri(figure), width, title, caption)
+        figure = maps.jitter_maps(run.arms, run.jitters, run.layout)
+        shown.insert(0, FigureWithData("jitter-map", "Maps of the jitter", where, figure))
+    return Section("jitter", title, text=text, figures=shown)
 
 
 def _mean(values: Floats) -> float:

@@ -8,10 +8,10 @@ import pytest
 from tests.loop.result_cases import made_up_budget, made_up_interleaved, made_up_magnitude, small_interleaved
 
 from faintspot.errors import InputError
+from faintspot.loop.report_page import loop_report, write_loop_report
+from faintspot.loop.report_sections import loop_sections, loop_warnings
 from faintspot.loop.results import MAGNITUDE_FILE
 from faintspot.loop.verdict import NOWHERE, LoopResults
-from faintspot.report.loop_page import loop_report, write_loop_report
-from faintspot.report.loop_sections import loop_sections, loop_warnings
 
 pytest.importorskip("hcipy")
 

@@ -12,9 +12,9 @@ import pytest
 from tests.study.study_cases import dataset, power_law
 
 from faintspot.errors import InputError
-from faintspot.report import study_page
-from faintspot.report.study_page import report_of_study, study_report
+from faintspot.report.drawing import svg
 from faintspot.study import paper
+from faintspot.study.page import report_of_study, study_report
 from faintspot.study.specification import StudySpecification, Sweep
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
@@ -29,12 +29,6 @@ def of(specification: StudySpecification, **options: Any) -> Any:
     return data
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study_page, "svg", lambda figure: b"")
-
-
-@pytest.mark.usefixtures("undrawn")
 class TestPage:
     def test_is_complete_and_in_order(self) -> None:
         html = study_report(of(paper.specification(quick=True)))
@@ -79,7 +73,7 @@ def test_pictures_are_svg_without_the_time_of_day() -> None:
     from faintspot.study.figures import sweep_figure
 
     data = of(paper.specification(quick=True, figures=["fig3"]))
-    first, second = (study_page.svg(sweep_figure(data, [0, 1], "a", "b").figure) for _ in range(2))
+    first, second = (svg(sweep_figure(data, [0, 1], "a", "b").figure) for _ in range(2))
     assert first == second
     assert b"<svg" in first
 

@@ -27,7 +27,7 @@ _BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of th
 
 
 @dataclass(frozen=True)
-class Arm:
+class MeasuredSlopes:
     """Slopes of all frames, measured in one way; every array has shape (n_frames, n_subapertures).
 
     Parameters
@@ -65,8 +65,8 @@ class Arm:
             object.__setattr__(self, field.name, array)
 
     @classmethod
-    def of(cls, name: str, slopes: Any) -> Arm:
-        """Make an arm of the `Slopes` of one frame or several."""
+    def of(cls, name: str, slopes: Any) -> MeasuredSlopes:
+        """Make one of the `Slopes` of one frame or several."""
         return cls(name, *(np.atleast_2d(getattr(slopes, field.name)) for field in fields(cls)[1:]))
 
     @property
@@ -94,11 +94,12 @@ class Arm:
         return int(np.count_nonzero((self.flags & int(flag)) == int(flag)))
 
 
+Arm = MeasuredSlopes  # its name in `faintspot.report`
+
+
 @dataclass(frozen=True)
-class Summary:
-    """One arm in numbers: of the whole run, and per sub-aperture, (n_subapertures,), over its valid "
-    "frames.
-    """
+class SlopesSummary:
+    """Slopes in numbers: of the whole run, and per sub-aperture, (n_subapertures,), over its valid frames."""
 
     valid_fraction: float
     median_flux_e: float
@@ -118,9 +119,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Jitter:
-    """Scatter of each sub-aperture's position over the frames, px, (n_subapertures,); NaN below two "
-    "frames.
-    """
+    """Scatter of each sub-aperture's position over frames, px, (n_subapertures,); NaN below two frames."""
 
     n_frames: NDArray[np.int64]
     x_px: Floats
@@ -150,13 +149,13 @@ class SlopeError:
     standard_error_px: float
     """NaN from a single measurement."""
     gain: float
-    """Centroid gain: slope of the estimate on the truth, x and y pooled; NaN where the truth does not "
-    "move."""
+    """Centroid gain: slope of the estimate on the truth, x and y pooled; NaN where the truth stands
+    still."""
     n: int
     """Number of measurements."""
 
 
-def summarise(arm: Arm) -> Summary:
+def summarise(arm: MeasuredSlopes) -> SlopesSummary:
     """Return the numbers of one arm."""
     valid = arm.valid
     parts: dict[str, list[Any]] = {name: [] for name in ("flux", "x", "y", "iterations")}
@@ -168,7 +167,7 @@ def summarise(arm: Arm) -> Summary:
     flux, x, y, iterations = (np.concatenate(part) for part in parts.values())
     some = bool(valid.any())
     limit = (arm.flags & int(SubapertureFlag.NOT_CONVERGED)) != 0
-    return Summary(
+    return SlopesSummary(
         valid_fraction=float(valid.mean()),
         median_flux_e=float(np.median(arm.flux[valid])) if some else np.nan,
         median_iterations=float(np.median(arm.iterations[valid])) if some else np.nan,
@@ -181,7 +180,7 @@ def summarise(arm: Arm) -> Summary:
     )
 
 
-def valid_in_all(arms: Sequence[Arm]) -> NDArray[np.bool_]:
+def valid_in_all(arms: Sequence[MeasuredSlopes]) -> NDArray[np.bool_]:
     """Return which measurements are valid in every arm, (n_frames, n_subapertures)."""
     valid: NDArray[np.bool_] = np.logical_and.reduce([arm.valid for arm in arms])
     return valid
@@ -210,7 +209,7 @@ def median(values: Floats) -> float:
     return float(np.median(kept)) if kept.size else np.nan
 
 
-def slope_error(arm: Arm, truth: Floats, valid: NDArray[np.bool_]) -> SlopeError:
+def slope_error(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> SlopeError:
     """Return the slope error R of an arm against the truth (n_frames, n_subapertures, 2), px."""
     n = int(np.count_nonzero(valid))
     if n == 0:
@@ -224,7 +223,9 @@ def slope_error(arm: Arm, truth: Floats, valid: NDArray[np.bool_]) -> SlopeError
     )
 
 
-def error_ratio(arm: Arm, reference: Arm, truth: Floats, valid: NDArray[np.bool_]) -> tuple[float, float]:
+def error_ratio(
+    arm: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
+) -> tuple[float, float]:
     """Return R of `reference` over R of `arm`, and the ratio's standard error, from paired measurements."""
     own, other = absolute_errors(arm, truth), absolute_errors(reference, truth)
     own_mean = own[valid].mean() if valid.any() else 0.0
@@ -243,7 +244,7 @@ def flux_gain(ratio: float) -> tuple[float, float]:
     return min(ratio, ratio**2), max(ratio, ratio**2)
 
 
-def absolute_errors(arm: Arm, truth: Floats) -> Floats:
+def absolute_errors(arm: MeasuredSlopes, truth: Floats) -> Floats:
     """Return (|dx| + |dy|) / 2 of every measurement, px."""
     errors: Floats = (np.abs(arm.x - truth[..., 0]) + np.abs(arm.y - truth[..., 1])) / 2
     return errors
@@ -309,7 +310,7 @@ def _divide(sums: Floats, counts: NDArray[np.int64]) -> Floats:
     return quotient
 
 
-def _gain(arm: Arm, truth: Floats, valid: NDArray[np.bool_]) -> float:
+def _gain(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> float:
     products, squares = 0.0, 0.0
     for axis, values in enumerate((arm.x, arm.y)):
         true = truth[..., axis][valid]

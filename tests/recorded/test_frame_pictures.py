@@ -7,14 +7,14 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
-from tests.report.report_cases import SETTINGS, sensor, simulated
+from tests.recorded.recorded_cases import SETTINGS, sensor, simulated
 from tests.shared_data import shared_file
 
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
+from faintspot.recorded.frame_pictures import Example, assembled, example_subapertures, whole_sensor
 from faintspot.report import layout_picture
 from faintspot.report.drawing import limits_of, new_figure, png, subaperture_shapes
-from faintspot.report.pictures import Example, assembled, example_subapertures, whole_sensor
 from faintspot.sensor.layout import Layout
 
 

@@ -11,17 +11,19 @@ from hypothesis import strategies as st
 
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
-from faintspot.report import statistics
-from faintspot.report.statistics import Arm
+from faintspot.recorded import statistics
+from faintspot.recorded.statistics import MeasuredSlopes
 
 
-def make_arm(n_frames: int, n: int, seed: int = 0, dark_fraction: float = 0.3, name: str = "TV") -> Arm:
+def make_arm(
+    n_frames: int, n: int, seed: int = 0, dark_fraction: float = 0.3, name: str = "TV"
+) -> MeasuredSlopes:
     rng = np.random.default_rng(seed)
     x, y = rng.normal(size=(2, n_frames, n)).astype(np.float32)
     dark = rng.random((n_frames, n)) < dark_fraction
     flags = np.where(dark, int(SubapertureFlag.NO_LIGHT), 0).astype(np.uint8)
     flux = rng.exponential(100.0, (n_frames, n)).astype(np.float32)
-    return Arm(name, x, y, flux, flags, rng.integers(1, 30, (n_frames, n)))
+    return MeasuredSlopes(name, x, y, flux, flags, rng.integers(1, 30, (n_frames, n)))
 
 
 def expected(values: np.ndarray, valid: np.ndarray, function: Any, least: int = 1) -> np.ndarray:
@@ -71,7 +73,7 @@ def test_summary_is_of_valid_measurements_only() -> None:
 def test_limit_fraction_counts_valid_measurements() -> None:
     flags = np.array([[32, 0, 33, 1]], np.uint8)  # NOT_CONVERGED; fine; both NO_LIGHT and NOT_CONVERGED; dark
     zero = np.zeros((1, 4))
-    arm = Arm("TV", zero, zero, zero, flags, np.ones((1, 4), int))
+    arm = MeasuredSlopes("TV", zero, zero, zero, flags, np.ones((1, 4), int))
     assert statistics.summarise(arm).limit_fraction == 0.5
     assert arm.flag_count(SubapertureFlag.NO_LIGHT) == 2
     assert arm.flag_count(SubapertureFlag.NO_LIGHT | SubapertureFlag.NOT_CONVERGED) == 1
@@ -101,7 +103,7 @@ def test_slope_error_is_the_projects_metric() -> None:
 def test_gain_is_that_of_a_shrinking_estimator() -> None:
     truth = np.random.default_rng(1).uniform(-1, 1, (50, 4, 2))
     zero = np.zeros((50, 4), np.uint8)
-    arm = Arm("half", 0.5 * truth[..., 0] + 0.3, 0.5 * truth[..., 1], zero + 1.0, zero, zero)
+    arm = MeasuredSlopes("half", 0.5 * truth[..., 0] + 0.3, 0.5 * truth[..., 1], zero + 1.0, zero, zero)
     assert statistics.slope_error(arm, truth, arm.valid).gain == pytest.approx(0.5)
     still = np.zeros_like(truth)
     assert np.isnan(statistics.slope_error(arm, still, arm.valid).gain)
@@ -124,7 +126,7 @@ def test_standard_error_sees_a_bias_of_each_subaperture() -> None:
 def test_error_ratio_and_flux_gain() -> None:
     truth = np.zeros((20, 3, 2))
     arm = make_arm(20, 3, dark_fraction=0.0)
-    worse = Arm("no TV", 2 * arm.x, 2 * arm.y, arm.flux, arm.flags, arm.iterations)
+    worse = MeasuredSlopes("no TV", 2 * arm.x, 2 * arm.y, arm.flux, arm.flags, arm.iterations)
     ratio, error = statistics.error_ratio(arm, worse, truth, arm.valid)
     assert ratio == pytest.approx(2.0)
     assert error == pytest.approx(0.0, abs=1e-6)
@@ -138,5 +140,5 @@ def test_error_ratio_and_flux_gain() -> None:
 def test_arms_that_do_not_fit_are_refused_in_one_line(change: dict[str, np.ndarray]) -> None:
     arrays = {name: np.zeros((2, 3)) for name in ("x", "y", "flux", "flags", "iterations")} | change
     with pytest.raises(InputError, match="TV") as error:
-        Arm("TV", **arrays)
+        MeasuredSlopes("TV", **arrays)
     assert "\n" not in str(error.value)

@@ -18,9 +18,9 @@ from faintspot.loop.analysis import (
     paired_differences,
     regression_lines,
 )
+from faintspot.loop.report_figures import standard_error, strehl_axis
 from faintspot.report.drawing import GREY, LIGHT_GREY, WIDTH, new_figure, styled
-from faintspot.report.loop_figures import standard_error, strehl_axis
-from faintspot.study.figure_data import StudyFigure
+from faintspot.report.figure_data import FigureWithData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ _GAP_S = 2.0  # between sets on the axis of time
 Floats = NDArray[np.float64]
 
 
-def interleaved_figures(table: Measurements, wavelength_m: float) -> Iterator[StudyFigure]:
+def interleaved_figures(table: Measurements, wavelength_m: float) -> Iterator[FigureWithData]:
     """Yield the figures of interleaved observations."""
     yield strehl_figure(table, strehl_axis(wavelength_m))
     yield differences_figure(table)
@@ -41,7 +41,7 @@ def interleaved_figures(table: Measurements, wavelength_m: float) -> Iterator[St
 
 
 @styled
-def strehl_figure(table: Measurements, label: str) -> StudyFigure:
+def strehl_figure(table: Measurements, label: str) -> FigureWithData:
     """Draw the paper's three panels: Strehl against time, against r0 and against strength."""
     figure = new_figure(WIDTH, 9.4)
     panels = figure.subplot_mosaic([["time", "time"], ["r0", "strength"]])
@@ -71,11 +71,11 @@ def strehl_figure(table: Measurements, label: str) -> StudyFigure:
         "band: mean "
         "of the measurements without TV and its standard error, which the drift of r0 widens."
     )
-    return StudyFigure("strehl", "Strehl with and without TV", caption, figure, *_measurement_rows(table))
+    return FigureWithData("strehl", "Strehl with and without TV", caption, figure, *_measurement_rows(table))
 
 
 @styled
-def differences_figure(table: Measurements) -> StudyFigure:
+def differences_figure(table: Measurements) -> FigureWithData:
     """Draw the paired differences from the neighbours without TV, by strength."""
     figure = new_figure(WIDTH * 0.7, 4.6)
     panel = figure.subplots()
@@ -97,11 +97,11 @@ def differences_figure(table: Measurements) -> StudyFigure:
         "with 95 %, where there are enough measurements for one. Grey: strengths 0.6 to 1.1."
     )
     header = ["strength_e", "difference", "low", "high", "measurements"]
-    return StudyFigure("differences", "Paired differences by strength", caption, figure, header, rows)
+    return FigureWithData("differences", "Paired differences by strength", caption, figure, header, rows)
 
 
 @styled
-def seeing_figure(table: Measurements) -> StudyFigure:
+def seeing_figure(table: Measurements) -> FigureWithData:
     """Draw r0 from the telemetry against the truth of the simulation."""
     figure = new_figure(WIDTH * 0.55, 5.6)
     panel = figure.subplots()
@@ -132,7 +132,7 @@ def seeing_figure(table: Measurements) -> StudyFigure:
         "few independent pieces of turbulence pass: single points scatter, the whole does not. Points beyond "
         "the axes are of a loop that had lost the star."
     )
-    return StudyFigure("seeing", "r0 from the telemetry", caption, figure, *_measurement_rows(table))
+    return FigureWithData("seeing", "r0 from the telemetry", caption, figure, *_measurement_rows(table))
 
 
 def _marker(group: str) -> dict[str, Any]:

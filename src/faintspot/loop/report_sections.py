@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from faintspot.errors import InputError
@@ -15,6 +12,23 @@ from faintspot.loop.analysis import (
 )
 from faintspot.loop.budget import TERM_MEANINGS
 from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.interleaved_figures import interleaved_figures
+from faintspot.loop.report_figures import (
+    budget_figure,
+    gain_figure,
+    magnitude_figure,
+    psf_figure,
+    strehl_axis,
+)
+from faintspot.loop.report_tables import (
+    centroid_gain_table,
+    difference_table,
+    gain_table,
+    regression_table,
+    seeing_table,
+    settings_table,
+    strehl_groups_table,
+)
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
 from faintspot.loop.statistics import paired_mean
 from faintspot.loop.verdict import (
@@ -25,25 +39,8 @@ from faintspot.loop.verdict import (
     reference_arm,
     tv_arm,
 )
-from faintspot.report.loop_figures import (
-    budget_figure,
-    gain_figure,
-    magnitude_figure,
-    psf_figure,
-    strehl_axis,
-)
-from faintspot.report.loop_panels import interleaved_figures
-from faintspot.report.loop_tables import (
-    centroid_gain_table,
-    difference_table,
-    gain_table,
-    regression_table,
-    seeing_table,
-    settings_table,
-    strehl_groups_table,
-)
-from faintspot.report.sections import Table
-from faintspot.study.figure_data import StudyFigure
+from faintspot.report.figure_data import FigureWithData
+from faintspot.report.page import Section, Table
 
 _FEW_REALISATIONS = 5
 _SHOWN_STRENGTH = 0.85  # of the images: in the middle of 0.6 to 1.1
@@ -52,24 +49,12 @@ _SLOPE_ERROR = "slope error"
 _NOT_RUN = "Not run: {} does that."
 
 
-@dataclass(frozen=True)
-class LoopSection:
-    """A section of the page; `missing` says why something is not in it."""
-
-    name: str
-    title: str
-    text: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    figures: Sequence[StudyFigure] = ()
-    missing: str = ""
-
-
-def loop_sections(results: LoopResults) -> list[LoopSection]:
+def loop_sections(results: LoopResults) -> list[Section]:
     """Return all sections in the page's order."""
     interleaved, magnitude, budget = results.interleaved, results.magnitude, results.budget
     lines = loop_verdict(results)
     sections = [
-        LoopSection("verdict", "What was found", lines, missing="" if lines else "Nothing to compare yet.")
+        Section("verdict", "What was found", lines, missing="" if lines else "Nothing to compare yet.")
     ]
     if interleaved is None:
         sections.append(_missing("interleaved", "Interleaved observations", "run"))
@@ -132,11 +117,11 @@ def configuration_of(results: LoopResults) -> LoopConfiguration | None:
         return None
 
 
-def _missing(name: str, title: str, command: str) -> LoopSection:
-    return LoopSection(name, title, missing=_NOT_RUN.format(f"“faintspot loop {command}”"))
+def _missing(name: str, title: str, command: str) -> Section:
+    return Section(name, title, missing=_NOT_RUN.format(f"“faintspot loop {command}”"))
 
 
-def _interleaved(result: InterleavedResult) -> list[LoopSection]:
+def _interleaved(result: InterleavedResult) -> list[Section]:
     table = measurements(result)
     record = result.records[0]
     strehl, *others = interleaved_figures(table, record.science_wavelength_m)
@@ -149,15 +134,15 @@ def _interleaved(result: InterleavedResult) -> list[LoopSection]:
     ]
     seeing = _seeing_line(table)
     return [
-        LoopSection(
+        Section(
             "interleaved",
             "Interleaved observations",
             text,
             [strehl_groups_table(result, table), regression_table(table)],
             [strehl],
         ),
-        LoopSection("differences", "Paired differences by strength", figures=others[:1]),
-        LoopSection("seeing", "r0 from the telemetry", seeing, [seeing_table(result)], others[1:]),
+        Section("differences", "Paired differences by strength", figures=others[:1]),
+        Section("seeing", "r0 from the telemetry", seeing, [seeing_table(result)], others[1:]),
     ]
 
 
@@ -181,7 +166,7 @@ def _seeing_line(table: Measurements) -> list[str]:
     return lines
 
 
-def _magnitude(result: MagnitudeResult) -> list[LoopSection]:
+def _magnitude(result: MagnitudeResult) -> list[Section]:
     reference = reference_arm(result)
     base = result.labels[reference]
     wavelength = LoopConfiguration.from_text(result.configuration).science.wavelength_m
@@ -200,21 +185,19 @@ def _magnitude(result: MagnitudeResult) -> list[LoopSection]:
         f"for all arms. Compared with {base}."
     ]
     return [
-        LoopSection(
+        Section(
             "magnitude",
             "Strehl against magnitude",
             text,
             tables,
             [magnitude_figure(result, reference, strehl_axis(wavelength))],
         ),
-        LoopSection(
-            "gain", "Centroid gain", tables=[centroid_gain_table(result)], figures=[gain_figure(result)]
-        ),
-        LoopSection("settings", "Tuned settings", tables=[settings_table(result)]),
+        Section("gain", "Centroid gain", tables=[centroid_gain_table(result)], figures=[gain_figure(result)]),
+        Section("settings", "Tuned settings", tables=[settings_table(result)]),
     ]
 
 
-def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | None) -> LoopSection:
+def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | None) -> Section:
     figure = None
     if magnitude is not None:
         figure = _images_of_arms(magnitude)
@@ -222,11 +205,11 @@ def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | 
         figure = _images_of_set(interleaved)
     title = "Long-exposure image with and without TV"
     if figure is None:
-        return LoopSection("psf", title, missing="Not drawn: arms with and without TV are not both there.")
-    return LoopSection("psf", title, figures=[figure])
+        return Section("psf", title, missing="Not drawn: arms with and without TV are not both there.")
+    return Section("psf", title, figures=[figure])
 
 
-def _images_of_arms(result: MagnitudeResult) -> StudyFigure | None:
+def _images_of_arms(result: MagnitudeResult) -> FigureWithData | None:
     tv, reference = tv_arm(result), reference_arm(result)
     if tv is None or tv == reference:
         return None
@@ -240,7 +223,7 @@ def _images_of_arms(result: MagnitudeResult) -> StudyFigure | None:
     return psf_figure(images, [result.labels[arm] for arm in (reference, tv)], where)
 
 
-def _images_of_set(result: InterleavedResult) -> StudyFigure | None:
+def _images_of_set(result: InterleavedResult) -> FigureWithData | None:
     strengths, record = result.strengths[0], result.records[0]
     without, strong = np.flatnonzero(np.isnan(strengths)), np.flatnonzero(strengths > 0)
     if not len(without) or not len(strong):
@@ -251,7 +234,7 @@ def _images_of_set(result: InterleavedResult) -> StudyFigure | None:
     return psf_figure([record.psf[without[0]], record.psf[tv]], names, where)
 
 
-def _budget(result: BudgetResult, results: LoopResults) -> LoopSection:
+def _budget(result: BudgetResult, results: LoopResults) -> Section:
     configuration = configuration_of(results)
     label = strehl_axis(1.65e-6 if configuration is None else configuration.science.wavelength_m)
     rows = []
@@ -270,7 +253,7 @@ def _budget(result: BudgetResult, results: LoopResults) -> LoopSection:
         + ".",
     )
     text = _budget_lines(result)
-    return LoopSection("budget", "Error budget", text, [table], [budget_figure(result, label)])
+    return Section("budget", "Error budget", text, [table], [budget_figure(result, label)])
 
 
 def _budget_lines(result: BudgetResult) -> list[str]:
