@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -140,6 +141,66 @@ def test_a_request_in_small_pieces(server: ControlServer) -> None:
         assert json.loads(connection.recv(1000)) == {"ok": True, "sum": 2}
 
 
+def test_others_are_answered_while_a_lengthy_command_lasts(path: Path) -> None:
+    """And lengthy ones are carried out one after the other."""
+    under_way: list[int] = []
+    most, go_on = [0], threading.Event()
+
+    def work(fields: dict[str, Any]) -> dict[str, Any]:
+        under_way.append(1)
+        most[0] = max(most[0], len(under_way))
+        go_on.wait(30)
+        under_way.pop()
+        return {"done": True}
+
+    done: list[dict[str, Any]] = []
+    with ControlServer(path, {**HANDLERS, "work": work}, lengthy=["work"]):
+        askers = [
+            threading.Thread(target=lambda: done.append(request(path, "work", timeout_s=60)))
+            for _ in range(3)
+        ]
+        for thread in askers:
+            thread.start()
+        while not under_way:
+            time.sleep(0.001)
+        assert is_well(path)
+        go_on.set()
+        for thread in askers:
+            thread.join()
+    assert done == [{"done": True}] * 3
+    assert most == [1]
+
+
+@pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt, GeneratorExit])
+@pytest.mark.parametrize("lengthy", [[], ["leave"]])
+def test_an_exit_in_a_command_is_an_error_of_that_command(
+    path: Path, kind: type[BaseException], lengthy: list[str]
+) -> None:
+    def leave(fields: dict[str, Any]) -> dict[str, Any]:
+        raise kind("for good")
+
+    with ControlServer(path, {**HANDLERS, "leave": leave}, lengthy=lengthy):
+        with pytest.raises(InputError, match=f"{kind.__name__}: for good"):
+            request(path, "leave", timeout_s=30)
+        assert is_well(path)
+
+
+def test_connections_leave_nothing_for_the_garbage_collector(server: ControlServer) -> None:
+    """Nobody collects while frames come: cycles of references would stay for good."""
+    is_well(server.path)
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(50):
+            is_well(server.path)
+            with connected(server.path) as connection:
+                connection.sendall(b"x" * (LARGEST_REQUEST + 10))
+                replies(connection)
+        assert gc.collect() < 50
+    finally:
+        gc.enable()
+
+
 # Bad clients
 
 
@@ -223,7 +284,7 @@ def test_clients_that_go_away_are_forgotten(server: ControlServer) -> None:
     end = time.monotonic() + 30
     while server._connections and time.monotonic() < end:
         time.sleep(0.01)
-    assert server._connections == []
+    assert not server._connections
 
 
 def test_many_clients_at_once(server: ControlServer) -> None:

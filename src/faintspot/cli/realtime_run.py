@@ -82,7 +82,7 @@ def run(
     from faintspot.pipeline import SlopePipeline
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
-    from faintspot.realtime.handlers import handlers_of
+    from faintspot.realtime.handlers import LENGTHY, handlers_of
     from faintspot.realtime.interleaving import Interleaving
     from faintspot.realtime.live import parse_subapertures
     from faintspot.realtime.manners import real_time
@@ -103,7 +103,8 @@ def run(
     )
     for source in modules:
         engine.modules.load(load_module(source))
-    with ControlServer(socket_path(name), handlers_of(engine)), real_time(processors, priority) as refused:
+    server = ControlServer(socket_path(name), handlers_of(engine), lengthy=LENGTHY)
+    with server, real_time(processors, priority) as refused:
         engine.refused = refused
         for line in refused:
             click.echo(f"not permitted, going on without: {line}", err=True)

@@ -6,14 +6,14 @@ A request is one line of JSON, {"command": NAME, ...}; the reply is one line as 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
-import selectors
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -83,9 +83,9 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
 class ControlServer:
     """Answers requests in a thread of its own, until it is closed.
 
-    Clients that hang, send garbage or go away neither stop it nor hold up others: nothing that it does waits
-    for one of them. Commands are carried out one after the other; one that takes long holds up the next.
-    Every process but those of the same user is told no.
+    Clients that hang, send garbage or go away neither stop it nor hold up others. Commands named in `lengthy`
+    are carried out one after the other in a second thread; all others are answered meanwhile. Every process
+    but those of the same user is told no.
 
     Parameters
     ----------
@@ -94,6 +94,8 @@ class ControlServer:
         remains of a dead one.
     handlers : mapping of str to function
         What each command does. An exception becomes the reply's error.
+    lengthy : collection of str
+        Commands that may take long.
 
     Raises
     ------
@@ -101,12 +103,12 @@ class ControlServer:
         When another server lives there, or the place is not private.
     """
 
-    def __init__(self, path: str | Path, handlers: Mapping[str, Handler]) -> None:
+    def __init__(
+        self, path: str | Path, handlers: Mapping[str, Handler], lengthy: Collection[str] = ()
+    ) -> None:
         self.path = Path(path)
-        self._handlers = dict(handlers)
-        self._uid = os.geteuid()
-        self._closing = False
-        self._connections: list[_Connection] = []
+        self._handlers, self._lengthy = dict(handlers), frozenset(lengthy)
+        self._connections: dict[asyncio.Task[None], None] = {}  # the one that was idle longest comes first
         self._lock_file = locked_beside(self.path)
         try:
             self._listener = bound_listener(self.path)
@@ -114,11 +116,10 @@ class ControlServer:
             os.close(self._lock_file)
             raise
         self._inode = os.stat(self.path).st_ino
-        self._waker, self._wake = socket.socketpair()
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._listener, selectors.EVENT_READ)
-        self._selector.register(self._wake, selectors.EVENT_READ)
-        self._thread = threading.Thread(target=self._serve, name="faintspot-control", daemon=True)
+        self._loop = asyncio.new_event_loop()
+        self._closing = asyncio.Event()
+        self._one_at_a_time = asyncio.Lock()
+        self._thread = threading.Thread(target=self._run, name="faintspot-control", daemon=True)
         self._thread.start()
 
     def __enter__(self) -> ControlServer:
@@ -129,68 +130,75 @@ class ControlServer:
 
     def close(self) -> None:
         """Stop answering and remove the socket; closing again does nothing."""
-        self._closing = True
-        with contextlib.suppress(OSError):
-            self._waker.send(b".")
+        with contextlib.suppress(RuntimeError):  # closed already
+            self._loop.call_soon_threadsafe(self._closing.set)
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
-    def _serve(self) -> None:
+    def _run(self) -> None:
         """The thread: until it is told to close."""
         try:
-            while not self._closing:
-                waiting = any(connection.can_answer for connection in self._connections)
-                patience = 0.0 if waiting else _IDLE_S / 4 if self._connections else None
-                for key, _ in self._selector.select(patience):
-                    if key.fileobj is self._listener:
-                        self._accept()
-                    elif isinstance(key.data, _Connection):
-                        self._attempt(key.data, key.data.transfer)
-                for connection in list(self._connections):
-                    # One request of each in turn, so that nobody who sends many holds up the others.
-                    self._attempt(connection, partial(connection.answer, self._reply))
-                now = time.monotonic()
-                for connection in [each for each in self._connections if now - each.active > _IDLE_S]:
-                    self._drop(connection)
+            with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+                runner.run(self._serve())
         finally:
-            self._release()
+            with contextlib.suppress(OSError):  # the socket file only where it is still this server's
+                if os.stat(self.path).st_ino == self._inode:
+                    os.unlink(self.path)
+                    os.unlink(lock_path(self.path))
+            self._listener.close()
+            os.close(self._lock_file)
 
-    def _accept(self) -> None:
-        try:
-            accepted, _ = self._listener.accept()
-        except BlockingIOError:
-            return
-        except OSError:  # no file descriptor left, mostly: make room
-            if self._connections:
-                self._drop(min(self._connections, key=lambda each: each.active))
-            time.sleep(_PAUSE_S)
-            return
-        accepted.setblocking(False)
-        if peer_uid(accepted) != self._uid:
-            with contextlib.suppress(OSError):
-                accepted.send(_encoded(_refusal("this engine answers only the user that runs it")))
-            accepted.close()
-            return
-        if len(self._connections) >= _MOST_CONNECTIONS:
-            self._drop(min(self._connections, key=lambda each: each.active))
-        self._connections.append(_Connection(accepted, self._selector))
+    async def _serve(self) -> None:
+        accepting = asyncio.create_task(self._accept())
+        await self._closing.wait()
+        for task in (accepting, *self._connections):
+            task.cancel()
 
-    def _attempt(self, connection: _Connection, action: Callable[[], None]) -> None:
-        """Do something with a connection; close it where it is over."""
-        try:
-            if connection in self._connections:  # not closed meanwhile, to make room
-                action()
-        except OSError:
-            connection.over = True
-        if connection.over:
-            self._drop(connection)
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(self._listener)
+            except OSError:  # no file descriptor left, mostly
+                self._make_room()
+                await asyncio.sleep(_PAUSE_S)
+                continue
+            if len(self._connections) >= _MOST_CONNECTIONS:
+                self._make_room()
+            connection.setblocking(False)
+            task = loop.create_task(self._converse(connection))
+            self._connections[task] = None
+            task.add_done_callback(partial(self._end, connection))
 
-    def _drop(self, connection: _Connection) -> None:
-        if connection in self._connections:
-            self._connections.remove(connection)
-            connection.close()
+    def _make_room(self) -> None:
+        """End the connection that was idle longest."""
+        if self._connections:
+            task = next(iter(self._connections))
+            del self._connections[task]
+            task.cancel()
 
-    def _reply(self, line: bytes) -> bytes:
+    def _end(self, connection: socket.socket, task: asyncio.Task[None]) -> None:
+        self._connections.pop(task, None)
+        connection.close()
+
+    async def _converse(self, connection: socket.socket) -> None:
+        """Answer the requests of one connection until it ends, or is idle for too long."""
+        # Not with asyncio's streams: each leaves a cycle of references behind, and nobody collects those
+        # while frames come.
+        task, inbox = asyncio.current_task(), bytearray()
+        with contextlib.suppress(OSError, TimeoutError):
+            try:
+                if peer_uid(connection) != os.geteuid():
+                    raise InputError("this engine answers only the user that runs it")
+                while line := await _next_line(connection, inbox):
+                    await _send(connection, await self._reply(line))
+                    if task in self._connections:  # it becomes the one that was idle last
+                        self._connections[task] = self._connections.pop(task)
+                    await asyncio.sleep(0)  # who sends many requests at once does not hold up the others
+            except InputError as error:
+                await _send(connection, _encoded(_refusal(str(error))))
+
+    async def _reply(self, line: bytes) -> bytes:
         """Carry out one request; whatever happens, there is a reply."""
         try:
             fields = _parsed_request(line)
@@ -198,103 +206,68 @@ class ControlServer:
             if not isinstance(command, str) or command not in self._handlers:
                 known = ", ".join(sorted(self._handlers))
                 raise InputError(f"command = {command!r:.80}: expected one of {known}")
-            reply = _encoded({"ok": True, **self._handlers[command](fields)})
-            if len(reply) > _LARGEST_REPLY:
-                raise InputError(f"reply: expected at most {_LARGEST_REPLY} bytes, got {len(reply)}")
-            return reply
         except InputError as error:
             return _encoded(_refusal(str(error)))
-        except Exception as error:  # a fault of a command must not end the channel
-            return _encoded(_refusal(f"{type(error).__name__}: {error}"))
-
-    def _release(self) -> None:
-        """Give back everything; the socket file only where it is still this server's."""
-        for connection in list(self._connections):
-            self._drop(connection)
-        self._selector.close()
-        with contextlib.suppress(OSError):
-            if os.stat(self.path).st_ino == self._inode:
-                os.unlink(self.path)
-                os.unlink(lock_path(self.path))
-        for end in (self._listener, self._wake, self._waker):
-            end.close()
-        os.close(self._lock_file)
+        work = partial(_answer, self._handlers[command], fields)
+        if command not in self._lengthy:
+            return work()
+        async with self._one_at_a_time:
+            return await _in_thread(work)
 
 
-class _Connection:
-    """One client: what it has sent so far, and what it has not read yet."""
+async def _next_line(connection: socket.socket, inbox: bytearray) -> bytes:
+    """Wait for the end of a line; empty where the connection ends before. InputError when it is too long."""
+    loop = asyncio.get_running_loop()
+    async with asyncio.timeout(_IDLE_S):
+        while not (size := inbox.find(b"\n") + 1) and len(inbox) < LARGEST_REQUEST:
+            data = await loop.sock_recv(connection, LARGEST_REQUEST)
+            if not data:
+                return b""
+            inbox += data
+    if not 0 < size <= LARGEST_REQUEST:
+        raise InputError(f"request: expected at most {LARGEST_REQUEST} bytes in one line")
+    line = bytes(inbox[:size])
+    del inbox[:size]
+    return line
 
-    def __init__(self, connection: socket.socket, selector: selectors.BaseSelector) -> None:
-        self._socket, self._selector = connection, selector
-        self._inbox, self._outbox = bytearray(), memoryview(b"")
-        self._finished = False  # no more requests; to be closed when the reply is gone
-        self.over = False
-        self.active = time.monotonic()
-        self._selector.register(connection, selectors.EVENT_READ, self)
 
-    @property
-    def can_answer(self) -> bool:
-        """Whether there is a request to carry out now; none before the reply to the last one is gone."""
-        return not self._outbox and not self.over and b"\n" in self._inbox
+async def _send(connection: socket.socket, reply: bytes) -> None:
+    async with asyncio.timeout(_IDLE_S):
+        await asyncio.get_running_loop().sock_sendall(connection, reply)
 
-    def transfer(self) -> None:
-        """Send or receive what can be without waiting."""
-        if self._outbox:
-            self._send()
-        elif not self.can_answer:  # else first that request: at most one more fits beside it
-            self._receive()
 
-    def answer(self, reply: Callable[[bytes], bytes]) -> None:
-        """Carry out the next request, if there is one."""
-        if not self.can_answer:
-            return
-        line, _, rest = bytes(self._inbox).partition(b"\n")
-        self._inbox = bytearray(rest)
-        if len(line) >= LARGEST_REQUEST:
-            self._refuse_size()
-        else:
-            self._outbox = memoryview(reply(line))
-        self.active = time.monotonic()
-        self._send()
+async def _in_thread(work: Callable[[], bytes]) -> bytes:
+    """Wait for what a function returns in a thread of its own; the end of the process waits for neither."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[bytes] = loop.create_future()
 
-    def close(self) -> None:
-        """Close it."""
-        self._selector.unregister(self._socket)
-        self._socket.close()
+    def finish(reply: bytes) -> None:
+        if not done.done():  # else nobody waits any more
+            done.set_result(reply)
 
-    def _receive(self) -> None:
-        try:
-            data = self._socket.recv(LARGEST_REQUEST)
-        except BlockingIOError:
-            return
-        self._inbox += data
-        if not data:
-            # Requests that came before the end are still answered; what has no line's end is none.
-            self._finished = True
-        elif b"\n" not in self._inbox and len(self._inbox) >= LARGEST_REQUEST:
-            self._refuse_size()
-            self._send()
-        self._watch()
+    def run() -> None:
+        reply = work()
+        with contextlib.suppress(RuntimeError):  # the server was closed meanwhile
+            loop.call_soon_threadsafe(finish, reply)
 
-    def _refuse_size(self) -> None:
-        text = f"request: expected at most {LARGEST_REQUEST} bytes in one line"
-        self._outbox = memoryview(_encoded(_refusal(text)))
-        self._inbox.clear()
-        self._finished = True
-
-    def _send(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            self._outbox = self._outbox[self._socket.send(self._outbox) :]
-        self._watch()
-
-    def _watch(self) -> None:
-        """Choose what to wait for next."""
-        self.over = self._finished and not self._outbox and not self.can_answer
-        events = selectors.EVENT_WRITE if self._outbox else selectors.EVENT_READ
-        self._selector.modify(self._socket, events, self)
+    threading.Thread(target=run, name="faintspot-command", daemon=True).start()
+    return await done
 
 
 # Messages -------------------------------------------------------------------------------------------
+
+
+def _answer(handler: Handler, fields: dict[str, Any]) -> bytes:
+    """Carry out a command; whatever happens, there is a reply."""
+    try:
+        reply = _encoded({"ok": True, **handler(fields)})
+        if len(reply) > _LARGEST_REPLY:
+            raise InputError(f"reply: expected at most {_LARGEST_REPLY} bytes, got {len(reply)}")
+        return reply
+    except InputError as error:
+        return _encoded(_refusal(str(error)))
+    except BaseException as error:  # a fault of a command must not end the channel, nor an exit in one
+        return _encoded(_refusal(f"{type(error).__name__}: {error}"))
 
 
 def _encoded(message: Mapping[str, Any]) -> bytes:

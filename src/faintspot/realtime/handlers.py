@@ -10,6 +10,8 @@ from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.modules import module_handlers
 
+LENGTHY = ("set", "load", "swap", "unload")
+"""Commands that make something anew, which may compile: other commands are answered meanwhile."""
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
