@@ -137,6 +137,46 @@ class SlopePipeline:
         other.on_device = None if self.on_device is None else other._device_pipeline()
         return other
 
+    def with_settings(self, settings: Settings) -> SlopePipeline:
+        """Return the same pipeline with other settings.
+
+        Raises
+        ------
+        InputError
+            When they do not fit.
+        """
+        psf, score, zero = self._parts
+        return SlopePipeline(
+            self.layout,
+            settings,
+            self.calibration,
+            zero - self.layout.offsets,
+            psf=psf,
+            score=score,
+            width=self.width,
+            threads=self.threads,
+            device=self.device,
+        )
+
+    def for_images(self) -> SlopePipeline:
+        """Return the same pipeline for calibrated images (n, ny, nx), electrons, read as one tall frame."""
+        layout, camera, (ny, nx) = self.layout, self.calibration, self.layout.window
+        n = len(layout)
+        corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
+        centres = corners[:, ::-1] + 0.5 * (np.array([nx, ny]) - 1) + layout.offsets
+        other = copy.copy(self)
+        other.layout = Layout((n * ny, nx), (ny, nx), corners, centres)
+        other.calibration = Calibration(
+            gain_e_per_adu=camera.em_gain,
+            em_gain=camera.em_gain,
+            read_noise_e=camera.read_noise_e,
+            background_e=camera.background_e,
+        )
+        other._calibration = packed_calibration(other.layout, other.calibration, self.width)
+        other.preparation = other._prepared()
+        other.device, other.on_device = "cpu", None
+        return other
+
     @property
     def needs_light(self) -> bool:
         """Whether settings follow the light of each frame, which is looked at before it is measured."""

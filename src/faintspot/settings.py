@@ -38,8 +38,8 @@ class _Shared(Options):
     error_scale: Any = option(1.0, "Factor on the standard errors.", low=0.0, high=1e3, low_open=True)
     flux_e: Any = option(
         None,
-        'Light expected of a spot in a frame, for estimators that use it and for "auto". Default: measured in '
-        "each frame, as the mean of all sub-apertures.",
+        'Light expected of a spot in a frame, for estimators that use it and for "auto". Default: measured '
+        "in each frame, as the mean of all sub-apertures.",
         unit="e-",
         low=0.0,
         high=1e12,
@@ -225,7 +225,7 @@ class Settings:
         wanted = changes.get("estimator", self.estimator.name)
         given = {name: value for name, value in changes.items() if name != "estimator"}
         if isinstance(wanted, Estimator):
-            return Settings(wanted, **{**vars(self._shared), **given})
+            return self._of(wanted, self._shared.replaced(given))
         name, options = current_options(wanted, given)
         kept = {
             key: getattr(self.estimator, key)
@@ -278,6 +278,46 @@ def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
+def without_denoising(settings: Settings, where: str) -> Settings:
+    """Return settings with the same estimator without its denoising.
+
+    Raises
+    ------
+    InputError
+        When it has none; the text says `where` that was asked for.
+    """
+    plain = settings.estimator.without_denoising()
+    if plain is None:
+        raise InputError(
+            f"{where}: the estimator {settings.estimator.name!r} ({settings.estimator.label}) does not "
+            "denoise; leave this out, or set another estimator"
+        )
+    return settings.replace(estimator=plain)
+
+
+def with_preset(settings: Settings, preset: str) -> Settings:
+    """Return settings whose estimator does as much work as a preset says.
+
+    Raises
+    ------
+    InputError
+        When it does the same work always.
+    """
+    if "preset" not in settings.estimator.declared():
+        others = ", ".join(repr(name) for name, kind in estimators().items() if "preset" in kind.declared())
+        raise InputError(
+            f"preset = {preset!r}: the estimator {settings.estimator.name!r} does the same work always; "
+            f"{others} have presets"
+        )
+    return settings.replace(preset=preset)
+
+
+def option_names() -> list[str]:
+    """Return the names of all options of all estimators, and of the shared ones; "estimator" is the first."""
+    own = (name for kind in estimators().values() for name in kind.declared())
+    return list(dict.fromkeys(["estimator", *own, *Settings.SHARED]))
+
+
 def spot_fwhm_px(settings: Settings, n_subapertures: int, pixels: int) -> NDArray[np.float64]:
     """Return the widths (n, 2) of the spots along x and y that settings give; NaN where they give none."""
     along, across = (
@@ -287,4 +327,4 @@ def spot_fwhm_px(settings: Settings, n_subapertures: int, pixels: int) -> NDArra
     return np.column_stack([along, np.where(np.isnan(across), along, across)])
 
 
-__all__ = ["Settings", "check_option", "spot_fwhm_px"]
+__all__ = ["Settings", "check_option", "option_names", "spot_fwhm_px", "with_preset", "without_denoising"]

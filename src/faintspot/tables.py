@@ -1,4 +1,4 @@
-"""Tables of a configuration file (faintspot.toml): read, checked, written; what else it holds stays as it is."""
+"""Tables of a configuration file (faintspot.toml): read, checked, written; what else it holds stays."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def run(
         for line in refused:
             click.echo(f"not permitted, going on without: {line}", err=True)
         click.echo(
-            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator}; waiting for frames, "
+            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
             "Ctrl-C stops"
         )
         with stop_on_signal() as stop:

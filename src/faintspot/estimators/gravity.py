@@ -20,6 +20,7 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
 from faintspot.kernels.flat_start import NO_TABLE
+from faintspot.kernels.groups import Task
 from faintspot.options import is_auto, option
 
 Floats = NDArray[np.float64]
@@ -110,9 +111,9 @@ class GravityPrepared(Prepared):
 
     def __init__(self, estimator: Gravity, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
-        keeping = isinstance(estimator, KeepingBrightest)
-        self._keeps = keeping
-        self.needs_light = keeping and estimator.is_automatic and bool(np.isnan(sensor.flux_e).all())
+        self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
+        automatic = self._keeping is not None and self._keeping.is_automatic
+        self.needs_light = automatic and bool(np.isnan(sensor.flux_e).all())
 
     # What the kernel, and that of the GPU, reads ------------------------------------------------------
 
@@ -146,6 +147,18 @@ class GravityPrepared(Prepared):
         """See `Prepared`."""
         return gravity.gravity_scratch
 
+    def part(self, task: Task, *, denoise: bool, background: bool) -> tuple[Any, Task]:
+        """Return the kernel and its task for some of the stages: others before and after do the rest."""
+        if background and (denoise or self.before == gravity.NOTHING):
+            return self.kernel, task
+        before = self.before if denoise else gravity.NOTHING
+        tables = gravity.GravityTables(before, self.algorithm, self.flat_start, self.taps)
+        settings = task.settings
+        if not background:
+            settings = settings.copy()
+            keep_all(settings.swapaxes(0, 1))
+        return gravity.gravity_of_groups, task._replace(settings=settings, tables=tables)
+
     # Settings ---------------------------------------------------------------------------------------
 
     def fill(self, table: NDArray[np.float32]) -> None:
@@ -154,12 +167,13 @@ class GravityPrepared(Prepared):
 
     def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `Prepared`."""
-        if not self._keeps:
+        if self._keeping is None:
             keep_all(table)
             return
-        keep = (
-            self.each("keep_brightest") if not is_auto(self._option("keep_brightest")) else self._kept(flux_e)
-        )
+        keep = self.each("keep_brightest")
+        if is_auto(self._keeping.keep_brightest):
+            method = self._keeping.automatic_method
+            keep = automatic_kept_pixels(**self.rule_arguments(flux_e), method=method)
         pixels, rules = self.sensor.pixels, self.each("rule")
         for rule in np.unique(rules):
             selected = rules == rule
@@ -189,13 +203,6 @@ class GravityPrepared(Prepared):
             "elongation": optical.max(axis=1) / optical.min(axis=1),
             "position_range_px": np.where(np.isfinite(reach), reach, _USUAL_RANGE_PX),
         }
-
-    def _option(self, name: str) -> Any:
-        return getattr(self.estimator, name)
-
-    def _kept(self, flux_e: Floats) -> NDArray[Any]:
-        assert isinstance(self.estimator, KeepingBrightest)
-        return automatic_kept_pixels(**self.rule_arguments(flux_e), method=self.estimator.automatic_method)
 
 
 def keep_all(table: NDArray[np.float32]) -> None:

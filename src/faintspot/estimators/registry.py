@@ -87,7 +87,7 @@ def _load() -> None:
             point.load()
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".split("\n")[0]
+            package = point.dist.name if point.dist else "?"
             raise InputError(
-                f"estimator {point.name!r} of the package {point.dist.name if point.dist else '?'}: {reason}; "
-                "mend or uninstall it"
+                f"estimator {point.name!r} of the package {package}: {reason}; mend or uninstall it"
             ) from None

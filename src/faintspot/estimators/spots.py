@@ -21,7 +21,7 @@ BLURS = (0.4, 0.0, 0.8, 1.2)
 
 
 class SpotPrepared(Prepared):
-    """Settings and tables of an estimator that reads profiles of the spots, or of weights that follow them."""
+    """Settings and tables of an estimator that reads profiles of spots, or of weights that follow them."""
 
     setting_rows = located.SETTING_ROWS
 

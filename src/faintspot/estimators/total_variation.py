@@ -44,8 +44,8 @@ class TotalVariation(KeepingBrightest):
     )
     tolerance: Any = option(
         None,
-        "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. Default: "
-        'that of the preset, 0.01 or, with "fast", 0: only the limit stops it.',
+        "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. "
+        'Default: that of the preset, 0.01 or, with "fast", 0: only the limit stops it.',
         low=0.0,
         high=1.0,
     )

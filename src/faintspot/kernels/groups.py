@@ -1,8 +1,8 @@
 """From frames to slopes, group by group of W sub-apertures: one driver for every estimator.
 
 The driver gathers and calibrates a group, an estimator's own kernel locates its spots, and the driver stores
-what was found. Every function here works on the groups [start, stop), so that threads can share a job; results
-do not depend on how they do.
+what was found. Every function here works on the groups [start, stop), so that threads can share a job;
+results do not depend on how they do.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ SATURATED = int(SubapertureFlag.SATURATED)
 ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE, EXCESS, ERROR_SCALE = range(7)
 COMMON_ROWS = 7
 
-# Rows of a group's results (RESULT_ROWS, W): position (px from the window's middle), light (e-), standard errors.
+# Rows of a group's results (RESULT_ROWS, W): position (px from the window's middle), light (e-), standard
+# errors.
 X, Y, FLUX, ERROR_X, ERROR_Y = range(5)
 RESULT_ROWS = 5
 
@@ -128,14 +129,17 @@ def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Sc
         aligned_zeros((pixels + 1) * width, lanes.dtype),
         aligned_zeros(pixels * width, lanes.dtype),
         aligned_zeros(RESULT_ROWS * width, lanes.dtype),
-        *(np.zeros(width, np.int64) for _ in range(4)),
+        np.zeros(width, np.int64),
+        np.zeros(width, np.int64),
+        np.zeros(width, np.int64),
+        np.zeros(width, np.int64),
         own,
     )
 
 
 @compiled
 def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
-    """Gather and calibrate the W sub-apertures of a group; counts of bad and saturated pixels in `results`."""
+    """Gather and calibrate the W sub-apertures of a group; numbers of bad, saturated pixels in `results`."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
     n, line = source.corners.shape[0], source.frames.shape[2]

@@ -126,7 +126,7 @@ class Engine:
             "source_refused": self._unfit or None,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
-            "estimator": self.live.settings.estimator,
+            "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.pipeline.layout),
             "arms": self.interleaving.labels,
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},

@@ -148,7 +148,7 @@ class Programmes:
         """
         pipeline = self._make_pipeline(settings)
         pipelines = [
-            self._make_pipeline(settings.replace(**arm.changes)) if arm.changes else pipeline
+            pipeline if (own := arm.of(settings)) is settings else self._make_pipeline(own)
             for arm in self._interleaving.arms
         ]
         for each in pipelines:

@@ -20,6 +20,7 @@ from faintspot.io.locations import split_location
 from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import VARIABLES
 from faintspot.pipeline import SlopePipeline
+from faintspot.settings import with_preset, without_denoising
 from faintspot.slopes import Slopes
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
@@ -104,9 +105,9 @@ def measure_recorded(
     """
     layout, settings, calibration, psf, score = configuration.load_all(configuration_file)
     if not denoise:
-        settings = settings.replace(denoise=False)
+        settings = without_denoising(settings, "denoise = False")
     if preset is not None:
-        settings = settings.replace(preset=preset)
+        settings = with_preset(settings, preset)
     positions = read_array(reference) if isinstance(reference, str | Path) else reference
     try:
         pipeline = SlopePipeline(
