@@ -44,6 +44,10 @@ class FileFormat:
         """Read slopes; any usual exception when there are none, InputError when it knows the reason."""
         raise NotImplementedError
 
+    def has_slopes(self, path: Path) -> bool:
+        """Tell slopes from other arrays in a file whose name ends like one of slopes."""
+        return True
+
     def finished(self, path: Path) -> Begun | None:
         """Return what a finished output says of itself, or None when there is none."""
         if not path.exists():

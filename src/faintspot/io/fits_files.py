@@ -23,7 +23,7 @@ from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
-from faintspot.io.slopes_format import StoredSlopes
+from faintspot.io.slopes_format import REQUIRED, StoredSlopes
 
 _BLOCK_BYTES = 2880
 _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
@@ -64,6 +64,10 @@ class Fits(FileFormat):
         from faintspot.io.slopes_fits import read_fits
 
         return read_fits(path)
+
+    def has_slopes(self, path: Path) -> bool:
+        """Tell by the names of the extensions."""
+        return {name.upper() for name in (*REQUIRED, "attributes")} <= {unit.name for unit in _units(path)}
 
 
 class FitsGz(Fits):

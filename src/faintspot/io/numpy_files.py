@@ -15,7 +15,7 @@ from faintspot.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
 from faintspot.io.raw import DAMAGE, MappedArray, RawArray, pieces
-from faintspot.io.slopes_format import VARIABLES, StoredSlopes, with_absent
+from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, with_absent
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,13 @@ class Npz(FileFormat):
         variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
         attributes = json.loads(str(arrays.pop("attributes")))
         return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
+
+    def has_slopes(self, path: Path) -> bool:
+        """Tell by the names of the arrays."""
+        if not zipfile.is_zipfile(path):
+            return False
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in (*REQUIRED, "attributes")} <= set(archive.namelist())
 
 
 def _find_npy(path: Path, key: str | None) -> StoredArray:

@@ -82,6 +82,15 @@ class Zarr(FileFormat):
 
         return read_store(path)
 
+    def has_slopes(self, path: Path) -> bool:
+        """Tell by the attributes of the store."""
+        from faintspot.io.slopes_zarr import describe_store
+
+        try:
+            return describe_store(path) is not None
+        except InputError:
+            return False
+
     def finished(self, path: Path) -> Begun | None:
         """Return what a complete store says of itself."""
         from faintspot.io.slopes_zarr import describe_store
