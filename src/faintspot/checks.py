@@ -50,7 +50,8 @@ def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray
 
 def _masked_as_nan(value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
     """Return a masked array as floats that hold its values, float32 where that does, and NaN."""
-    filled: NDArray[Any] = value.astype(np.result_type(value.dtype, np.float32)).filled(np.nan)
+    dtype = np.result_type(value.dtype, np.float32)
+    filled: NDArray[Any] = np.ma.filled(value.astype(dtype), np.nan)
     return filled
 
 

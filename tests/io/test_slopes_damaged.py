@@ -76,7 +76,7 @@ def test_astropy_verifies_the_checksums(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["x", "flags", "valid", "centre_x"])
 @pytest.mark.parametrize("damage", ["lost", "empty", "short", "bit"])
 def test_chunk(store: Path, name: str, damage: str) -> None:
-    chunk = store / name / "c" / ("0" if name == "centre_x" else "2/0")
+    chunk = store / name / ("c.0" if name == "centre_x" else "c.2.0")
     content = bytearray(chunk.read_bytes())
     content[5] ^= 4
     if damage == "lost":
@@ -93,7 +93,7 @@ def test_chunk_that_is_damaged_while_a_run_is_interrupted(tmp_path: Path) -> Non
     path = tmp_path / "slopes.zarr"
     with writer_for(path) as writer:
         writer.append(0, part(whole(), 0, 13))
-    (path / "y" / "c" / "0" / "0").write_bytes(b"")
+    (path / "y" / "c.0.0").write_bytes(b"")
     with pytest.raises(InputError, match="the store is damaged: y "):
         writer_for(path)
 

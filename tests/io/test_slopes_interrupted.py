@@ -98,7 +98,7 @@ class TestDiskFull:
         original = LocalStore.set
 
         async def full(self: Any, key: str, value: Any, *rest: Any) -> None:
-            if key.startswith("iterations/c/2"):
+            if key.startswith("iterations/c.2"):
                 raise OSError(errno.ENOSPC, "No space left on device")
             await original(self, key, value, *rest)
 

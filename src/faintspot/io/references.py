@@ -54,8 +54,11 @@ def _mean_positions(path: Path, slopes: StoredSlopes) -> NDArray[np.float64]:
     if not count.any():
         raise InputError(f"{path}: expected slopes to take as reference, found none that is valid")
     sums = [np.sum(slopes.variables[name], axis=0, where=valid, dtype=np.float64) for name in ("x", "y")]
-    means = np.stack(sums, axis=1) / np.maximum(count, 1)[:, np.newaxis]
-    before = np.asarray(slopes.attributes.get("reference", np.zeros_like(means)), np.float64)
+    means: NDArray[np.float64] = np.stack(sums, axis=1) / np.maximum(count, 1)[:, np.newaxis]
+    before: NDArray[np.float64] = np.asarray(
+        slopes.attributes.get("reference", np.zeros_like(means)), np.float64
+    )
     if before.ndim == 1:
         before = before.reshape(2, -1).T
-    return means + before
+    means += before
+    return means
