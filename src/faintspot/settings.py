@@ -20,7 +20,7 @@ from faintspot.toml_files import check_known
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Shared(Options):
+class SharedOptions(Options):
     """What every estimator is told."""
 
     search_range_px: Any = option(
@@ -84,11 +84,11 @@ class Settings:
     ('maximum likelihood', 0.1)
     """
 
-    SHARED: ClassVar[tuple[str, ...]] = tuple(_Shared.declared())
+    SHARED: ClassVar[tuple[str, ...]] = tuple(SharedOptions.declared())
 
     estimator: Estimator
     """How a position is found."""
-    _shared: _Shared
+    _shared: SharedOptions
 
     def __init__(self, estimator: str | Estimator | None = None, **options: Any) -> None:
         if isinstance(estimator, Estimator):
@@ -107,7 +107,7 @@ class Settings:
             made = kind(**own)
         put = object.__setattr__
         put(self, "estimator", made)
-        put(self, "_shared", _Shared(**{k: v for k, v in options.items() if k in self.SHARED}))
+        put(self, "_shared", SharedOptions(**{k: v for k, v in options.items() if k in self.SHARED}))
         check_lengths(made, self._shared)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -235,7 +235,7 @@ class Settings:
         return Settings(name, **{**vars(self._shared), **kept, **options})
 
     @classmethod
-    def _of(cls, estimator: Estimator, shared: _Shared) -> Settings:
+    def _of(cls, estimator: Estimator, shared: SharedOptions) -> Settings:
         return cls(estimator, **vars(shared))
 
     def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:

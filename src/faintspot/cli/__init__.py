@@ -13,6 +13,7 @@ from faintspot.errors import InputError, MissingExtraError
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
+    "estimators": "List the estimators, or the options of one.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "loop": "Measure what a method gains in a closed adaptive-optics loop, in simulation.",
     "realtime": "Measure frames as they arrive, row by row, and publish slopes in shared memory.",

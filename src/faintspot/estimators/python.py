@@ -87,7 +87,7 @@ class PythonPrepared(Prepared):
             array = np.asarray(found)
             if array.shape != (n, 2):
                 raise InputError(
-                    f"estimator {self.estimator.name!r}: locate: expected an array ({n}, 2), got {array.shape}"
+                    f"estimator {self.estimator.name!r}: locate: expected ({n}, 2), got {array.shape}"
                 )
             found = Positions(array[:, 0], array[:, 1])
         light = images.sum(axis=(1, 2)) if found.flux is None else found.flux
