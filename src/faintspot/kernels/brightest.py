@@ -161,39 +161,39 @@ def _step_exactly(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high
 
 
 @compiled
-def find_threshold(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
+def find_threshold(lanes: Any, image: Any, pixels: Any, lane_values: Any) -> None:
     """Find the RANK-th largest pixel of every lane, exactly, and the largest magnitude."""
     width = width_of(lanes)
     one = splat(lanes, 1.0)
-    rank = load(lanes, numbers, RANK * width)
+    rank = load(lanes, lane_values, RANK * width)
     low, high, total = _range_and_sum(lanes, image, pixels)
-    store(numbers, LARGEST * width, maximum(absolute(low), absolute(high)))
+    store(lane_values, LARGEST * width, maximum(absolute(low), absolute(high)))
     low, high, low_count, high_count = _bracket(lanes, image, pixels, rank, low, high, total)
     first, last = _ends(lanes, image, pixels, low, high)
     low = select(rank >= low_count, first, select(rank <= high_count + one, last, first))
     high = select(rank >= low_count, first, last)
     while any_lane(low < high):  # ties among others, or outliers that spoil the means
         low, high = _step_exactly(lanes, image, pixels, rank, low, high)
-    store(numbers, THRESHOLD * width, low)
+    store(lane_values, THRESHOLD * width, low)
 
 
 @compiled
-def find_largest(lanes: Any, image: Any, pixels: Any, numbers: Any) -> None:
+def find_largest(lanes: Any, image: Any, pixels: Any, lane_values: Any) -> None:
     """Find the largest magnitude of every lane."""
     width = width_of(lanes)
     largest = splat(lanes, 0.0)
     for i in range(pixels):
         largest = maximum(absolute(load(lanes, image, i * width)), largest)
-    store(numbers, LARGEST * width, largest)
+    store(lane_values, LARGEST * width, largest)
 
 
 @compiled
-def subtract_background(lanes: Any, image: Any, pixels: Any, numbers: Any, left: Any) -> None:
+def subtract_background(lanes: Any, image: Any, pixels: Any, lane_values: Any, left: Any) -> None:
     """Zero the pixels below THRESHOLD, and take it off the others where SUBTRACT is 1; `left` is written."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
-    threshold = load(lanes, numbers, THRESHOLD * width)
-    offset = select(load(lanes, numbers, SUBTRACT * width) > zero, threshold, zero)
+    threshold = load(lanes, lane_values, THRESHOLD * width)
+    offset = select(load(lanes, lane_values, SUBTRACT * width) > zero, threshold, zero)
     for i in range(pixels):
         g = load(lanes, image, i * width)
         store(left, i * width, select(g >= threshold, g - offset, zero))
@@ -206,28 +206,28 @@ def _from_middle(lanes: Any, i: Any, n: Any) -> Any:
 
 
 @compiled
-def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, numbers: Any) -> Any:
+def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, lane_values: Any) -> Any:
     """Write SUM, X and Y, (0, 0) where the sum is not positive; return 1 / SUM, or 1."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
     lit = total > zero
     inverse = one / select(lit, total, one)
-    store(numbers, SUM * width, total)
-    store(numbers, X * width, select(lit, moment_x * inverse, zero))
-    store(numbers, Y * width, select(lit, moment_y * inverse, zero))
+    store(lane_values, SUM * width, total)
+    store(lane_values, X * width, select(lit, moment_x * inverse, zero))
+    store(lane_values, Y * width, select(lit, moment_y * inverse, zero))
     return inverse
 
 
 @compiled
-def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
+def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any) -> None:
     """Sum of what is left of every lane's image by THRESHOLD and SUBTRACT, and its centre of gravity.
 
     (0, 0) where the sum is not positive.
     """
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
-    threshold = load(lanes, numbers, THRESHOLD * width)
-    offset = select(load(lanes, numbers, SUBTRACT * width) > zero, threshold, zero)
+    threshold = load(lanes, lane_values, THRESHOLD * width)
+    offset = select(load(lanes, lane_values, SUBTRACT * width) > zero, threshold, zero)
     total, moment_x, moment_y = zero, zero, zero
     for y in range(ny):
         row, row_x = zero, zero  # sums by row: rows do not wait for each other
@@ -237,20 +237,20 @@ def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, numbers: Any) ->
             row, row_x = row + left, multiply_add(left, _from_middle(lanes, x, nx), row_x)
         total, moment_x = total + row, moment_x + row_x
         moment_y = multiply_add(row, _from_middle(lanes, y, ny), moment_y)
-    _store_centre(lanes, total, moment_x, moment_y, numbers)
+    _store_centre(lanes, total, moment_x, moment_y, lane_values)
 
 
 @compiled
-def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, numbers: Any) -> None:
+def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, lane_values: Any) -> None:
     """As `centre_of_gravity`, and its standard error: the propagated noise of the pixels that are left.
 
     That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured; `image` may be denoised.
     """
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
-    threshold = load(lanes, numbers, THRESHOLD * width)
-    offset = select(load(lanes, numbers, SUBTRACT * width) > zero, threshold, zero)
-    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
+    threshold = load(lanes, lane_values, THRESHOLD * width)
+    offset = select(load(lanes, lane_values, SUBTRACT * width) > zero, threshold, zero)
+    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
     total, moment_x, moment_y = zero, zero, zero
     noise, noise_x, noise_xx, noise_y, noise_yy = zero, zero, zero, zero, zero
     for y in range(ny):
@@ -269,19 +269,19 @@ def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, nu
         noise, noise_x, noise_xx = noise + part, noise_x + part_x, noise_xx + part_xx
         away = part * line
         noise_y, noise_yy = noise_y + away, multiply_add(away, line, noise_yy)
-    inverse = _store_centre(lanes, total, moment_x, moment_y, numbers)
-    _store_error(lanes, noise, noise_x, noise_xx, inverse, X, ERROR_X, numbers)
-    _store_error(lanes, noise, noise_y, noise_yy, inverse, Y, ERROR_Y, numbers)
+    inverse = _store_centre(lanes, total, moment_x, moment_y, lane_values)
+    _store_error(lanes, noise, noise_x, noise_xx, inverse, X, ERROR_X, lane_values)
+    _store_error(lanes, noise, noise_y, noise_yy, inverse, Y, ERROR_Y, lane_values)
 
 
 @compiled
 def _store_error(
-    lanes: Any, noise: Any, first: Any, second: Any, inverse: Any, position: Any, error: Any, numbers: Any
+    lanes: Any, noise: Any, first: Any, second: Any, inverse: Any, position: Any, error: Any, lane_values: Any
 ) -> None:
     """Write a standard error, from the noise's moments about the window's middle."""
     width = width_of(lanes)
-    at = load(lanes, numbers, position * width)
+    at = load(lanes, lane_values, position * width)
     # Within a pixel, where in it the light is, is not known: px^2 / 12.
     around = multiply_add(noise, multiply_add(at, at, splat(lanes, 1.0 / 12.0)), second)
     around = multiply_add(first, splat(lanes, -2.0) * at, around)
-    store(numbers, error * width, square_root(maximum(around, splat(lanes, 0.0))) * inverse)
+    store(lane_values, error * width, square_root(maximum(around, splat(lanes, 0.0))) * inverse)

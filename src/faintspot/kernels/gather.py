@@ -49,7 +49,7 @@ def gather_raw(
 
 @compiled
 def calibrate(
-    lanes: Any, image: Any, pixels: Any, calibration: Any, place: Any, saturation: Any, numbers: Any
+    lanes: Any, image: Any, pixels: Any, calibration: Any, place: Any, saturation: Any, lane_values: Any
 ) -> None:
     """Turn a group's raw images into electrons, in place: (raw - dark) * scale.
 
@@ -60,7 +60,7 @@ def calibrate(
     calibration : array
         From element `place`: dark and scale of every pixel, W numbers each.
     saturation : float
-    numbers : (2 * W,) array
+    lane_values : (2 * W,) array
         Number of bad and of saturated pixels in every lane; written.
     """
     width = width_of(lanes)
@@ -76,8 +76,8 @@ def calibrate(
         bad = bad + select(good, zero, one)
         saturated = saturated + select(raw >= level, one, zero)
         store(image, i * width, select(good, value, nan))
-    store(numbers, 0, bad)
-    store(numbers, width, saturated)
+    store(lane_values, 0, bad)
+    store(lane_values, width, saturated)
 
 
 @compiled

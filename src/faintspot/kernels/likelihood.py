@@ -24,7 +24,7 @@ from faintspot.kernels.simd import (
     store,
     width_of,
 )
-from faintspot.kernels.spot_numbers import (
+from faintspot.kernels.spot_rows import (
     ERROR_X,
     ERROR_Y,
     EXCESS,
@@ -67,14 +67,17 @@ LEAST_LIGHT_E = 1e-2
 
 
 @compiled
-def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, numbers: Any) -> None:
+def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
     """Sum score, information and the score's covariance of every lane for a PSF of one separable term."""
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
-    wv, we = load(lanes, numbers, WEIGHT_VARIANCE * width), load(lanes, numbers, WEIGHT_EXCESS * width)
-    model_error, flux = load(lanes, numbers, MODEL_ERROR * width), load(lanes, numbers, FLUX * width)
+    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
+    wv, we = (
+        load(lanes, lane_values, WEIGHT_VARIANCE * width),
+        load(lanes, lane_values, WEIGHT_EXCESS * width),
+    )
+    model_error, flux = load(lanes, lane_values, MODEL_ERROR * width), load(lanes, lane_values, FLUX * width)
     sx, sy, sf = zero, zero, zero
     ixx, iyy, iff, ixy, ixf, iyf = zero, zero, zero, zero, zero, zero
     jxx, jyy, jff, jxy, jxf, jyf = zero, zero, zero, zero, zero, zero
@@ -100,19 +103,22 @@ def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, num
         ixy, ixf, iyf = multiply_add(i1, fd, ixy), multiply_add(i1, ff, ixf), multiply_add(i0, fd, iyf)
         jxx, jyy, jff = multiply_add(j2, ff, jxx), multiply_add(j0, dd, jyy), multiply_add(j0, ff, jff)
         jxy, jxf, jyf = multiply_add(j1, fd, jxy), multiply_add(j1, ff, jxf), multiply_add(j0, fd, jyf)
-    _store_sums(lanes, numbers, sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf)
-    _store_covariance(lanes, numbers, jxx, jyy, jff, jxy, jxf, jyf)
+    _store_sums(lanes, lane_values, sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf)
+    _store_covariance(lanes, lane_values, jxx, jyy, jff, jxy, jxf, jyf)
 
 
 @compiled
-def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, numbers: Any) -> None:
+def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
     """As `_separable_sums`, for a PSF of several separable terms."""
     width = width_of(lanes)
     rank, padded = profiles.shape[1], profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
-    wv, we = load(lanes, numbers, WEIGHT_VARIANCE * width), load(lanes, numbers, WEIGHT_EXCESS * width)
-    model_error, flux = load(lanes, numbers, MODEL_ERROR * width), load(lanes, numbers, FLUX * width)
+    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
+    wv, we = (
+        load(lanes, lane_values, WEIGHT_VARIANCE * width),
+        load(lanes, lane_values, WEIGHT_EXCESS * width),
+    )
+    model_error, flux = load(lanes, lane_values, MODEL_ERROR * width), load(lanes, lane_values, FLUX * width)
     sx, sy, sf = zero, zero, zero
     ixx, iyy, iff, ixy, ixf, iyf = zero, zero, zero, zero, zero, zero
     jxx, jyy, jff, jxy, jxf, jyf = zero, zero, zero, zero, zero, zero
@@ -142,14 +148,14 @@ def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, numbe
             wx, wy, wm = wt * wx, wt * wy, wt * wm
             jxx, jyy, jff = multiply_add(wx, mx, jxx), multiply_add(wy, my, jyy), multiply_add(wm, m, jff)
             jxy, jxf, jyf = multiply_add(wx, my, jxy), multiply_add(wx, m, jxf), multiply_add(wy, m, jyf)
-    _store_sums(lanes, numbers, sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf)
-    _store_covariance(lanes, numbers, jxx, jyy, jff, jxy, jxf, jyf)
+    _store_sums(lanes, lane_values, sx, sy, sf, ixx, iyy, iff, ixy, ixf, iyf)
+    _store_covariance(lanes, lane_values, jxx, jyy, jff, jxy, jxf, jyf)
 
 
 @compiled
 def _store_sums(
     lanes: Any,
-    numbers: Any,
+    lane_values: Any,
     sx: Any,
     sy: Any,
     sf: Any,
@@ -161,56 +167,56 @@ def _store_sums(
     iyf: Any,
 ) -> None:
     width = width_of(lanes)
-    store(numbers, SCORE_X * width, sx)
-    store(numbers, SCORE_Y * width, sy)
-    store(numbers, SCORE_F * width, sf)
-    store(numbers, I_XX * width, ixx)
-    store(numbers, I_YY * width, iyy)
-    store(numbers, I_FF * width, iff)
-    store(numbers, I_XY * width, ixy)
-    store(numbers, I_XF * width, ixf)
-    store(numbers, I_YF * width, iyf)
+    store(lane_values, SCORE_X * width, sx)
+    store(lane_values, SCORE_Y * width, sy)
+    store(lane_values, SCORE_F * width, sf)
+    store(lane_values, I_XX * width, ixx)
+    store(lane_values, I_YY * width, iyy)
+    store(lane_values, I_FF * width, iff)
+    store(lane_values, I_XY * width, ixy)
+    store(lane_values, I_XF * width, ixf)
+    store(lane_values, I_YF * width, iyf)
 
 
 @compiled
 def _store_covariance(
-    lanes: Any, numbers: Any, jxx: Any, jyy: Any, jff: Any, jxy: Any, jxf: Any, jyf: Any
+    lanes: Any, lane_values: Any, jxx: Any, jyy: Any, jff: Any, jxy: Any, jxf: Any, jyf: Any
 ) -> None:
     width = width_of(lanes)
-    store(numbers, J_XX * width, jxx)
-    store(numbers, J_YY * width, jyy)
-    store(numbers, J_FF * width, jff)
-    store(numbers, J_XY * width, jxy)
-    store(numbers, J_XF * width, jxf)
-    store(numbers, J_YF * width, jyf)
+    store(lane_values, J_XX * width, jxx)
+    store(lane_values, J_YY * width, jyy)
+    store(lane_values, J_FF * width, jff)
+    store(lane_values, J_XY * width, jxy)
+    store(lane_values, J_XF * width, jxf)
+    store(lane_values, J_YF * width, jyf)
 
 
 @compiled
-def _move(lanes: Any, numbers: Any) -> None:
+def _move(lanes: Any, lane_values: Any) -> None:
     """Make one step, within bounds."""
     width = width_of(lanes)
     zero, one, tiny = splat(lanes, 0.0), splat(lanes, 1.0), splat(lanes, 1e-20)
     x, y, flux = (
-        load(lanes, numbers, X * width),
-        load(lanes, numbers, Y * width),
-        load(lanes, numbers, FLUX * width),
+        load(lanes, lane_values, X * width),
+        load(lanes, lane_values, Y * width),
+        load(lanes, lane_values, FLUX * width),
     )
-    prior = load(lanes, numbers, PRIOR_WEIGHT * width)
+    prior = load(lanes, lane_values, PRIOR_WEIGHT * width)
     sf, ixf, iyf = (
-        load(lanes, numbers, SCORE_F * width),
-        load(lanes, numbers, I_XF * width),
-        load(lanes, numbers, I_YF * width),
+        load(lanes, lane_values, SCORE_F * width),
+        load(lanes, lane_values, I_XF * width),
+        load(lanes, lane_values, I_YF * width),
     )
     # The light is eliminated first, then y; a lane without information does not move.
-    inverse_ff = one / maximum(load(lanes, numbers, I_FF * width), tiny)
+    inverse_ff = one / maximum(load(lanes, lane_values, I_FF * width), tiny)
     cx, cy = ixf * inverse_ff, iyf * inverse_ff
-    bx = load(lanes, numbers, SCORE_X * width) - cx * sf
-    by = load(lanes, numbers, SCORE_Y * width) - cy * sf
-    bx = multiply_add(prior, load(lanes, numbers, PRIOR_X * width) - x, bx)
-    by = multiply_add(prior, load(lanes, numbers, PRIOR_Y * width) - y, by)
-    axx = load(lanes, numbers, I_XX * width) - cx * ixf + prior
-    ayy = load(lanes, numbers, I_YY * width) - cy * iyf + prior
-    axy = load(lanes, numbers, I_XY * width) - cx * iyf
+    bx = load(lanes, lane_values, SCORE_X * width) - cx * sf
+    by = load(lanes, lane_values, SCORE_Y * width) - cy * sf
+    bx = multiply_add(prior, load(lanes, lane_values, PRIOR_X * width) - x, bx)
+    by = multiply_add(prior, load(lanes, lane_values, PRIOR_Y * width) - y, by)
+    axx = load(lanes, lane_values, I_XX * width) - cx * ixf + prior
+    ayy = load(lanes, lane_values, I_YY * width) - cy * iyf + prior
+    axy = load(lanes, lane_values, I_XY * width) - cx * iyf
     slope = axy / maximum(ayy, tiny)
     left = axx - slope * axy
     # An almost singular matrix (round-off) gives no direction to go in.
@@ -221,51 +227,55 @@ def _move(lanes: Any, numbers: Any) -> None:
     dx, dy = minimum(maximum(dx, least), most), minimum(maximum(dy, least), most)
     df = (sf - ixf * dx - iyf * dy) * inverse_ff
     factor = minimum(maximum(one + df, splat(lanes, 1.0 / LARGEST_FACTOR)), splat(lanes, LARGEST_FACTOR))
-    x = minimum(maximum(x + dx, load(lanes, numbers, LOW_X * width)), load(lanes, numbers, HIGH_X * width))
-    y = minimum(maximum(y + dy, load(lanes, numbers, LOW_Y * width)), load(lanes, numbers, HIGH_Y * width))
-    store(numbers, X * width, x)
-    store(numbers, Y * width, y)
-    store(numbers, FLUX * width, maximum(flux * factor, splat(lanes, LEAST_LIGHT_E)))
+    x = minimum(
+        maximum(x + dx, load(lanes, lane_values, LOW_X * width)), load(lanes, lane_values, HIGH_X * width)
+    )
+    y = minimum(
+        maximum(y + dy, load(lanes, lane_values, LOW_Y * width)), load(lanes, lane_values, HIGH_Y * width)
+    )
+    store(lane_values, X * width, x)
+    store(lane_values, Y * width, y)
+    store(lane_values, FLUX * width, maximum(flux * factor, splat(lanes, LEAST_LIGHT_E)))
 
 
 @compiled
-def _store_errors(width: Any, lane: Any, flux: Any, numbers: Any) -> None:
+def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
     """Write what a lane's sums, made with light `flux`, say: the light seen, and the standard errors.
 
     Those are the square roots of the diagonal of A^-1 (J + prior) A^-1, A = I + prior.
     """
-    prior = float(numbers[PRIOR_WEIGHT * width + lane])
-    iff = float(numbers[I_FF * width + lane])
-    numbers[ERROR_X * width + lane] = math.inf
-    numbers[ERROR_Y * width + lane] = math.inf
-    numbers[SEEN * width + lane] = 0.0
-    numbers[SEEN_ERROR * width + lane] = math.inf
+    prior = float(lane_values[PRIOR_WEIGHT * width + lane])
+    iff = float(lane_values[I_FF * width + lane])
+    lane_values[ERROR_X * width + lane] = math.inf
+    lane_values[ERROR_Y * width + lane] = math.inf
+    lane_values[SEEN * width + lane] = 0.0
+    lane_values[SEEN_ERROR * width + lane] = math.inf
     if not iff > 0.0:
         return
     # The model is proportional to the light: sum w g m / sum w m^2 is the light that fits best.
-    numbers[SEEN * width + lane] = flux * (1.0 + numbers[SCORE_F * width + lane] / iff)
-    numbers[SEEN_ERROR * width + lane] = flux / math.sqrt(iff)
-    cx, cy = numbers[I_XF * width + lane] / iff, numbers[I_YF * width + lane] / iff
-    axx = numbers[I_XX * width + lane] - cx * numbers[I_XF * width + lane] + prior
-    ayy = numbers[I_YY * width + lane] - cy * numbers[I_YF * width + lane] + prior
-    axy = numbers[I_XY * width + lane] - cx * numbers[I_YF * width + lane]
+    lane_values[SEEN * width + lane] = flux * (1.0 + lane_values[SCORE_F * width + lane] / iff)
+    lane_values[SEEN_ERROR * width + lane] = flux / math.sqrt(iff)
+    cx, cy = lane_values[I_XF * width + lane] / iff, lane_values[I_YF * width + lane] / iff
+    axx = lane_values[I_XX * width + lane] - cx * lane_values[I_XF * width + lane] + prior
+    ayy = lane_values[I_YY * width + lane] - cy * lane_values[I_YF * width + lane] + prior
+    axy = lane_values[I_XY * width + lane] - cx * lane_values[I_YF * width + lane]
     determinant = axx * ayy - axy * axy
     if not determinant > 1e-5 * axx * ayy:
         return
     # With the light eliminated, the score is s - c s_F; so its covariance is
     jxf, jyf, jff = (
-        numbers[J_XF * width + lane],
-        numbers[J_YF * width + lane],
-        numbers[J_FF * width + lane],
+        lane_values[J_XF * width + lane],
+        lane_values[J_YF * width + lane],
+        lane_values[J_FF * width + lane],
     )
-    bxx = numbers[J_XX * width + lane] - 2.0 * cx * jxf + cx * cx * jff + prior
-    byy = numbers[J_YY * width + lane] - 2.0 * cy * jyf + cy * cy * jff + prior
-    bxy = numbers[J_XY * width + lane] - cy * jxf - cx * jyf + cx * cy * jff
+    bxx = lane_values[J_XX * width + lane] - 2.0 * cx * jxf + cx * cx * jff + prior
+    byy = lane_values[J_YY * width + lane] - 2.0 * cy * jyf + cy * cy * jff + prior
+    bxy = lane_values[J_XY * width + lane] - cy * jxf - cx * jyf + cx * cy * jff
     vx = (ayy * ayy * bxx - 2.0 * ayy * axy * bxy + axy * axy * byy) / (determinant * determinant)
     vy = (axx * axx * byy - 2.0 * axx * axy * bxy + axy * axy * bxx) / (determinant * determinant)
     if vx > 0.0 and vy > 0.0:
-        numbers[ERROR_X * width + lane] = math.sqrt(vx)
-        numbers[ERROR_Y * width + lane] = math.sqrt(vy)
+        lane_values[ERROR_X * width + lane] = math.sqrt(vx)
+        lane_values[ERROR_Y * width + lane] = math.sqrt(vy)
 
 
 @compiled
@@ -277,7 +287,7 @@ def fit_group(
     tables: Any,
     which: Any,
     steps: Any,
-    numbers: Any,
+    lane_values: Any,
     starts: Any,
     profiles: Any,
 ) -> None:
@@ -290,18 +300,18 @@ def fit_group(
         See `look_up`.
     steps : int
         Always as many, so that the time is known and lanes do not depend on each other.
-    numbers : (LANE_ROWS * W,)
+    lane_values : (LANE_ROWS * W,)
         The start (X, Y, FLUX) and everything marked "in" is read; position, light, errors and
         what is SEEN are written.
     """
     width = width_of(lanes)
     for step in range(steps):
-        look_up(lanes, tables, which, ny, nx, numbers, starts, profiles)
+        look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
         if profiles.shape[1] == 1:
-            _separable_sums(lanes, image, ny, nx, profiles, numbers)
+            _separable_sums(lanes, image, ny, nx, profiles, lane_values)
         else:
-            _general_sums(lanes, image, ny, nx, profiles, numbers)
+            _general_sums(lanes, image, ny, nx, profiles, lane_values)
         if step == steps - 1:
             for lane in range(width):
-                _store_errors(width, lane, float(numbers[FLUX * width + lane]), numbers)
-        _move(lanes, numbers)
+                _store_errors(width, lane, float(lane_values[FLUX * width + lane]), lane_values)
+        _move(lanes, lane_values)

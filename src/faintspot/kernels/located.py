@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from faintspot.flags import SubapertureFlag
-from faintspot.kernels import groups, spot_numbers
+from faintspot.kernels import groups, spot_rows
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     COMMON_ROWS,
@@ -31,7 +31,7 @@ from faintspot.kernels.weighted import weigh_group
 
 # Rows of the settings' table that follow the common ones: light that is expected; weights of a fit; prior.
 FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)
-# Which model and which table of the light's; see `spot_numbers`; errors of a score; light of likely outliers.
+# Which model and which table of the light's; see `spot_rows`; errors of a score; light of likely outliers.
 MODEL, KIND, START_LIGHT, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_LIGHT = range(
     COMMON_ROWS + 5, COMMON_ROWS + 13
 )
@@ -88,7 +88,7 @@ class SpotScratch(NamedTuple):
     """Memory of one thread."""
 
     taps: Any
-    numbers: Any
+    lane_values: Any
     profiles: Any
     rows: Any
     logarithms: Any
@@ -106,7 +106,7 @@ def spot_scratch(
     padded = -(-max(ny, nx) // width) * width
     return SpotScratch(
         aligned_zeros(2 * taps * width, lanes.dtype),
-        aligned_zeros(spot_numbers.LANE_ROWS * width, lanes.dtype),
+        aligned_zeros(spot_rows.LANE_ROWS * width, lanes.dtype),
         aligned_zeros(4 * rank * padded * width, lanes.dtype).reshape(2, rank, 2, padded, width),
         aligned_zeros(ny * vectors * width * width, lanes.dtype).reshape(ny, vectors, width, width),
         np.zeros(positions),
@@ -128,7 +128,7 @@ def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         tables.model,
         own.models,
         tables.steps,
-        own.numbers,
+        own.lane_values,
         own.starts,
         own.profiles,
     )
@@ -151,7 +151,7 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
     own = scratch.own
     _round(group, tables.fit.round_electrons, scratch.image)
     _begin(group, scratch)
-    _expect_light(group, own.numbers)
+    _expect_light(group, own.lane_values)
     posterior_of_group(
         group.lanes,
         scratch.image,
@@ -162,17 +162,17 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
         tables.grid,
         tables.spacing,
         own.kinds,
-        own.numbers,
+        own.lane_values,
         own.starts,
         own.rows,
         own.logarithms,
     )
     width = width_of(group.lanes)
     for axis in range(2):
-        mean = load(group.lanes, own.numbers, (spot_numbers.MEAN_X + axis) * width)
-        store(own.numbers, (spot_numbers.X + axis) * width, mean)
+        mean = load(group.lanes, own.lane_values, (spot_rows.MEAN_X + axis) * width)
+        store(own.lane_values, (spot_rows.X + axis) * width, mean)
     _fit(group, tables.fit, scratch)
-    _keep_broad_posteriors(width, own.numbers)
+    _keep_broad_posteriors(width, own.lane_values)
     _finish(group, tables.fit.steps, True, scratch)
 
 
@@ -183,7 +183,7 @@ def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     _begin(group, scratch)
     if tables.from_peak:
         _begin_at_peak(group, tables.taps, scratch)
-    _expect_light(group, own.numbers)
+    _expect_light(group, own.lane_values)
     apply_score(
         group.lanes,
         scratch.image,
@@ -193,11 +193,11 @@ def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         own.kinds,
         tables.steps_per_px,
         tables.margin,
-        own.numbers,
+        own.lane_values,
         own.starts,
         own.rows,
     )
-    _sum_light(group, scratch.image, own.numbers)
+    _sum_light(group, scratch.image, own.lane_values)
     _finish(group, tables.passes, True, scratch)
 
 
@@ -214,7 +214,7 @@ def _round(group: Any, round_electrons: Any, image: Any) -> None:
 def _begin(group: Any, scratch: Any) -> None:
     """Copy what the lanes' sub-apertures are set to; the position is the predicted one at first."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
-    numbers = own.numbers
+    lane_values = own.lane_values
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
         own.models[lane], own.kinds[lane] = int(settings[MODEL, s]), int(settings[KIND, s])
@@ -225,16 +225,16 @@ def _begin(group: Any, scratch: Any) -> None:
             low = min(max(zero - reach, -half), half - 0.5)
             high = max(min(zero + reach, half), low)
             place = zero + group.predicted[axis, s]
-            numbers[(spot_numbers.LOW_X + 2 * axis) * width + lane] = low
-            numbers[(spot_numbers.HIGH_X + 2 * axis) * width + lane] = high
-            numbers[(spot_numbers.PRIOR_X + axis) * width + lane] = place
-            numbers[(spot_numbers.X + axis) * width + lane] = min(max(place, low), high)
-        numbers[spot_numbers.VARIANCE * width + lane] = max(settings[VARIANCE, s], 0.0)
-        numbers[spot_numbers.EXCESS * width + lane] = settings[EXCESS, s]
-        numbers[spot_numbers.PRIOR_WEIGHT * width + lane] = settings[PRIOR_WEIGHT, s]
-        numbers[spot_numbers.START_LIGHT * width + lane] = settings[START_LIGHT, s]
-        numbers[spot_numbers.GAIN_X * width + lane] = settings[GAIN_X, s]
-        numbers[spot_numbers.GAIN_Y * width + lane] = settings[GAIN_Y, s]
+            lane_values[(spot_rows.LOW_X + 2 * axis) * width + lane] = low
+            lane_values[(spot_rows.HIGH_X + 2 * axis) * width + lane] = high
+            lane_values[(spot_rows.PRIOR_X + axis) * width + lane] = place
+            lane_values[(spot_rows.X + axis) * width + lane] = min(max(place, low), high)
+        lane_values[spot_rows.VARIANCE * width + lane] = max(settings[VARIANCE, s], 0.0)
+        lane_values[spot_rows.EXCESS * width + lane] = settings[EXCESS, s]
+        lane_values[spot_rows.PRIOR_WEIGHT * width + lane] = settings[PRIOR_WEIGHT, s]
+        lane_values[spot_rows.START_LIGHT * width + lane] = settings[START_LIGHT, s]
+        lane_values[spot_rows.GAIN_X * width + lane] = settings[GAIN_X, s]
+        lane_values[spot_rows.GAIN_Y * width + lane] = settings[GAIN_Y, s]
 
 
 @compiled
@@ -243,21 +243,21 @@ def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
     lanes, own = group.lanes, scratch.own
     gather_taps(width_of(lanes), group.first, taps, own.taps)
     reach = taps.shape[2] - 1
-    find_start(lanes, scratch.image, group.ny, group.nx, reach, own.taps, scratch.spare, own.numbers)
+    find_start(lanes, scratch.image, group.ny, group.nx, reach, own.taps, scratch.spare, own.lane_values)
 
 
 @compiled
 def _fit(group: Any, tables: Any, scratch: Any) -> None:
     """Fit from where the lanes are; the floor on the weights is a fraction of the light found so far."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
-    numbers = own.numbers
+    lane_values = own.lane_values
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        floor = settings[WEIGHT_FLOOR, s] * numbers[spot_numbers.FLUX * width + lane]
-        variance = numbers[spot_numbers.VARIANCE * width + lane] + floor
-        numbers[spot_numbers.WEIGHT_VARIANCE * width + lane] = max(variance, SMALLEST_VARIANCE)
-        numbers[spot_numbers.WEIGHT_EXCESS * width + lane] = settings[WEIGHT_EXCESS, s]
-        numbers[spot_numbers.MODEL_ERROR * width + lane] = settings[MODEL_ERROR, s] ** 2
+        floor = settings[WEIGHT_FLOOR, s] * lane_values[spot_rows.FLUX * width + lane]
+        variance = lane_values[spot_rows.VARIANCE * width + lane] + floor
+        lane_values[spot_rows.WEIGHT_VARIANCE * width + lane] = max(variance, SMALLEST_VARIANCE)
+        lane_values[spot_rows.WEIGHT_EXCESS * width + lane] = settings[WEIGHT_EXCESS, s]
+        lane_values[spot_rows.MODEL_ERROR * width + lane] = settings[MODEL_ERROR, s] ** 2
     fit_group(
         group.lanes,
         scratch.image,
@@ -266,23 +266,23 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
         tables.model,
         own.models,
         tables.steps,
-        numbers,
+        lane_values,
         own.starts,
         own.profiles,
     )
 
 
 @compiled
-def _expect_light(group: Any, numbers: Any) -> None:
+def _expect_light(group: Any, lane_values: Any) -> None:
     """Take the light that is expected for the light."""
     width, first, settings = width_of(group.lanes), group.first, group.settings
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        numbers[spot_numbers.FLUX * width + lane] = max(settings[FLUX, s], LEAST_LIGHT_E)
+        lane_values[spot_rows.FLUX * width + lane] = max(settings[FLUX, s], LEAST_LIGHT_E)
 
 
 @compiled
-def _sum_light(group: Any, image: Any, numbers: Any) -> None:
+def _sum_light(group: Any, image: Any, lane_values: Any) -> None:
     """Standard errors from the training, and the light that is seen in the whole window."""
     lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
     width = width_of(lanes)
@@ -293,39 +293,39 @@ def _sum_light(group: Any, image: Any, numbers: Any) -> None:
         for x in range(nx):
             row = row + load(lanes, image, (y * nx + x) * width)
         total = total + row
-    store(numbers, spot_numbers.SEEN * width, total)
+    store(lane_values, spot_rows.SEEN * width, total)
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        numbers[spot_numbers.ERROR_X * width + lane] = settings[TRAINED_ERROR_X, s]
-        numbers[spot_numbers.ERROR_Y * width + lane] = settings[TRAINED_ERROR_Y, s]
-        variance = numbers[spot_numbers.VARIANCE * width + lane]
-        excess = numbers[spot_numbers.EXCESS * width + lane]
-        seen = numbers[spot_numbers.SEEN * width + lane]
-        numbers[spot_numbers.SEEN_ERROR * width + lane] = math.sqrt(
+        lane_values[spot_rows.ERROR_X * width + lane] = settings[TRAINED_ERROR_X, s]
+        lane_values[spot_rows.ERROR_Y * width + lane] = settings[TRAINED_ERROR_Y, s]
+        variance = lane_values[spot_rows.VARIANCE * width + lane]
+        excess = lane_values[spot_rows.EXCESS * width + lane]
+        seen = lane_values[spot_rows.SEEN * width + lane]
+        lane_values[spot_rows.SEEN_ERROR * width + lane] = math.sqrt(
             ny * nx * variance + excess * max(seen, 0.0)
         )
-        numbers[spot_numbers.FLUX * width + lane] = seen
+        lane_values[spot_rows.FLUX * width + lane] = seen
 
 
 @compiled
-def _keep_broad_posteriors(width: Any, numbers: Any) -> None:
+def _keep_broad_posteriors(width: Any, lane_values: Any) -> None:
     """Along an axis on which the posterior is broader than its grid, its mean and spread are the result."""
     for lane in range(width):
-        fitted = numbers[spot_numbers.ERROR_X * width + lane] < math.inf
-        broad = _BROAD * numbers[spot_numbers.SPACING * width + lane]
+        fitted = lane_values[spot_rows.ERROR_X * width + lane] < math.inf
+        broad = _BROAD * lane_values[spot_rows.SPACING * width + lane]
         for axis in range(2):
-            spread = numbers[(spot_numbers.SPREAD_X + axis) * width + lane]
+            spread = lane_values[(spot_rows.SPREAD_X + axis) * width + lane]
             if spread > broad or not fitted:
-                mean = numbers[(spot_numbers.MEAN_X + axis) * width + lane]
-                numbers[(spot_numbers.X + axis) * width + lane] = mean
-                numbers[(spot_numbers.ERROR_X + axis) * width + lane] = spread
+                mean = lane_values[(spot_rows.MEAN_X + axis) * width + lane]
+                lane_values[(spot_rows.X + axis) * width + lane] = mean
+                lane_values[(spot_rows.ERROR_X + axis) * width + lane] = spread
 
 
 @compiled
-def _is_lit(width: Any, lane: Any, expected: Any, numbers: Any) -> Any:
+def _is_lit(width: Any, lane: Any, expected: Any, lane_values: Any) -> Any:
     """Whether there is a spot: where its light is expected, not surely much less; else a significant one."""
-    seen = numbers[spot_numbers.SEEN * width + lane]
-    error = numbers[spot_numbers.SEEN_ERROR * width + lane]
+    seen = lane_values[spot_rows.SEEN * width + lane]
+    error = lane_values[spot_rows.SEEN_ERROR * width + lane]
     if expected >= 0.0:
         return expected >= LEAST_LIGHT_E and seen + _SURELY * error > _LIT_FRACTION * expected
     return seen >= LEAST_SIGNIFICANCE * error
@@ -334,28 +334,28 @@ def _is_lit(width: Any, lane: Any, expected: Any, numbers: Any) -> Any:
 @compiled
 def _finish(group: Any, steps: Any, expects_light: Any, scratch: Any) -> None:
     """Write the lanes' results, and the bits of their flags."""
-    width, settings, numbers, found = (
+    width, settings, lane_values, found = (
         width_of(group.lanes),
         group.settings,
-        scratch.own.numbers,
+        scratch.own.lane_values,
         scratch.results,
     )
     for lane in range(width):
         s = min(group.first + lane, settings.shape[1] - 1)
         bits = scratch.flags[lane]
-        error_x = numbers[spot_numbers.ERROR_X * width + lane]
-        error_y = numbers[spot_numbers.ERROR_Y * width + lane]
-        light = numbers[spot_numbers.FLUX * width + lane]
+        error_x = lane_values[spot_rows.ERROR_X * width + lane]
+        error_y = lane_values[spot_rows.ERROR_Y * width + lane]
+        light = lane_values[spot_rows.FLUX * width + lane]
         if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
             expected = settings[FLUX, s] if expects_light else np.float32(-1.0)
-            lit = _is_lit(width, lane, expected, numbers)
+            lit = _is_lit(width, lane, expected, lane_values)
             if not (error_x + error_y < math.inf and lit and abs(light) < math.inf):
                 bits |= NO_LIGHT
             elif light < settings[LEAST_LIGHT, s]:
                 bits |= OUTLIER_LIKELY
         scratch.flags[lane], scratch.iterations[lane] = bits, steps
-        found[groups.X * width + lane] = numbers[spot_numbers.X * width + lane]
-        found[groups.Y * width + lane] = numbers[spot_numbers.Y * width + lane]
+        found[groups.X * width + lane] = lane_values[spot_rows.X * width + lane]
+        found[groups.Y * width + lane] = lane_values[spot_rows.Y * width + lane]
         found[groups.FLUX * width + lane] = light if abs(light) < math.inf else np.float32(0.0)
         found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
 

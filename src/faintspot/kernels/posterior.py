@@ -13,7 +13,7 @@ from typing import Any
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.rows import rows_from_lanes
 from faintspot.kernels.simd import load, multiply_add, splat, sum_of, width_of
-from faintspot.kernels.spot_numbers import (
+from faintspot.kernels.spot_rows import (
     HIGH_X,
     HIGH_Y,
     LOW_X,
@@ -71,7 +71,7 @@ def posterior_of_group(
     grid: Any,
     spacing: Any,
     which: Any,
-    numbers: Any,
+    lane_values: Any,
     starts: Any,
     rows: Any,
     values: Any,
@@ -91,7 +91,7 @@ def posterior_of_group(
         Of the grid, px.
     which : (W,) int64
         Table of each lane.
-    numbers : (LANE_ROWS * W,)
+    lane_values : (LANE_ROWS * W,)
         Allowed positions and prior are read.
     starts : (W,) int64
         Scratch.
@@ -104,10 +104,13 @@ def posterior_of_group(
     n = grid.shape[0]
     rows_from_lanes(lanes, image, ny, nx, starts, rows)
     for lane in range(width):
-        low_x, high_x = numbers[LOW_X * width + lane], numbers[HIGH_X * width + lane]
-        low_y, high_y = numbers[LOW_Y * width + lane], numbers[HIGH_Y * width + lane]
-        prior = float(numbers[PRIOR_WEIGHT * width + lane])
-        prior_x, prior_y = float(numbers[PRIOR_X * width + lane]), float(numbers[PRIOR_Y * width + lane])
+        low_x, high_x = lane_values[LOW_X * width + lane], lane_values[HIGH_X * width + lane]
+        low_y, high_y = lane_values[LOW_Y * width + lane], lane_values[HIGH_Y * width + lane]
+        prior = float(lane_values[PRIOR_WEIGHT * width + lane])
+        prior_x, prior_y = (
+            float(lane_values[PRIOR_X * width + lane]),
+            float(lane_values[PRIOR_Y * width + lane]),
+        )
         largest = -math.inf
         for i in range(n):
             x, y = float(grid[i, 0]), float(grid[i, 1])
@@ -136,8 +139,8 @@ def posterior_of_group(
         x, y = (sum_x * inverse, sum_y * inverse) if known else (prior_x, prior_y)
         spread_x = math.sqrt(max(squares_x * inverse - x * x, 0.0)) if known else 0.0
         spread_y = math.sqrt(max(squares_y * inverse - y * y, 0.0)) if known else 0.0
-        numbers[MEAN_X * width + lane] = min(max(x, low_x), high_x)
-        numbers[MEAN_Y * width + lane] = min(max(y, low_y), high_y)
-        numbers[SPREAD_X * width + lane] = spread_x
-        numbers[SPREAD_Y * width + lane] = spread_y
-        numbers[SPACING * width + lane] = spacing
+        lane_values[MEAN_X * width + lane] = min(max(x, low_x), high_x)
+        lane_values[MEAN_Y * width + lane] = min(max(y, low_y), high_y)
+        lane_values[SPREAD_X * width + lane] = spread_x
+        lane_values[SPREAD_Y * width + lane] = spread_y
+        lane_values[SPACING * width + lane] = spacing

@@ -11,7 +11,7 @@ from typing import Any
 
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.simd import copy_transposed, load, multiply_add, store, width_of
-from faintspot.kernels.spot_numbers import REST_X, X
+from faintspot.kernels.spot_rows import REST_X, X
 
 PHASES = 16
 MARGIN = 2  # px that a table reaches beyond the window's side, on either end
@@ -19,7 +19,7 @@ MARGIN = 2  # px that a table reaches beyond the window's side, on either end
 
 @compiled
 def look_up(
-    lanes: Any, tables: Any, which: Any, ny: Any, nx: Any, numbers: Any, starts: Any, profiles: Any
+    lanes: Any, tables: Any, which: Any, ny: Any, nx: Any, lane_values: Any, starts: Any, profiles: Any
 ) -> None:
     """Write every lane's profiles, and their derivatives in the position, at its position X, Y.
 
@@ -32,7 +32,7 @@ def look_up(
     which : (W,) int64
         Model of each lane.
     ny, nx : int
-    numbers : (LANE_ROWS * W,)
+    lane_values : (LANE_ROWS * W,)
         X and Y are read, REST_X and REST_Y written.
     starts : (W,) int64
         Scratch.
@@ -46,12 +46,12 @@ def look_up(
         n = nx if axis == 0 else ny
         first = -0.5 * (n - 1)
         for lane in range(width):
-            position = numbers[(X + axis) * width + lane]
+            position = lane_values[(X + axis) * width + lane]
             step = math.floor((first - position) * PHASES + 0.5)
             whole, phase = step // PHASES, step % PHASES
             starts[lane] = ((which[lane] * 2 + axis) * rank * 2 * PHASES + phase) * length + whole + margin
-            numbers[(REST_X + axis) * width + lane] = position - (first - step / PHASES)
-        rest = load(lanes, numbers, (REST_X + axis) * width)
+            lane_values[(REST_X + axis) * width + lane] = position - (first - step / PHASES)
+        rest = load(lanes, lane_values, (REST_X + axis) * width)
         for term in range(rank):
             for kind in range(2):
                 plane = (term * 2 + kind) * PHASES * length

@@ -8,18 +8,18 @@ from typing import Any
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.simd import load, maximum, minimum, select, splat, store, width_of
 from faintspot.kernels.smoothing import smooth_pixel
-from faintspot.kernels.spot_numbers import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, START_LIGHT, X, Y
+from faintspot.kernels.spot_rows import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, START_LIGHT, X, Y
 
 LEAST_LIGHT_E = 1.0  # an estimate of the light below this says nothing
 
 
 @compiled
-def _pixel_range(lanes: Any, numbers: Any, low: Any, high: Any, n: Any) -> Any:
+def _pixel_range(lanes: Any, lane_values: Any, low: Any, high: Any, n: Any) -> Any:
     """First and last pixel whose centre is within half a pixel of some lane's allowed positions."""
     width = width_of(lanes)
     first, last = n - 1, 0
     for lane in range(width):
-        lowest, highest = numbers[low * width + lane], numbers[high * width + lane]
+        lowest, highest = lane_values[low * width + lane], lane_values[high * width + lane]
         first = min(first, math.ceil(lowest - 0.5 + 0.5 * (n - 1)))
         last = max(last, math.floor(highest + 0.5 + 0.5 * (n - 1)))
     return max(first, 0), min(last, n - 1)
@@ -27,7 +27,7 @@ def _pixel_range(lanes: Any, numbers: Any, low: Any, high: Any, n: Any) -> Any:
 
 @compiled
 def find_start(
-    lanes: Any, image: Any, ny: Any, nx: Any, reach: Any, taps: Any, smoothed: Any, numbers: Any
+    lanes: Any, image: Any, ny: Any, nx: Any, reach: Any, taps: Any, smoothed: Any, lane_values: Any
 ) -> None:
     """Write X, Y and FLUX of every lane: its largest smoothed pixel within the allowed positions.
 
@@ -42,15 +42,15 @@ def find_start(
         Scratch.
     """
     width = width_of(lanes)
-    first_x, last_x = _pixel_range(lanes, numbers, LOW_X, HIGH_X, nx)
-    first_y, last_y = _pixel_range(lanes, numbers, LOW_Y, HIGH_Y, ny)
+    first_x, last_x = _pixel_range(lanes, lane_values, LOW_X, HIGH_X, nx)
+    first_y, last_y = _pixel_range(lanes, lane_values, LOW_Y, HIGH_Y, ny)
     for y in range(max(first_y - reach, 0), min(last_y + reach + 1, ny)):
         for x in range(first_x, last_x + 1):
             at = (y * nx + x) * width
             store(smoothed, at, smooth_pixel(lanes, image, at, width, x, nx, taps, 0, reach))
     half, minus_half = splat(lanes, 0.5), splat(lanes, -0.5)
-    low_x, high_x = load(lanes, numbers, LOW_X * width), load(lanes, numbers, HIGH_X * width)
-    low_y, high_y = load(lanes, numbers, LOW_Y * width), load(lanes, numbers, HIGH_Y * width)
+    low_x, high_x = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
+    low_y, high_y = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)
     best = splat(lanes, -math.inf)
     best_x, best_y = half * (low_x + high_x), half * (low_y + high_y)
     for y in range(first_y, last_y + 1):
@@ -63,7 +63,7 @@ def find_start(
             larger = value > best
             best = select(larger, value, best)
             best_x, best_y = select(larger, u, best_x), select(larger, v, best_y)
-    light = best / load(lanes, numbers, START_LIGHT * width)
-    store(numbers, X * width, minimum(maximum(best_x, low_x), high_x))
-    store(numbers, Y * width, minimum(maximum(best_y, low_y), high_y))
-    store(numbers, FLUX * width, maximum(light, splat(lanes, LEAST_LIGHT_E)))
+    light = best / load(lanes, lane_values, START_LIGHT * width)
+    store(lane_values, X * width, minimum(maximum(best_x, low_x), high_x))
+    store(lane_values, Y * width, minimum(maximum(best_y, low_y), high_y))
+    store(lane_values, FLUX * width, maximum(light, splat(lanes, LEAST_LIGHT_E)))

@@ -50,7 +50,7 @@ COUNT_ROWS = 5
 
 @compiled
 def _measure_change(
-    lanes: Any, state: Any, ny: Any, nx: Any, current: Any, inverse: Any, numbers: Any
+    lanes: Any, state: Any, ny: Any, nx: Any, current: Any, inverse: Any, lane_values: Any
 ) -> None:
     """Sum ||div p - div p_previous||^2 and ||div p - g / lambda||^2 per lane, both times 4, for the test."""
     width = width_of(lanes)
@@ -66,13 +66,13 @@ def _measure_change(
             v = multiply_add(load(lanes, state, place + IMAGE * width), minus_inverse, d)
             change = multiply_add(move, move, change)
             size = multiply_add(v, v, size)
-    store(numbers, CHANGE * width, change)
-    store(numbers, SIZE * width, size)
+    store(lane_values, CHANGE * width, change)
+    store(lane_values, SIZE * width, size)
 
 
 @compiled
 def _write_finished(
-    lanes: Any, state: Any, rows: Any, output: Any, ny: Any, nx: Any, current: Any, numbers: Any
+    lanes: Any, state: Any, rows: Any, output: Any, ny: Any, nx: Any, current: Any, lane_values: Any
 ) -> None:
     """Write u = g - lambda div p of the lanes that finish now, with lambda such that the constraint holds."""
     width = width_of(lanes)
@@ -84,12 +84,14 @@ def _write_finished(
             d = twice_divergence(lanes, state, y * line + x * pixel, current * width, y, x, line, pixel)
             norm = multiply_add(d, d, norm)
             store(rows, (y * nx + x) * width, d)
-    finishing = load(lanes, numbers, FINISHING * width) > zero
-    mean, scale = load(lanes, numbers, MEAN * width), load(lanes, numbers, SCALE * width)
-    half_multiplier = load(lanes, numbers, RADIUS * width) / square_root(norm)
+    finishing = load(lanes, lane_values, FINISHING * width) > zero
+    mean, scale = load(lanes, lane_values, MEAN * width), load(lanes, lane_values, SCALE * width)
+    half_multiplier = load(lanes, lane_values, RADIUS * width) / square_root(norm)
     half_multiplier = select(norm > zero, half_multiplier, zero)
-    old = load(lanes, numbers, MULTIPLIER * width)
-    store(numbers, MULTIPLIER * width, select(finishing, (half_multiplier + half_multiplier) * scale, old))
+    old = load(lanes, lane_values, MULTIPLIER * width)
+    store(
+        lane_values, MULTIPLIER * width, select(finishing, (half_multiplier + half_multiplier) * scale, old)
+    )
     for here in range(0, ny * nx * width, width):
         g = load(lanes, state, here * STATE_VECTORS + IMAGE * width)
         u = multiply_add(g - half_multiplier * load(lanes, rows, here), scale, mean)
@@ -97,7 +99,9 @@ def _write_finished(
 
 
 @compiled
-def _prepare(lanes: Any, image: Any, state: Any, ny: Any, nx: Any, smallest_range: Any, numbers: Any) -> None:
+def _prepare(
+    lanes: Any, image: Any, state: Any, ny: Any, nx: Any, smallest_range: Any, lane_values: Any
+) -> None:
     """Normalise the images into the state.
 
     Normalisation (mean to zero, largest deviation to one) keeps every intermediate of order one, whatever
@@ -125,9 +129,9 @@ def _prepare(lanes: Any, image: Any, state: Any, ny: Any, nx: Any, smallest_rang
         g = (load(lanes, image, here) - mean) * inverse
         squares = multiply_add(g, g, squares)
         store(state, here * STATE_VECTORS + IMAGE * width, g)
-    store(numbers, MEAN * width, mean)
-    store(numbers, SCALE * width, scale)
-    store(numbers, SIZE * width, squares)
+    store(lane_values, MEAN * width, mean)
+    store(lane_values, SCALE * width, scale)
+    store(lane_values, SIZE * width, squares)
 
 
 @compiled
@@ -148,7 +152,7 @@ def _copy_lane(width: Any, lane: Any, pixels: Any, image: Any, output: Any) -> N
 
 @compiled
 def _decide_beforehand(
-    width: Any, pixels: Any, smallest: Any, image: Any, output: Any, numbers: Any, counts: Any
+    width: Any, pixels: Any, smallest: Any, image: Any, output: Any, lane_values: Any, counts: Any
 ) -> Any:
     """Settle the lanes that need no iteration; return how many remain active.
 
@@ -157,27 +161,27 @@ def _decide_beforehand(
     """
     active = 0
     for lane in range(width):
-        strength, scale = numbers[STRENGTH * width + lane], numbers[SCALE * width + lane]
+        strength, scale = lane_values[STRENGTH * width + lane], lane_values[SCALE * width + lane]
         counts[ITERATIONS * width + lane] = 0
         counts[CONVERGED * width + lane] = 1
         counts[INFEASIBLE * width + lane] = 0
         counts[ACTIVE * width + lane] = 0
-        numbers[MULTIPLIER * width + lane] = 0.0
-        numbers[RADIUS * width + lane] = 1.0
+        lane_values[MULTIPLIER * width + lane] = 0.0
+        lane_values[RADIUS * width + lane] = 1.0
         if scale <= 0.0 or strength <= smallest * scale:
             _copy_lane(width, lane, pixels, image, output)
             if scale <= 0.0 and strength > 0.0:
                 counts[INFEASIBLE * width + lane] = 1
-                numbers[MULTIPLIER * width + lane] = math.inf
+                lane_values[MULTIPLIER * width + lane] = math.inf
             continue
         radius = math.sqrt(pixels) * (strength / scale)
-        if radius * radius >= numbers[SIZE * width + lane]:
+        if radius * radius >= lane_values[SIZE * width + lane]:
             counts[INFEASIBLE * width + lane] = 1
-            numbers[MULTIPLIER * width + lane] = math.inf
+            lane_values[MULTIPLIER * width + lane] = math.inf
             for i in range(pixels):
-                output[i * width + lane] = numbers[MEAN * width + lane]
+                output[i * width + lane] = lane_values[MEAN * width + lane]
             continue
-        numbers[RADIUS * width + lane] = radius
+        lane_values[RADIUS * width + lane] = radius
         if counts[LIMIT * width + lane] <= 0:
             _copy_lane(width, lane, pixels, image, output)
             counts[CONVERGED * width + lane] = 0
@@ -198,21 +202,21 @@ def _next_limit(width: Any, counts: Any) -> Any:
 
 
 @compiled
-def _mark_finished(width: Any, iteration: Any, measured: Any, numbers: Any, counts: Any) -> Any:
+def _mark_finished(width: Any, iteration: Any, measured: Any, lane_values: Any, counts: Any) -> Any:
     """Mark the active lanes that have converged or reached their limit; return how many."""
     finished = 0
     for lane in range(width):
-        numbers[FINISHING * width + lane] = 0.0
+        lane_values[FINISHING * width + lane] = 0.0
         if not counts[ACTIVE * width + lane]:
             continue
-        tolerance = numbers[TOLERANCE * width + lane]
-        bound = tolerance * tolerance * numbers[SIZE * width + lane]
-        converged = measured and tolerance > 0.0 and numbers[CHANGE * width + lane] <= bound
+        tolerance = lane_values[TOLERANCE * width + lane]
+        bound = tolerance * tolerance * lane_values[SIZE * width + lane]
+        converged = measured and tolerance > 0.0 and lane_values[CHANGE * width + lane] <= bound
         if converged or iteration >= counts[LIMIT * width + lane]:
             counts[CONVERGED * width + lane] = 1 if converged else 0
             counts[ITERATIONS * width + lane] = iteration
             counts[ACTIVE * width + lane] = 0
-            numbers[FINISHING * width + lane] = 1.0
+            lane_values[FINISHING * width + lane] = 1.0
             finished += 1
     return finished
 
@@ -228,7 +232,7 @@ def denoise_group(
     output: Any,
     state: Any,
     rows: Any,
-    numbers: Any,
+    lane_values: Any,
     counts: Any,
 ) -> None:
     """Denoise the W images of a group.
@@ -245,7 +249,7 @@ def denoise_group(
         Input, kept as it is, and result: all lanes of a pixel side by side.
     state, rows : arrays
         Scratch of STATE_VECTORS * ny * nx * W and (ny * nx + 2 * nx + 3) * W numbers.
-    numbers : (LANE_ROWS * W,) array
+    lane_values : (LANE_ROWS * W,) array
         STRENGTH and TOLERANCE are read, MULTIPLIER is written, the rest is scratch.
     counts : (COUNT_ROWS * W,) int64 array
         LIMIT is read; ITERATIONS, CONVERGED, INFEASIBLE are written.
@@ -253,15 +257,15 @@ def denoise_group(
     width = width_of(lanes)
     # Strengths below the images' rounding error count as zero; ranges whose inverse overflows, as constant.
     smallest, smallest_range = (1e-8, 1e-30) if image.itemsize == 4 else (1e-17, 1e-290)
-    _prepare(lanes, image, state, ny, nx, smallest_range, numbers)
-    active = _decide_beforehand(width, ny * nx, smallest, image, output, numbers, counts)
+    _prepare(lanes, image, state, ny, nx, smallest_range, lane_values)
+    active = _decide_beforehand(width, ny * nx, smallest, image, output, lane_values, counts)
     if active == 0:
         return
     test_change = False
     for lane in range(width):
-        test_change |= numbers[TOLERANCE * width + lane] > 0.0
+        test_change |= lane_values[TOLERANCE * width + lane] > 0.0
     zero = splat(lanes, 0.0)
-    inverse_radius = splat(lanes, 1.0) / load(lanes, numbers, RADIUS * width)
+    inverse_radius = splat(lanes, 1.0) / load(lanes, lane_values, RADIUS * width)
     inverse = inverse_radius * splat(lanes, math.sqrt(ny * nx) / FIRST_MULTIPLIER)
     momentum_age = 1.0
     if table.shape[0] > 0:
@@ -283,10 +287,10 @@ def denoise_group(
         momentum, momentum_age = (momentum_age - 1.0) / next_age, next_age
         measured = test_change and iteration % CHECK_INTERVAL == 0
         if measured:
-            _measure_change(lanes, state, ny, nx, current, inverse, numbers)
+            _measure_change(lanes, state, ny, nx, current, inverse, lane_values)
         if measured or iteration >= limit:
-            finished = _mark_finished(width, iteration, measured, numbers, counts)
+            finished = _mark_finished(width, iteration, measured, lane_values, counts)
             if finished > 0:
-                _write_finished(lanes, state, rows, output, ny, nx, current, numbers)
+                _write_finished(lanes, state, rows, output, ny, nx, current, lane_values)
                 active -= finished
                 limit = _next_limit(width, counts)

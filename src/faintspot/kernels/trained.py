@@ -8,7 +8,7 @@ from typing import Any
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.rows import rows_from_lanes
 from faintspot.kernels.simd import load, multiply_add, splat, sum_of, width_of
-from faintspot.kernels.spot_numbers import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, X, Y
+from faintspot.kernels.spot_rows import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, X, Y
 
 
 @compiled
@@ -47,7 +47,7 @@ def apply_score(
     kinds: Any,
     steps_per_px: Any,
     margin: Any,
-    numbers: Any,
+    lane_values: Any,
     starts: Any,
     rows: Any,
 ) -> None:
@@ -61,7 +61,7 @@ def apply_score(
         belongs to the offset i - margin + p / steps_per_px from q.
     kinds : (W,) int64
     margin : int
-    numbers : (LANE_ROWS * W,)
+    lane_values : (LANE_ROWS * W,)
         X, Y and FLUX are read; X and Y are written.
     starts : (W,) int64
         Scratch.
@@ -75,18 +75,18 @@ def apply_score(
     # All sub-apertures make a pass before the next one: nothing then waits for its own last pass.
     for number in range(passes):
         for lane in range(width):
-            step_x = math.floor((-0.5 * (nx - 1) - numbers[X * width + lane]) * steps_per_px + 0.5)
-            step_y = math.floor((-0.5 * (ny - 1) - numbers[Y * width + lane]) * steps_per_px + 0.5)
+            step_x = math.floor((-0.5 * (nx - 1) - lane_values[X * width + lane]) * steps_per_px + 0.5)
+            step_y = math.floor((-0.5 * (ny - 1) - lane_values[Y * width + lane]) * steps_per_px + 0.5)
             # In floating point: dividing whole numbers takes longer than a row of the image.
             whole_x, whole_y = math.floor(step_x * px_per_step), math.floor(step_y * px_per_step)
             phase = (step_y - whole_y * phases) * phases + (step_x - whole_x * phases)
             plane = ((kinds[lane] * passes + number) * phases * phases + int(phase)) * 2 * side * length
             at = plane + (int(whole_y) + margin) * length + int(whole_x) + margin
             sum_x, sum_y = _products(lanes, rows, lane, tables, at, length, side * length)
-            inverse = 1.0 / numbers[FLUX * width + lane]
+            inverse = 1.0 / lane_values[FLUX * width + lane]
             x = -0.5 * (nx - 1) - step_x * px_per_step + sum_x * inverse
             y = -0.5 * (ny - 1) - step_y * px_per_step + sum_y * inverse
-            low, high = numbers[LOW_X * width + lane], numbers[HIGH_X * width + lane]
-            numbers[X * width + lane] = min(max(x, low), high)
-            low, high = numbers[LOW_Y * width + lane], numbers[HIGH_Y * width + lane]
-            numbers[Y * width + lane] = min(max(y, low), high)
+            low, high = lane_values[LOW_X * width + lane], lane_values[HIGH_X * width + lane]
+            lane_values[X * width + lane] = min(max(x, low), high)
+            low, high = lane_values[LOW_Y * width + lane], lane_values[HIGH_Y * width + lane]
+            lane_values[Y * width + lane] = min(max(y, low), high)

@@ -8,7 +8,7 @@ from typing import Any
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.profiles import look_up
 from faintspot.kernels.simd import load, maximum, minimum, multiply_add, select, splat, store, width_of
-from faintspot.kernels.spot_numbers import (
+from faintspot.kernels.spot_rows import (
     ERROR_X,
     ERROR_Y,
     EXCESS,
@@ -32,12 +32,12 @@ LEAST_FRACTION = 0.05  # of the light at the start: less under the weight would 
 
 
 @compiled
-def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, numbers: Any) -> None:
+def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, lane_values: Any) -> None:
     """Move every lane by the weighted centre of gravity of its image, seen from where it is."""
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    x0, y0 = load(lanes, numbers, X * width), load(lanes, numbers, Y * width)
+    x0, y0 = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
     total, moment_x, moment_y = zero, zero, zero
     for y in range(ny):
         weight_y = load(lanes, profiles, (2 * padded + y) * width)
@@ -51,23 +51,25 @@ def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, n
         moment_y = multiply_add(row * weight_y, splat(lanes, y - 0.5 * (ny - 1)), moment_y)
     inverse = splat(lanes, 1.0) / maximum(total, floor)
     most, least = splat(lanes, LARGEST_MOVE_PX), splat(lanes, -LARGEST_MOVE_PX)
-    dx = load(lanes, numbers, GAIN_X * width) * ((moment_x - x0 * total) * inverse)
-    dy = load(lanes, numbers, GAIN_Y * width) * ((moment_y - y0 * total) * inverse)
+    dx = load(lanes, lane_values, GAIN_X * width) * ((moment_x - x0 * total) * inverse)
+    dy = load(lanes, lane_values, GAIN_Y * width) * ((moment_y - y0 * total) * inverse)
     x0, y0 = x0 + minimum(maximum(dx, least), most), y0 + minimum(maximum(dy, least), most)
-    low, high = load(lanes, numbers, LOW_X * width), load(lanes, numbers, HIGH_X * width)
-    store(numbers, X * width, minimum(maximum(x0, low), high))
-    low, high = load(lanes, numbers, LOW_Y * width), load(lanes, numbers, HIGH_Y * width)
-    store(numbers, Y * width, minimum(maximum(y0, low), high))
+    low, high = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
+    store(lane_values, X * width, minimum(maximum(x0, low), high))
+    low, high = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)
+    store(lane_values, Y * width, minimum(maximum(y0, low), high))
 
 
 @compiled
-def _store_errors(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, numbers: Any) -> None:
+def _store_errors(
+    lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, lane_values: Any
+) -> None:
     """Propagate the pixels' noise, VARIANCE + EXCESS * g, through the last step."""
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
-    v, e = load(lanes, numbers, VARIANCE * width), load(lanes, numbers, EXCESS * width)
-    x0, y0 = load(lanes, numbers, X * width), load(lanes, numbers, Y * width)
+    v, e = load(lanes, lane_values, VARIANCE * width), load(lanes, lane_values, EXCESS * width)
+    x0, y0 = load(lanes, lane_values, X * width), load(lanes, lane_values, Y * width)
     total, noise_x, noise_y, noise, dark_x, dark_y = zero, zero, zero, zero, zero, zero
     for y in range(ny):
         weight_y = load(lanes, profiles, (2 * padded + y) * width)
@@ -87,21 +89,21 @@ def _store_errors(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor
     least = splat(lanes, SMALLEST_VARIANCE)
     lit = total > floor
     inverse = splat(lanes, 1.0) / maximum(total, floor)
-    gain_x, gain_y = load(lanes, numbers, GAIN_X * width), load(lanes, numbers, GAIN_Y * width)
+    gain_x, gain_y = load(lanes, lane_values, GAIN_X * width), load(lanes, lane_values, GAIN_Y * width)
     unknown = splat(lanes, math.inf)
     # Pixels that noise has made negative must not take away more than the light's own noise.
     noise_x = maximum(noise_x, maximum(v, least) * dark_x)
     noise_y = maximum(noise_y, maximum(v, least) * dark_y)
     error_x = gain_x * gain_x * inverse * inverse * noise_x
     error_y = gain_y * gain_y * inverse * inverse * noise_y
-    store(numbers, ERROR_X * width, select(lit, error_x, unknown))
-    store(numbers, ERROR_Y * width, select(lit, error_y, unknown))
-    store(numbers, SEEN * width, total)
-    store(numbers, SEEN_ERROR * width, maximum(noise, least))
+    store(lane_values, ERROR_X * width, select(lit, error_x, unknown))
+    store(lane_values, ERROR_Y * width, select(lit, error_y, unknown))
+    store(lane_values, SEEN * width, total)
+    store(lane_values, SEEN_ERROR * width, maximum(noise, least))
     for lane in range(width):
-        numbers[SEEN_ERROR * width + lane] = math.sqrt(numbers[SEEN_ERROR * width + lane])
+        lane_values[SEEN_ERROR * width + lane] = math.sqrt(lane_values[SEEN_ERROR * width + lane])
         for row in (ERROR_X, ERROR_Y):
-            numbers[row * width + lane] = math.sqrt(max(numbers[row * width + lane], 0.0))
+            lane_values[row * width + lane] = math.sqrt(max(lane_values[row * width + lane], 0.0))
 
 
 @compiled
@@ -113,7 +115,7 @@ def weigh_group(
     tables: Any,
     which: Any,
     steps: Any,
-    numbers: Any,
+    lane_values: Any,
     starts: Any,
     profiles: Any,
 ) -> None:
@@ -122,8 +124,8 @@ def weigh_group(
     The tables hold the weight's profile, 1 at its centre.
     """
     width = width_of(lanes)
-    floor = splat(lanes, LEAST_FRACTION) * load(lanes, numbers, FLUX * width)
+    floor = splat(lanes, LEAST_FRACTION) * load(lanes, lane_values, FLUX * width)
     for _ in range(steps):
-        look_up(lanes, tables, which, ny, nx, numbers, starts, profiles)
-        _move(lanes, image, ny, nx, profiles, floor, numbers)
-    _store_errors(lanes, image, ny, nx, profiles, floor, numbers)
+        look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
+        _move(lanes, image, ny, nx, profiles, floor, lane_values)
+    _store_errors(lanes, image, ny, nx, profiles, floor, lane_values)

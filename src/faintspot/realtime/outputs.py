@@ -10,7 +10,7 @@ import numpy as np
 
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.kernels.compiling import Direct
-from faintspot.kernels.details import fill_details
+from faintspot.kernels.telemetry_rows import fill_telemetry_rows
 from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -45,7 +45,7 @@ class SlopeStreams:
         self._details = _created(f"{name}_details", (len(DETAILS), n))
         self._marks = _created(f"{name}_marks", (len(MARKS),), np.int64)
         self._n = n
-        self._fill = Direct(fill_details)
+        self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
 
     @contextmanager

@@ -11,7 +11,7 @@ _INVALID, _NOT_CONVERGED = int(INVALID), int(SubapertureFlag.NOT_CONVERGED)
 
 
 @compiled
-def fill_details(
+def fill_telemetry_rows(
     flux: Any, flags: Any, iterations: Any, error_x: Any, error_y: Any, counts: Any, table: Any
 ) -> None:
     """Fill a table (6, n), and count: invalid sub-apertures, those at the iteration limit, iterations.

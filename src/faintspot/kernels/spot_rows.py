@@ -1,4 +1,4 @@
-"""Rows of the table of per-lane numbers (n_rows, W) that the estimators of a spot's position share."""
+"""Rows of the table of per-lane values (n_rows, W) that the estimators of a spot's position share."""
 
 from __future__ import annotations
 
