@@ -28,7 +28,8 @@ TRUTH_COLOUR = "#56B4E9"
 GREY = "#9a9a9a"
 LIGHT_GREY = "#e4e4e4"
 DOTS_PER_INCH = 144
-_MOST_WITH_GAPS = 600  # narrower than a pixel of the picture, gaps would only make a moiré
+MOST_WITH_GAPS = 600
+"""With more sub-apertures than this, gaps between them and outlines would only make a moiré."""
 WIDTH = 13.0
 """Inches of a picture as wide as the page."""
 
@@ -90,7 +91,7 @@ def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
     else:
         angles, radius = 45.0 + 90.0 * np.arange(4), pitch / np.sqrt(2)
     direction = np.deg2rad(angles + layout.angle_deg)
-    gap = 0.96 if len(layout) <= _MOST_WITH_GAPS else 1.0
+    gap = 0.96 if len(layout) <= MOST_WITH_GAPS else 1.0
     ring = gap * radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
     shapes: NDArray[np.float64] = layout.centres[:, None, :] + ring
     return shapes
@@ -110,7 +111,7 @@ def subaperture_map(
     known = np.isfinite(values)
     empty = PolyCollection(list(shapes[~known]), facecolors="white", edgecolors=GREY, linewidths=0.6)
     filled = PolyCollection(list(shapes[known]), array=values[known], cmap=COLOUR_MAP, linewidths=0)
-    filled.set_antialiased(len(layout) <= _MOST_WITH_GAPS)
+    filled.set_antialiased(len(layout) <= MOST_WITH_GAPS)
     filled.set_clim(*limits)
     axes.add_collection(empty)
     axes.add_collection(filled)
