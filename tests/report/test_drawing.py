@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from faintspot.errors import MissingExtraError
-from faintspot.report.drawing import limits_of, new_figure, png, subaperture_shapes, svg
+from faintspot.report.drawing import limits_of, new_figure, plain_ticks, png, subaperture_shapes, svg
 from faintspot.sensor.layout import Layout
 
 
@@ -45,3 +45,12 @@ def test_missing_matplotlib_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
             monkeypatch.delitem(sys.modules, name, raising=False)
         with pytest.raises(MissingExtraError, match=r"faintspot\[web\]"):
             __import__(f"faintspot.{module}")
+
+
+def test_plain_ticks_are_at_their_places_alone() -> None:
+    axes = new_figure(3.0, 3.0).subplots()
+    axes.set_xscale("log")
+    axes.set_xlim(0.5, 20000)
+    plain_ticks(axes.xaxis, (1, 30, 10000))
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["1", "30", "10000"]
+    assert len(axes.get_xticks(minor=True)) == 0

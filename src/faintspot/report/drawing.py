@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -16,8 +16,10 @@ from faintspot.sensor.layout import Layout
 try:
     import matplotlib
     from matplotlib.axes import Axes
+    from matplotlib.axis import XAxis, YAxis
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 except ImportError:
     raise MissingExtraError("matplotlib", "web", "Drawing pictures") from None
 
@@ -118,6 +120,13 @@ def subaperture_map(
     place_axes(axes, layout)
     axes.set_title(title)
     colour_bar(axes, filled, label)
+
+
+def plain_ticks(axis: XAxis | YAxis, values: Iterable[float], form: str = "g") -> None:
+    """Put ticks at these values and nowhere else, written as plain numbers."""
+    axis.set_major_locator(FixedLocator([float(value) for value in values]))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:{form}}"))
 
 
 def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:
