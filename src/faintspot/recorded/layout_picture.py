@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.files import write_atomically
 from faintspot.report.drawing import colour_bar, limits_of, new_figure, png, styled
-from faintspot.report.files import write_file
 from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
     if array.ndim == 3:
         array = array.mean(axis=0)
     inside = layout.images(array)
-    write_file(path, png(_layout_figure(array, inside, layout)))
+    write_atomically(path, png(_layout_figure(array, inside, layout)))
 
 
 def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
