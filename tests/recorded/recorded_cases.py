@@ -69,5 +69,10 @@ class Page(HTMLParser):
     def text(self) -> str:
         return " ".join(" ".join(self.words).split())
 
+    @property
+    def ids(self) -> list[str]:
+        """Names of the sections."""
+        return [value for tag, found in self.tags if tag == "section" and (value := found.get("id"))]
+
     def values(self, attribute: str) -> list[str]:
         return [value for _, found in self.tags if (value := found.get(attribute)) is not None]

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import matplotlib
 import numpy as np
-import pytest
 from tests.recorded.recorded_cases import SETTINGS, sensor, simulated
-from tests.shared_data import shared_file
 
-from faintspot.errors import InputError
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.pipeline import SlopePipeline
-from faintspot.recorded.frame_pictures import Example, assembled, example_subapertures, whole_sensor
-from faintspot.report import layout_picture
-from faintspot.report.drawing import limits_of, new_figure, png, subaperture_shapes
+from faintspot.recorded.frame_pictures import (
+    Example,
+    assembled,
+    coarseness,
+    coarser,
+    example_subapertures,
+    whole_sensor,
+)
+from faintspot.report.drawing import png
 from faintspot.sensor.layout import Layout
 
 
@@ -70,22 +72,6 @@ def test_raw_in_electrons_is_recognised() -> None:
     assert not Example(layout, {"TV": other}).raw_is_calibrated
 
 
-@pytest.mark.parametrize(("geometry", "area"), [("square", 1.0), ("hexagonal", np.sqrt(3) / 2)])
-def test_shapes_tile_the_plane(geometry: str, area: float) -> None:
-    layout = Layout((60, 60), (8, 8), np.array([[10, 10], [30, 30]]), geometry=geometry, pitch_px=10.0)
-    x, y = subaperture_shapes(layout)[0].T
-    found = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-    assert found == pytest.approx(0.96**2 * area * 100)
-    assert np.hypot(x - 13.5, y - 13.5).max() < 7.1
-
-
-def test_limits_are_never_empty() -> None:
-    assert limits_of(np.array([np.nan])) == (0.0, 1.0)
-    low, high = limits_of(np.array([3.0, 3.0]))
-    assert low < high
-    assert limits_of(np.array([1.0, np.nan]), np.array([5.0]), low=0.0) == (0.0, 5.0)
-
-
 def test_users_style_is_neither_used_nor_changed() -> None:
     layout = sensor((1, 1))
     stages = {"TV": SlopePipeline(layout, SETTINGS).explain(simulated(layout, 1)[0][0])}
@@ -95,25 +81,19 @@ def test_users_style_is_neither_used_nor_changed() -> None:
         assert matplotlib.rcParams["font.size"] == 30
 
 
-def test_layout_picture_is_a_png(tmp_path: Path) -> None:
+def test_a_big_sensor_is_shown_coarser_and_its_spots_stay() -> None:
+    small, big = sensor(), Layout.grid((60, 60), pixels=16)
+    assert coarseness(small) == 1
+    assert coarseness(big) == 3
+    sheet = np.full((7, 5), np.nan)
+    sheet[1, 1], sheet[2, 3], sheet[6, 4] = 5.0, 2.0, 1.0
+    found = coarser(sheet, 3)
+    np.testing.assert_array_equal(found, [[5.0, 2.0], [np.nan, np.nan], [np.nan, 1.0]])
+    assert coarser(sheet, 1) is sheet
+
+
+def test_a_raw_frame_in_electrons_is_not_shown_twice_alone() -> None:
     layout = sensor()
-    frames = simulated(layout, 2)[0]
-    frames[:, 3, 3] = np.nan
-    layout_picture(frames, layout, tmp_path / "layout.png")
-    assert (tmp_path / "layout.png").read_bytes().startswith(b"\x89PNG")
-    layout_picture(np.zeros(layout.frame_shape), layout, tmp_path / "dark.png")
-    with pytest.raises(InputError, match="frame"):
-        layout_picture(frames[:, 1:], layout, tmp_path / "other.png")
-    with pytest.raises(InputError, match="does not exist"):
-        layout_picture(frames, layout, tmp_path / "none" / "layout.png")
-
-
-def test_layout_picture_of_a_real_frame(tmp_path: Path) -> None:
-    frame = np.load(shared_file("data/ciao_bench_60x224x224.npz"))["frames"].mean(axis=0)
-    layout = Layout.grid((8, 8), pixels=27, frame_shape=frame.shape)
-    layout_picture(frame, layout, tmp_path / "layout.png")
-    assert (tmp_path / "layout.png").stat().st_size > 10_000
-
-
-def test_an_empty_figure_is_written() -> None:
-    assert png(new_figure(1.0, 1.0)).startswith(b"\x89PNG")
+    stages = {"ml": SlopePipeline(layout, SETTINGS).explain(simulated(layout, 1)[0][0])}
+    assert list(Example(layout, stages, steps=TotalVariation.steps_shown[:2]).shown_steps) == ["raw"]
+    assert len(Example(layout, stages, steps=TotalVariation.steps_shown).shown_steps) == 4

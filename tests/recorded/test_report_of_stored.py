@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +20,11 @@ from faintspot.recorded import measure_recorded, slopes_as_variables
 from faintspot.report import report_of_stored
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
 from faintspot.settings import Settings
+from faintspot.simulate import Detector
+from faintspot.training import train_estimator
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 PLAIN = SETTINGS.replace(denoise=False)
@@ -70,8 +75,8 @@ def test_two_stores_are_two_arms(tmp_path: Path) -> None:
     first = store(tmp_path / "a.npz", sensor())
     second = store(tmp_path / "b.npz", sensor(), PLAIN)
     page = Page(report_of_stored([first, second]))
-    assert "Settings of 'TV'" in page.text
-    assert "Settings of 'no TV'" in page.text
+    assert "Settings of 'TV denoising'" in page.text
+    assert "Settings of 'brightest pixels'" in page.text
     assert "no denoising; 10 brightest of 64 pixels" in page.text
 
 
@@ -119,7 +124,7 @@ def test_frames_counts_that_differ_are_said(tmp_path: Path) -> None:
 def test_csv_without_attributes_still_gives_numbers(tmp_path: Path) -> None:
     text = Page(report_of_stored([store(tmp_path / "slopes.csv", sensor())])).text
     assert "does not say with which configuration" in text
-    assert "median flux after background" in text
+    assert "median flux" in text
     assert "the layout of the sub-apertures is not known" in text
 
 
@@ -168,12 +173,92 @@ def test_frames_that_are_not_the_runs_are_noticed(tmp_path: Path) -> None:
     assert "positions that differ from those stored" in Page(report_of_stored([path])).text
 
 
+def measured(folder: Path, name: str, **options: Any) -> Path:
+    """Measure frames with an estimator as `faintspot slopes` does; PSF and score lie beside the settings."""
+    layout = sensor()
+    np.save(folder / "frames.npy", simulated(layout, 5)[0])
+    configured = folder / f"{name}.toml"
+    for item in (layout, Settings(estimator=name, **options), Calibration(read_noise_e=0.3)):
+        configuration.save(configured, item)
+    if name in ("matched", "ml", "map"):
+        psf = PSF.analytic("diffraction", size=1.0)
+        configuration.save(configured, PSF(psf.samples, psf.oversampling))
+    if name == "trained":
+        configuration.save(configured, small_score())
+    measure_recorded([folder / "frames.npy"], configured, folder / f"{name}.zarr")
+    return folder / f"{name}.zarr"
+
+
+@cache
+def small_score() -> TrainedScore:
+    return train_estimator(flux_e=(50.0, 200.0), detector=Detector(0.3), shape=(8, 8), realisations=2000)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("brightest", {}),
+        ("smoothed", {}),
+        ("thresholded", {"threshold_e": 0.5}),
+        ("weighted", {"spot_fwhm_px": 2.0}),
+        ("matched", {}),
+        ("ml", {}),
+        ("map", {}),
+        ("trained", {}),
+    ],
+)
+def test_the_page_of_an_estimator_speaks_of_it_alone(
+    tmp_path: Path, name: str, options: dict[str, Any]
+) -> None:
+    text = Page(report_of_stored([measured(tmp_path, name, **options)])).text
+    estimator = Settings(estimator=name, **options).estimator
+    assert f"Settings {estimator.in_words(9, 64)}" in text
+    assert f"Images are those of '{estimator.label}'" in text
+    assert "Not drawn" not in text
+    for other in ("TV", "total-variation", "iteration"):
+        assert other not in text
+
+
+def test_automatic_settings_have_a_page(tmp_path: Path) -> None:
+    path = measured(tmp_path, "tv", noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
+    assert "total-variation denoising" in Page(report_of_stored([path])).text
+
+
+def test_a_psf_that_is_gone_is_said_in_one_line(tmp_path: Path) -> None:
+    path = measured(tmp_path, "ml")
+    (tmp_path / "ml.toml").unlink()
+    assert "Not drawn" not in Page(report_of_stored([path])).text
+    (tmp_path / "ml.psf.npz").unlink()
+    html = report_of_stored([path])
+    assert "Not drawn: the PSF of ml.zarr is gone" in Page(html).text
+    assert html.count("the PSF of ml.zarr is gone") == 2  # at the top, and where the pictures would be
+
+
+def test_an_analytic_psf_is_read_from_the_configuration(tmp_path: Path) -> None:
+    path = measured(tmp_path, "ml")
+    configured = tmp_path / "ml.toml"
+    text = configured.read_text()
+    start = text.index("[psf]")
+    configured.write_text(text[:start] + '[psf]\nprofile = "diffraction"\nsize = 1.0\n')
+    measure_recorded([tmp_path / "frames.npy"], configured, path, overwrite=True)
+    (tmp_path / "ml.psf.npz").unlink()
+    assert "Not drawn" not in Page(report_of_stored([path])).text
+
+
+def test_slopes_without_sources_are_not_said_to_have_others(tmp_path: Path) -> None:
+    first = store(tmp_path / "a.npz", sensor())
+    second = store(tmp_path / "b.csv", sensor(), PLAIN)
+    other = store(tmp_path / "c.npz", sensor(), PLAIN, sources=["other.npy"])
+    assert "different sources" not in Page(report_of_stored([first, second])).text
+    assert "different sources" in Page(report_of_stored([first, other])).text
+
+
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.zarr"):
         report_of_stored([tmp_path / "gone.zarr"])
 
 
-def test_slopes_relative_to_a_reference_are_recognised(tmp_path: Path) -> None:
+def test_slopes_relative_to_a_reference_are_said_to_be(tmp_path: Path) -> None:
     layout = sensor()
     reference = np.full((len(layout), 2), 0.4)
     frames = simulated(layout, 3)[0]

@@ -49,7 +49,7 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
     for name in frames:
         split_location(name)  # refuses what is not there
     if len(paths) == 1 and holds_loop_results(paths[0]):
-        from faintspot.loop.report_page import write_loop_report
+        from faintspot.loop.page import write_loop_report
 
         page = Path(output) if output is not None else paths[0] / "report.html"
         write_loop_report(paths[0], page)

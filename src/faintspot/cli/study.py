@@ -164,7 +164,7 @@ def estimators(
       faintspot study estimators --quick
       faintspot study estimators -o estimators.zarr --table efficiency.md
     """
-    from faintspot.report.files import write_file
+    from faintspot.files import write_atomically
     from faintspot.study import estimators as study_of_estimators
     from faintspot.study.efficiency import markdown
 
@@ -177,7 +177,7 @@ def estimators(
     if table is not None:
         options = " --quick" if quick else ""
         made_by = f"faintspot study estimators{options} --table {shlex.quote(table)}"
-        write_file(Path(table), markdown(results, made_by).encode("utf-8"))
+        write_atomically(table, markdown(results, made_by))
         click.echo(f"{table}: tables")
 
 

@@ -18,7 +18,7 @@ from faintspot.loop.analysis import (
     paired_differences,
     regression_lines,
 )
-from faintspot.loop.report_figures import standard_error, strehl_axis
+from faintspot.loop.figures import standard_error, strehl_axis
 from faintspot.report.drawing import GREY, LIGHT_GREY, WIDTH, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
 
@@ -68,8 +68,7 @@ def strehl_figure(table: Measurements, label: str) -> FigureWithData:
     caption = (
         "One point for each measurement. Straight lines: least squares through the points of each group "
         "with their correlation r. Right: points as on the left; line: means over ranges of strengths; "
-        "band: mean "
-        "of the measurements without TV and its standard error, which the drift of r0 widens."
+        "band: mean of the measurements without TV and its standard error, which the drift of r0 widens."
     )
     return FigureWithData("strehl", "Strehl with and without TV", caption, figure, *_measurement_rows(table))
 

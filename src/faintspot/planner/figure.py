@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.report.drawing import ARM_COLOURS, GREY, LIGHT_GREY, new_figure, styled
+from faintspot.report.drawing import ARM_COLOURS, GREY, LIGHT_GREY, new_figure, plain_ticks, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,7 +49,7 @@ def tune_figure(answer: Answer) -> Figure:
     _mark_star(axes, answer)
     _mark_budget(axes, answer)
     _electrons_above(axes, answer)
-    _plain_ticks(axes)
+    plain_ticks(axes.yaxis, _TICKS)
     axes.grid(which="major", color=LIGHT_GREY, lw=0.7)
     axes.set_xlabel(answer.magnitude_label)
     axes.set_ylabel("slope error R, mean |error| per axis (px)")
@@ -130,11 +130,3 @@ def _electrons_above(axes: Axes, answer: Answer) -> None:
     top = axes.secondary_xaxis("top")
     top.set_xticks(answer.magnitudes(answer.flux_e), [f"{float(f'{flux:.3g}'):g}" for flux in answer.flux_e])
     top.set_xlabel("electrons per sub-aperture and frame")
-
-
-def _plain_ticks(axes: Axes) -> None:
-    from matplotlib.ticker import FixedLocator, NullLocator
-
-    axes.yaxis.set_major_locator(FixedLocator(list(_TICKS)))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter("{x:g}")

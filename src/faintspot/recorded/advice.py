@@ -1,4 +1,4 @@
-"""A run in words: its settings, what its flags mean, and what to do about what went wrong."""
+"""What the flags of a run mean, and what to do about what went wrong."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import numpy as np
 
 from faintspot.flags import SubapertureFlag
 from faintspot.recorded.statistics import MeasuredSlopes, SlopesSummary
-from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
 
 FLAG_MEANINGS = {
-    SubapertureFlag.NO_LIGHT: "Nothing usable was left after the background subtraction: invalid, slope 0.",
+    SubapertureFlag.NO_LIGHT: "Nothing usable was left of the light: invalid, slope 0.",
     SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
     SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
@@ -20,6 +18,7 @@ FLAG_MEANINGS = {
     SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
     SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
 }
+FLAGS_OF_DENOISING = (SubapertureFlag.INFEASIBLE_STRENGTH, SubapertureFlag.NOT_CONVERGED)
 _MOST_LISTED = 20
 _OFTEN_INFEASIBLE = 0.05
 # Fraction of the measurements from which a flag is worth a warning, and what to do then.
@@ -45,27 +44,6 @@ _ADVICE = {
         "raise max_iterations, or raise tolerance if the time does not allow it",
     ),
 }
-
-
-def settings_in_words(settings: Settings, layout: Layout) -> str:
-    """Return what the settings do, in one line."""
-    pixels = layout.pixels
-
-    def span(name: str) -> str:
-        values = settings.values(name, len(layout), pixels)
-        low, high = values.min(), values.max()
-        return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-    denoised = int(np.count_nonzero(settings.values("denoise", len(layout), pixels)))
-    rules = ", ".join(str(rule) for rule in np.unique(settings.values("rule", len(layout), pixels)))
-    kept = f"{span('keep_brightest')} brightest of {pixels} pixels kept (rule {rules}), centre of gravity"
-    if denoised == 0:
-        return f"no denoising; {kept}"
-    where = "" if denoised == len(layout) else f" in {denoised} of {len(layout)} sub-apertures"
-    return (
-        f"total-variation denoising{where} of strength {span('noise_std')} e- ({settings.algorithm}, "
-        f"tolerance {span('tolerance')}, at most {span('max_iterations')} iterations); {kept}"
-    )
 
 
 def percentage(fraction: float) -> str:

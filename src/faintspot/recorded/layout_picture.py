@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.collections import PolyCollection
-from matplotlib.colors import FuncNorm
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot.files import write_atomically
 from faintspot.report.drawing import colour_bar, limits_of, new_figure, png, styled
-from faintspot.report.files import write_file
 from faintspot.sensor.layout import Layout
+
+if TYPE_CHECKING:
+    from matplotlib.colors import FuncNorm
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
 _MOST_NUMBERED = 1500
+_MOST_PIXELS = 1400  # a side of the frame; of more, pixels are averaged rather than left out
 
 
 @styled
@@ -45,19 +46,23 @@ def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
     if array.ndim == 3:
         array = array.mean(axis=0)
     inside = layout.images(array)
-    write_file(path, png(_layout_figure(array, inside, layout)))
+    write_atomically(path, png(_layout_figure(array, inside, layout)))
 
 
 def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
+    from matplotlib import patheffects
+    from matplotlib.collections import PolyCollection
+
     n_rows, n_columns = array.shape
     side = 12.0
     figure = new_figure(side, min(max(0.9 * side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
     axes = figure.subplots()
-    image = axes.imshow(array, cmap="gray", norm=_stretch(array, inside), interpolation="nearest")
+    smooth = "nearest" if max(array.shape) <= _MOST_PIXELS else "antialiased"
+    image = axes.imshow(array, cmap="gray", norm=_stretch(array, inside), interpolation=smooth)
     colour_bar(axes, image, "frame's units")
-    boxes = _window_outlines(layout)
-    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors="#E69F00", linewidths=0.9))
     points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
+    boxes, line = _window_outlines(layout), min(max(points / 14, 0.2), 0.9)  # lines never hide the spots
+    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors="#E69F00", linewidths=line))
     font = min(points / 3.0, 13.0)
     if font >= 4 and len(layout) <= _MOST_NUMBERED:
         for number, (row, column) in enumerate(layout.corners):
@@ -84,6 +89,8 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
 
 def _stretch(array: Floats, inside: Floats) -> FuncNorm:
     """Return an asinh stretch around the sky level, in units of its noise; blind to hot and bad pixels."""
+    from matplotlib.colors import FuncNorm
+
     good = array[np.isfinite(array)]
     sky = float(np.median(good)) if good.size else 0.0
     noise = 1.4826 * float(np.median(np.abs(good - sky))) if good.size else 0.0

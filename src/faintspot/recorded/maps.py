@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from faintspot.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary, median
+from faintspot.recorded.statistics import Floats, Jitter, MeasuredSlopes, SlopesSummary, median
 from faintspot.report.drawing import (
     ARM_COLOURS,
     GREY,
     LIGHT_GREY,
+    MOST_WITH_GAPS,
     WIDTH,
     limits_of,
     new_figure,
@@ -24,8 +23,14 @@ from faintspot.report.drawing import (
 )
 from faintspot.sensor.layout import Layout
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _PANEL_HEIGHT = 5.0
 _HISTOGRAM_BINS = 60
+ARROWS_WHOLE_PERCENT = 98
+"""Of this many slopes in a hundred, arrows are never cut."""
 _MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could not be seen
 
 
@@ -33,15 +38,24 @@ _MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could
 def flux_and_validity(
     arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
 ) -> Figure:
-    """Draw median flux and fraction of valid frames, a row of maps for each arm."""
-    figure, axes = _panels(len(arms), 2, layout)
+    """Draw median flux and fraction of valid frames, a row of maps for each arm; of one frame, flux only."""
+    several = arms[0].n_frames > 1
+    figure, axes = _panels(len(arms), 2, layout) if several else _panels(1, len(arms), layout)
     limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
-    for row, arm, summary in zip(axes, arms, summaries, strict=True):
-        title = f"{arm.name}: median flux"
-        subaperture_map(row[0], layout, summary.flux_e, label="flux (e-)", limits=limits, title=title)
-        percent = 100.0 * summary.valid_frames / arm.n_frames
-        title = f"{arm.name}: valid frames"
-        subaperture_map(row[1], layout, percent, label="valid frames (%)", limits=(0, 100), title=title)
+    for number, (arm, summary) in enumerate(zip(arms, summaries, strict=True)):
+        panel = axes[number, 0] if several else axes[0, number]
+        title = f"{arm.name}: {'median ' if several else ''}flux"
+        subaperture_map(panel, layout, summary.flux_e, label="flux (e-)", limits=limits, title=title)
+        if several:
+            percent = 100.0 * summary.valid_frames / arm.n_frames
+            subaperture_map(
+                axes[number, 1],
+                layout,
+                percent,
+                label="valid frames (%)",
+                limits=(0, 100),
+                title=f"{arm.name}: valid frames",
+            )
     return figure
 
 
@@ -49,29 +63,37 @@ def flux_and_validity(
 def slope_arrows(
     arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
 ) -> Figure:
-    """Draw the mean slope of every sub-aperture, one panel per arm, all at one scale."""
+    """Draw the mean slope of every sub-aperture, one panel per arm, all at one scale.
+
+    Those longer than `longest_arrow` are cut to that length and drawn black.
+    """
     figure, axes = _panels(1, len(arms), layout)
-    longest = _arrow_limit(summaries)
+    longest, _ = longest_arrow(summaries)
     key = _round_length(longest)
     pitch = layout.pitch_px or max(layout.window)
     length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
     for panel, arm, summary, colour in zip(axes[0], arms, summaries, ARM_COLOURS, strict=False):
-        panel.add_collection(_outlines(layout))
+        if len(layout) <= MOST_WITH_GAPS:  # of more, outlines would hide the arrows
+            panel.add_collection(_outlines(layout))
         place_axes(panel, layout)
         known = np.isfinite(summary.x_px)
+        slopes = np.stack([summary.x_px[known], summary.y_px[known]])
+        long = np.hypot(*slopes)
+        slopes *= np.minimum(1.0, longest / np.maximum(long, longest))
         arrows = panel.quiver(
             *layout.centres[known].T,
-            summary.x_px[known],
-            summary.y_px[known],
-            color=colour,
+            *slopes,
+            color=np.where(long > longest, "black", colour),
             angles="xy",
             scale_units="xy",
             scale=longest / (length * pitch),
             width=width,
         )
-        panel.quiverkey(arrows, 0.8, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes")
+        panel.quiverkey(
+            arrows, 0.87, -0.1, key, f"{key:g} px", labelpos="E", coordinates="axes", color=colour
+        )
         panel.plot(*layout.centres[~known].T, "x", color=GREY, markersize=5)
-        panel.set_title(f"{arm.name}: mean slope", loc="left")
+        panel.set_title(f"{arm.name}: {'mean slope' if arm.n_frames > 1 else 'slope'}", loc="left")
     return figure
 
 
@@ -82,7 +104,7 @@ def iteration_counts(
     """Draw the mean iterations of every sub-aperture (first arm) and how often each number occurred."""
     figure, axes = _panels(1, 2, layout)
     limits = limits_of(summaries[0].iterations, low=0.0)
-    title = f"{arms[0].name}: mean iterations"
+    title = f"{arms[0].name}: {'mean ' if arms[0].n_frames > 1 else ''}iterations"
     subaperture_map(
         axes[0, 0], layout, summaries[0].iterations, label="iterations", limits=limits, title=title
     )
@@ -126,15 +148,30 @@ def jitter_plot(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Fi
         order = order[item.measured[order]]
         place = np.arange(1, len(order) + 1)
         axes[0].plot(place, item.px[order], ".", color=colour, label=f"{arm.name}: standard deviation")
-        axes[0].plot(place, item.robust_px[order], "-", lw=1.3, color=colour, label=f"{arm.name}: robust")
+        axes[0].plot(
+            place,
+            _running_median(item.robust_px[order]),
+            "-",
+            lw=1.3,
+            color=colour,
+            label=f"{arm.name}: robust",
+        )
         axes[0].axhline(median(item.px), color=colour, lw=0.9, ls=":")
     axes[0].set_xlabel(f"sub-apertures, in order of the jitter of {arms[-1].name!r}")
     axes[0].set_ylabel("jitter, rms of x and y (px)")
     axes[0].set_ylim(bottom=0)
-    axes[0].legend(frameon=False, loc="upper left")
     if pair:
         _scatter(axes[1], arms, jitters)
+    figure.legend(loc="outside lower center", ncols=5, frameon=False)  # beside the data, never on it
     return figure
+
+
+def _running_median(values: Floats) -> Floats:
+    """Return medians over a sixtieth of the values on both sides: few values stay as they are."""
+    reach = len(values) // 120
+    padded = np.pad(values, reach, constant_values=np.nan)
+    medians: Floats = np.nanmedian(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1), axis=1)
+    return medians
 
 
 def _scatter(axes: Axes, arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> None:
@@ -154,7 +191,6 @@ def _scatter(axes: Axes, arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitte
     axes.set_xlabel(f"jitter, {arms[1].name} (px)")
     axes.set_ylabel(f"jitter, {arms[0].name} (px)")
     axes.set_title("Below the line: the first arm is steadier", fontsize=12)
-    axes.legend(frameon=False, loc="lower right")
 
 
 def _panels(rows: int, columns: int, layout: Layout) -> tuple[Figure, Any]:
@@ -171,12 +207,19 @@ def _outlines(layout: Layout) -> Any:
     return PolyCollection(list(subaperture_shapes(layout)), facecolors="#f6f6f6", edgecolors=LIGHT_GREY)
 
 
-def _arrow_limit(summaries: Sequence[SlopesSummary]) -> float:
-    """Return the length, px, that sets the scale of the arrows: nearly the longest of all arms."""
+def longest_arrow(summaries: Sequence[SlopesSummary]) -> tuple[float, int]:
+    """Return the length, px, at which arrows are cut, and how many are longer.
+
+    It is a percentile, so that a few wild slopes do not make all others too short to be seen; lengths within
+    half of it more are left as they are.
+    """
     lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
     lengths = lengths[np.isfinite(lengths)]
-    longest = float(np.percentile(lengths, 98)) if lengths.size else 0.0
-    return longest if longest > 0 else 1.0
+    usual = float(np.percentile(lengths, ARROWS_WHOLE_PERCENT)) if lengths.size else 0.0
+    if usual <= 0:
+        return float(lengths.max(initial=0.0)) or 1.0, 0
+    longest = min(float(lengths.max()), 1.5 * usual)
+    return longest, int(np.count_nonzero(lengths > longest))
 
 
 def _round_length(length: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -198,8 +199,20 @@ def _attributes(
         "title": "Shack-Hartmann slopes",
         "configuration": text,
         "configuration_file": str(Path(configuration_file).resolve()),
+        **_files_of_the_spot(configuration_file),
         "sources": paths,
         "source_key": key or "",
         "faintspot_version": faintspot.__version__,
         "fingerprint": state.hexdigest(),
+    }
+
+
+def _files_of_the_spot(configuration_file: str | Path) -> dict[str, str]:
+    """Where PSF and score are kept, for a report: a file of their own, or the configuration itself."""
+    path = Path(configuration_file).resolve()
+    tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    return {
+        f"{part}_file": str(path.parent / tables[part].get("file", path.name))
+        for part in ("psf", "score")
+        if part in tables
     }

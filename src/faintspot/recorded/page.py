@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError
+from faintspot.estimators.base import Step
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import MeasuredSlopes
@@ -29,6 +31,7 @@ def slopes_report(
     example_frame: int = 0,
     warnings: Sequence[str] = (),
     why_no_stages: str = "Not drawn: no frame was given.",
+    steps: Sequence[Step] = TotalVariation.steps_shown,
 ) -> str:
     """Return the report page of a slopes run as HTML: self-contained, without scripts.
 
@@ -53,6 +56,8 @@ def slopes_report(
         Shown before those found in the slopes.
     why_no_stages : str
         What the page says in place of the frame.
+    steps : sequence of Step
+        Which pictures of the frame are drawn.
 
     Raises
     ------
@@ -67,7 +72,7 @@ def slopes_report(
     number_between("example_frame", example_frame, 0, shape[0] - 1, integer=True)
     true = None if truth is None else _checked_truth(truth, shape)
     stages = _checked_stages(stages or {}, shape[1])
-    run = make_run(arms, layout, stages, true, int(example_frame), why_no_stages)
+    run = make_run(arms, layout, stages, true, int(example_frame), why_no_stages, steps)
     return html_of(
         Page(
             title=title,

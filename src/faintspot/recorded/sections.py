@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.flags import SubapertureFlag
 from faintspot.recorded import frame_pictures, maps
-from faintspot.recorded.advice import FLAG_MEANINGS, percentage
+from faintspot.recorded.advice import FLAG_MEANINGS, FLAGS_OF_DENOISING, percentage
 from faintspot.recorded.statistics import (
     Floats,
     Jitter,
@@ -31,6 +32,7 @@ from faintspot.report.page import Section, Table
 from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:
+    from faintspot.estimators.base import Step
     from faintspot.slopes import Stages
 
 NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."
@@ -46,6 +48,7 @@ class Run:
     truth: Floats | None
     example_frame: int
     why_no_stages: str
+    steps: Sequence[Step]
     summaries: Sequence[SlopesSummary]
     jitters: Sequence[Jitter]
     valid: NDArray[np.bool_]
@@ -59,6 +62,7 @@ def make_run(
     truth: Floats | None,
     example_frame: int,
     why_no_stages: str,
+    steps: Sequence[Step],
 ) -> Run:
     """Compute the numbers of a run."""
     valid = valid_in_all(arms)
@@ -69,6 +73,7 @@ def make_run(
         truth,
         example_frame,
         why_no_stages,
+        steps,
         [summarise(arm) for arm in arms],
         [jitter(arm.x, arm.y, valid) for arm in arms],
         valid,
@@ -82,9 +87,11 @@ def all_sections(run: Run) -> list[Section]:
         _frame,
         _flux,
         _slopes,
-        _iterations,
-        _jitter,
     ]
+    if any(arm.is_denoised for arm in run.arms):
+        makers.append(_iterations)
+    if run.arms[0].n_frames > 1:
+        makers.append(_jitter)
     return [make(run) for make in makers]
 
 
@@ -95,38 +102,52 @@ def _key_numbers(run: Run) -> Section:
         errors, note = _truth_numbers(run, run.truth)
         columns = [column | more for column, more in zip(columns, errors, strict=True)]
         notes.append(note)
-    rows = [[name, *(column[name] for column in columns)] for name in columns[0]]
-    n_frames, n = run.arms[0].x.shape
-    frames = run.jitters[0].n_frames[run.jitters[0].measured]
-    span = f" ({frames.min()} to {frames.max()} frames each)" if frames.size else ""
-    text = (
-        f"One measurement is one sub-aperture in one frame: {n_frames} × {n} = {n_frames * n}. Flux, "
-        "iterations and the fraction at the limit are of the valid ones. Jitter is the standard deviation "
-        "over the frames of the position in a sub-aperture"
-        + (", over the frames that are valid in every arm" if len(run.arms) > 1 else "")
-        + f", from {len(frames)} of {n} sub-apertures{span}; it includes real motion of the spot."
-    )
-    table = Table(["", *(arm.name for arm in run.arms)], rows, caption=text)
+    names = dict.fromkeys(chain(*sorted(columns, key=lambda column: -len(column))))
+    rows = [[name, *(column.get(name, "–") for column in columns)] for name in names]
+    table = Table(["", *(arm.name for arm in run.arms)], rows, caption=_about_the_numbers(run))
     return Section("numbers", "Key numbers", tables=[table], text=notes)
 
 
+def _about_the_numbers(run: Run) -> str:
+    n_frames, n = run.arms[0].x.shape
+    text = f"One measurement is one sub-aperture in one frame: {n_frames} × {n} = {n_frames * n}. "
+    text += (
+        "Flux, iterations and the fraction at the limit are of the valid ones."
+        if any(arm.is_denoised for arm in run.arms)
+        else "Flux is that of the valid ones."
+    )
+    if n_frames == 1:
+        return text
+    frames = run.jitters[0].n_frames[run.jitters[0].measured]
+    span = f" ({frames.min()} to {frames.max()} frames each)" if frames.size else ""
+    valid = ", over the frames that are valid in every arm" if len(run.arms) > 1 else ""
+    return (
+        f"{text} Jitter is the standard deviation over the frames of the position in a sub-aperture{valid}, "
+        f"from {len(frames)} of {n} sub-apertures{span}; it includes real motion of the spot."
+    )
+
+
 def _arm_numbers(arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter) -> dict[str, str]:
-    return {
+    numbers = {
         "valid measurements": percentage(summary.valid_fraction),
-        "median flux after background": _number(summary.median_flux_e, "e-", 3),
-        "median iterations": f"{summary.median_iterations:.0f}" if _iterated(arm, summary) else "–",
-        "hit the iteration limit": percentage(summary.limit_fraction) if arm.is_denoised else "–",
-        "strength above the image's rms": percentage(_infeasible(arm)) if arm.is_denoised else "–",
+        "median flux": _number(summary.median_flux_e, "e-", 3),
+    }
+    if arm.is_denoised:
+        some = np.isfinite(summary.median_iterations)
+        numbers |= {
+            "median iterations": f"{summary.median_iterations:.0f}" if some else "–",
+            "hit the iteration limit": percentage(summary.limit_fraction),
+            "strength above the image's rms": percentage(_infeasible(arm)),
+        }
+    if arm.n_frames == 1:
+        return numbers
+    return numbers | {
         "slope jitter, rms of all sub-apertures": _number(rms(scatter.px), "px", 3),
         "slope jitter, median": _number(median(scatter.px), "px", 3),
         "slope jitter, median, x | y": f"{_number(median(scatter.x_px), '', 3)} | "
         + _number(median(scatter.y_px), "px", 3),
         "slope jitter, median, from absolute deviations": _number(median(scatter.robust_px), "px", 3),
     }
-
-
-def _iterated(arm: MeasuredSlopes, summary: SlopesSummary) -> bool:
-    return arm.is_denoised and bool(np.isfinite(summary.median_iterations))
 
 
 def _infeasible(arm: MeasuredSlopes) -> float:
@@ -181,24 +202,27 @@ def _frame(run: Run) -> Section:
     if not run.stages:
         return Section("frame", title, missing=run.why_no_stages)
     truth = None if run.truth is None else run.truth[run.example_frame]
-    example = frame_pictures.Example(run.layout, run.stages, truth)
-    scale = (
-        "The frames are in electrons already, so all four pictures share one colour scale."
-        if example.raw_is_calibrated
-        else "Raw is in ADU and has a scale of its own; the other three share one scale in electrons."
-    )
+    example = frame_pictures.Example(run.layout, run.stages, truth, run.steps)
     shown = next(iter(run.stages))
     circles = " and circles true ones" if truth is not None else ""
     marks = f"Images are those of {shown!r}. On the last one, crosses are measured positions{circles}. "
     if len(run.layout) > frame_pictures.MOST_MARKED:
         marks = f"Images are those of {shown!r}; positions are not marked in so many sub-apertures. "
-    whole = (
-        f"Frame {run.example_frame} with all windows at their places. {scale} {marks}Look for spots that "
-        "leave their window, for windows without a spot, and for anything left over after the background."
+    factor = frame_pictures.coarseness(run.layout)
+    coarse = (
+        f"Each pixel of the picture is the brightest of {factor} × {factor} of the frame. "
+        if factor > 1
+        else ""
     )
+    left_over = ", and for anything left over after the background" if len(example.shown_steps) > 2 else ""
+    whole = (
+        f"Frame {run.example_frame} with all windows at their places. {_scale_in_words(example)} {marks}"
+        f"{coarse}Look for spots that leave their window and for windows without a spot{left_over}."
+    )
+    noise = "whether the noise goes and the spot stays, and " if len(example.shown_steps) > 2 else ""
     zoomed = (
         "The faintest, a median and the brightest valid sub-aperture of this frame, each row on a scale of "
-        "its own. Look whether the noise goes and the spot stays, and whether the crosses sit on it."
+        f"its own. Look {noise}whether the crosses sit on the spot."
     )
     return Section(
         "frame",
@@ -214,11 +238,25 @@ def _frame(run: Run) -> Section:
     )
 
 
+def _scale_in_words(example: frame_pictures.Example) -> str:
+    number = len(example.shown_steps)
+    if example.raw_is_calibrated:
+        return "The frames are in electrons already." + (
+            " All pictures share one colour scale." if number > 1 else ""
+        )
+    if number == 2:
+        return "Raw is in ADU, calibrated in electrons; each has its own scale."
+    return "Raw is in ADU and has a scale of its own; the others share one scale in electrons."
+
+
 def _flux(run: Run) -> Section:
     header = ["flag", *(arm.name for arm in run.arms), "meaning"]
     rows = []
+    denoised = any(arm.is_denoised for arm in run.arms)
     for flag, meaning in FLAG_MEANINGS.items():
         counts = [arm.flag_count(flag) for arm in run.arms]
+        if flag in FLAGS_OF_DENOISING and not denoised and not any(counts):
+            continue
         cells = [f"{n} ({percentage(n / arm.flags.size)})" for n, arm in zip(counts, run.arms, strict=True)]
         rows.append([str(flag.name), *cells, meaning])
     table = Table(
@@ -229,10 +267,12 @@ def _flux(run: Run) -> Section:
     )
     if run.layout is None:
         return Section("flux", "Flux and validity", tables=[table], missing=NO_LAYOUT)
+    several = run.arms[0].n_frames > 1
+    maps_shown = "Left: median flux. Right: in how many frames the slope was valid." if several else "Flux."
     caption = (
-        "Left: median flux left after the background subtraction. Right: in how many frames the slope was "
-        "valid. An empty outline was never valid. Look for a smooth pupil: single dim sub-apertures are "
-        "vignetted or off their spot, and a bright edge on one side means that the windows are shifted."
+        f"{maps_shown} Flux is what the estimator finds: without the background, where one is subtracted. An "
+        "empty outline was never valid. Look for a smooth pupil: single dim sub-apertures are vignetted or "
+        "off their spot, and a bright edge on one side means that the windows are shifted."
     )
     figure = maps.flux_and_validity(run.arms, run.summaries, run.layout)
     shown = FigureWithData("flux", "Maps of flux and validity", caption, figure)
@@ -256,10 +296,18 @@ def _slopes(run: Run) -> Section:
             f" Arrows not longer than the standard error of a mean slope per axis (median {errors}, if "
             "frames are independent) are noise."
         )
+    what = "Mean slope of each sub-aperture over its valid frames" if run.arms[0].n_frames > 1 else "Slopes"
+    longest, number = maps.longest_arrow(run.summaries)
+    cut = ""
+    if number:
+        cut = (
+            f" Arrows longer than {_number(longest, 'px', 2)} (1.5 times the {maps.ARROWS_WHOLE_PERCENT}th "
+            f"percentile) are drawn black, at that length: {number}."
+        )
     caption = (
-        "Mean slope of each sub-aperture over its valid frames, all panels at one scale (key above each). "
-        "Sub-apertures without an arrow but a grey cross were never valid. All arrows alike are tilt or a "
-        f"shifted layout, arrows to or from the middle are focus. Mean over the sensor: {tilts}.{noise}"
+        f"{what}, all panels at one scale (key below each).{cut} Sub-apertures without an arrow but a grey "
+        "cross were never valid. All arrows alike are tilt or a shifted layout, arrows to or from the middle "
+        f"are focus. Mean over the sensor: {tilts}.{noise}"
     )
     figure = maps.slope_arrows(run.arms, run.summaries, run.layout)
     shown = FigureWithData("slopes", "Mean slopes as arrows", caption, figure)
@@ -270,10 +318,6 @@ def _iterations(run: Run) -> Section:
     denoised = [
         (arm, summary) for arm, summary in zip(run.arms, run.summaries, strict=True) if arm.is_denoised
     ]
-    if not denoised:
-        return Section(
-            "iterations", "Iterations", missing="Nothing was denoised, so there are no iterations."
-        )
     if run.layout is None:
         return Section("iterations", "Iterations", missing=NO_LAYOUT)
     if not any(arm.valid.any() for arm, _ in denoised):
@@ -291,14 +335,7 @@ def _iterations(run: Run) -> Section:
 def _jitter(run: Run) -> Section:
     title = "Slope jitter"
     if not run.jitters[0].measured.any():
-        why = (
-            "There is one frame only."
-            if run.arms[0].n_frames == 1
-            else "No sub-aperture is valid in two frames."
-        )
-        return Section(
-            "jitter", title, missing=f"{why} Jitter needs at least two valid frames of a sub-aperture."
-        )
+        return Section("jitter", title, missing="No sub-aperture is valid in two frames, as jitter needs.")
     text = [
         "Jitter includes the real motion of the spots (atmosphere, vibration, guiding), so it is an upper "
         "bound of the noise. Less jitter is not better by itself: an estimator whose centroid gain is below "
@@ -309,7 +346,8 @@ def _jitter(run: Run) -> Section:
         text.append(f"The true motion in these frames is {rms(moved.px):.3f} px rms.")
     caption = (
         "Dots: standard deviation over the frames. Line: the same from the median absolute deviation, which "
-        "rare outliers do not touch: dots far above their line are outliers, not noise. Dotted: medians."
+        "rare outliers do not touch: dots far above their line are outliers, not noise. Of many "
+        "sub-apertures the line is a running median. Dotted: medians."
     )
     plot = maps.jitter_plot(run.arms, run.jitters)
     shown = [FigureWithData("jitter", "Jitter of the sub-apertures", caption, plot)]

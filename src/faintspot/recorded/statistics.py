@@ -8,7 +8,7 @@ stands for "no valid frame".
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 GAUSSIAN_MAD = 1.4826
 """Standard deviation of a Gaussian in units of its median absolute deviation."""
 
+ARRAYS = ("x", "y", "flux", "flags", "iterations")
 _BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of the double-precision copies
 
 
@@ -40,6 +41,9 @@ class MeasuredSlopes:
     flags : array of uint8
         Bits of `SubapertureFlag`.
     iterations : array of int
+    denoised : bool, optional
+        Whether the iterations are those of a denoiser, rather than an estimator's own steps. Default: where
+        there are any.
 
     Raises
     ------
@@ -53,21 +57,22 @@ class MeasuredSlopes:
     flux: NDArray[Any]
     flags: NDArray[Any]
     iterations: NDArray[Any]
+    denoised: bool | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        for field in fields(self)[1:]:
-            array = finite_array(f"{self.name}: {field.name}", getattr(self, field.name))
+        for name in ARRAYS:
+            array = finite_array(f"{self.name}: {name}", getattr(self, name))
             if array.ndim != 2 or array.shape != np.shape(self.x):
                 raise InputError(
-                    f"{self.name}: {field.name}: expected shape (n_frames, n_subapertures), as x of shape "
+                    f"{self.name}: {name}: expected shape (n_frames, n_subapertures), as x of shape "
                     f"{np.shape(self.x)}, got {array.shape}"
                 )
-            object.__setattr__(self, field.name, array)
+            object.__setattr__(self, name, array)
 
     @classmethod
     def of(cls, name: str, slopes: Any) -> MeasuredSlopes:
         """Make one of the `Slopes` of one frame or several."""
-        return cls(name, *(np.atleast_2d(getattr(slopes, field.name)) for field in fields(cls)[1:]))
+        return cls(name, *(np.atleast_2d(getattr(slopes, of)) for of in ARRAYS))
 
     @property
     def n_frames(self) -> int:
@@ -87,6 +92,8 @@ class MeasuredSlopes:
     @property
     def is_denoised(self) -> bool:
         """Whether the denoiser did anything."""
+        if self.denoised is not None:
+            return self.denoised
         return bool(np.any(self.iterations) or self.flag_count(SubapertureFlag.INFEASIBLE_STRENGTH))
 
     def flag_count(self, flag: SubapertureFlag) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -16,8 +16,10 @@ from faintspot.sensor.layout import Layout
 try:
     import matplotlib
     from matplotlib.axes import Axes
+    from matplotlib.axis import XAxis, YAxis
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 except ImportError:
     raise MissingExtraError("matplotlib", "web", "Drawing pictures") from None
 
@@ -28,7 +30,8 @@ TRUTH_COLOUR = "#56B4E9"
 GREY = "#9a9a9a"
 LIGHT_GREY = "#e4e4e4"
 DOTS_PER_INCH = 144
-_MOST_WITH_GAPS = 600  # narrower than a pixel of the picture, gaps would only make a moiré
+MOST_WITH_GAPS = 600
+"""With more sub-apertures than this, gaps between them and outlines would only make a moiré."""
 WIDTH = 13.0
 """Inches of a picture as wide as the page."""
 
@@ -90,7 +93,7 @@ def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
     else:
         angles, radius = 45.0 + 90.0 * np.arange(4), pitch / np.sqrt(2)
     direction = np.deg2rad(angles + layout.angle_deg)
-    gap = 0.96 if len(layout) <= _MOST_WITH_GAPS else 1.0
+    gap = 0.96 if len(layout) <= MOST_WITH_GAPS else 1.0
     ring = gap * radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
     shapes: NDArray[np.float64] = layout.centres[:, None, :] + ring
     return shapes
@@ -110,13 +113,20 @@ def subaperture_map(
     known = np.isfinite(values)
     empty = PolyCollection(list(shapes[~known]), facecolors="white", edgecolors=GREY, linewidths=0.6)
     filled = PolyCollection(list(shapes[known]), array=values[known], cmap=COLOUR_MAP, linewidths=0)
-    filled.set_antialiased(len(layout) <= _MOST_WITH_GAPS)
+    filled.set_antialiased(len(layout) <= MOST_WITH_GAPS)
     filled.set_clim(*limits)
     axes.add_collection(empty)
     axes.add_collection(filled)
     place_axes(axes, layout)
     axes.set_title(title)
     colour_bar(axes, filled, label)
+
+
+def plain_ticks(axis: XAxis | YAxis, values: Iterable[float], form: str = "g") -> None:
+    """Put ticks at these values and nowhere else, written as plain numbers."""
+    axis.set_major_locator(FixedLocator([float(value) for value in values]))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:{form}}"))
 
 
 def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:

@@ -9,9 +9,9 @@ from importlib.resources import files
 from pathlib import Path
 
 import faintspot
-from faintspot.errors import MissingExtraError
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import write_atomically
 from faintspot.report.figure_data import FigureWithData
-from faintspot.report.files import write_beside, write_file
 
 POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."
 """For the foot of a page."""
@@ -170,7 +170,14 @@ def write_page(page: Page, path: str | Path) -> list[Path]:
         if "csv" in figure.contents
         for ending, content in figure.contents.items()
     }
-    return [path, *write_beside(path, contents)]
+    folder = path.with_name(f"{path.stem}-figures")
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}: choose another place") from None
+    for name, content in contents.items():
+        write_atomically(folder / name, content)
+    return [path, *(folder / name for name in contents)]
 
 
 def write_report(path: str | Path, html: str) -> None:
@@ -181,7 +188,7 @@ def write_report(path: str | Path, html: str) -> None:
     InputError
         When the file cannot be written.
     """
-    write_file(path, html.encode("utf-8"))
+    write_atomically(path, html)
 
 
 def data_uri(ending: str, content: bytes) -> str:

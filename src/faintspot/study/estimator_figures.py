@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.report.drawing import GREY, WIDTH, new_figure, styled
+from faintspot.report.drawing import GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.study.baselines import ARM_NAMES
 from faintspot.study.cell_numbers import numbers_of, parameter_in_words, parameters_of
@@ -121,18 +121,16 @@ def _error_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
         panel.plot(flux, dataset["bound"].values[part.cells], color="black", lw=3, alpha=0.35, zorder=1)
         panel.axhline(group.common["position_range_px"] / 2, color=GREY, lw=1, ls=":")
         panel.set_yscale("log")
-        _plain_numbers(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
+        plain_ticks(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
     _label(axes, group, "slope error R (px)")
-    _legend(figure, dataset, bound=True)
-    title = f"Slope error against signal: {group.words}"
-    figure.suptitle(title, fontsize=14)
     caption = (
         "Solid: estimators that know the spot; dashed: those that do not, each with its own best k, "
         "strength, width or threshold. Broad grey line: the Cramer-Rao bound. Dotted: R of always "
         "answering the centre. Bars: one standard error. All have the same search range, that of the true "
         "positions."
     )
-    return FigureWithData(f"error-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
+    _legend(figure, dataset, bound=True)
+    return _with_data(figure, dataset, group, "error", "Slope error against signal", caption)
 
 
 @styled
@@ -143,16 +141,13 @@ def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
         panel.axhline(1.0, color="black", lw=3, alpha=0.35, zorder=1)
         panel.set_ylim(0, 1.35)
     _label(axes, group, "photon efficiency")
-    _legend(figure, dataset, bound=True)
-    title = f"Photon efficiency: {group.words}"
-    figure.suptitle(title, fontsize=14)
     caption = (
         "The light with which an estimator at the Cramer-Rao bound would have the same R, over the light "
         "that was used. More than 1 at little light: there the search range says more than the light. "
         "What lies above 1.35 is cut off; the numbers are in the data."
     )
-    name = f"efficiency-{group.name}"
-    return FigureWithData(name, title, caption, figure, *numbers_of(dataset, group.cells))
+    _legend(figure, dataset, bound=True)
+    return _with_data(figure, dataset, group, "efficiency", "Photon efficiency", caption)
 
 
 @styled
@@ -166,21 +161,19 @@ def _gain_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
         upper.set_title(part.title)
         _lines(lower, dataset, part, "outlier_fraction", BEST, "flux_e")
         lower.set_yscale("symlog", linthresh=1e-3)
-        _plain_numbers(lower.yaxis, (0, 1e-3, 1e-2, 0.1, 0.5))
+        plain_ticks(lower.yaxis, (0, 1e-3, 1e-2, 0.1, 0.5))
         _flux_axis(lower)
     drawn = dataset["outlier_fraction"].sel(mode=BEST).isel(cell=group.cells).values
     axes[1, 0].set_ylim(-1e-4, max(2e-3, min(1.0, 1.5 * float(np.nanmax(drawn)))))
     axes[0, 0].set_ylabel("gain")
     axes[1, 0].set_ylabel("fraction of errors beyond 1 px")
-    _legend(figure, dataset, bound=False)
-    title = f"Gain and outliers: {group.words}"
-    figure.suptitle(title, fontsize=14)
     caption = (
         "Above: slope of the estimate against the truth, 1 where nothing is lost. An estimator that falls "
         "back to the centre has a small R and a small gain. Below: fraction of slopes with an error "
         "beyond 1 px on either axis, linear below 0.001."
     )
-    return FigureWithData(f"gain-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
+    _legend(figure, dataset, bound=False)
+    return _with_data(figure, dataset, group, "gain", "Gain and outliers", caption)
 
 
 @styled
@@ -196,20 +189,27 @@ def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
         panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
         panel.set_yscale("log")
         panel.set_xscale("log")
-        _plain_numbers(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))
-        _plain_numbers(panel.yaxis, (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2))
+        plain_ticks(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))
+        plain_ticks(panel.yaxis, (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2))
         panel.set_ylim(0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(drawn.values))))
     _label(axes, group, "gain-corrected rms (px)", flux=False)
-    _legend(figure, dataset, bound=False)
-    title = f"Speckled spots: {group.words}"
-    figure.suptitle(title, fontsize=14)
     caption = (
         "Root mean square error per axis after each arm’s own offset and gain are taken off, with "
         "settings chosen for it. Ring: the best arm of the cell. Bars: one standard error. Solid: "
         "estimators that know the spot; dashed: those that do not."
     )
-    name = f"turbulence-{group.name}"
-    return FigureWithData(name, title, caption, figure, *numbers_of(dataset, group.cells))
+    _legend(figure, dataset, bound=False)
+    return _with_data(figure, dataset, group, "turbulence", "Speckled spots", caption)
+
+
+def _with_data(
+    figure: Figure, dataset: xarray.Dataset, group: _Group, kind: str, subject: str, caption: str
+) -> FigureWithData:
+    """Return a figure with its title and the numbers of the group's cells."""
+    title = f"{subject}: {group.words}"
+    figure.suptitle(title, fontsize=14)
+    numbers = numbers_of(dataset, group.cells)
+    return FigureWithData(f"{kind}-{group.name}", title, caption, figure, *numbers)
 
 
 def _grid(group: _Group) -> tuple[Figure, list[Axes]]:
@@ -257,17 +257,8 @@ def _label(axes: list[Axes], group: _Group, y: str, *, flux: bool = True) -> Non
 
 def _flux_axis(panel: Axes) -> None:
     panel.set_xscale("log")
-    _plain_numbers(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
+    plain_ticks(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
     panel.set_xlabel("signal (photo-electrons per spot)")
-
-
-def _plain_numbers(axis: Any, values: Sequence[float]) -> None:
-    """Ticks at these values, written as plain numbers."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-
-    axis.set_major_locator(FixedLocator(list(values)))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _legend(figure: Figure, dataset: xarray.Dataset, *, bound: bool) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, styled
+from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.study.baselines import ARM_NAMES
 from faintspot.study.cell_numbers import (
@@ -122,8 +122,8 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
             panel.axvline(float(fixed), color=GREY, lw=1, ls=":")
             panel.set_xscale("log")
             panel.set_yscale("log")
-            _plain_ticks(panel.xaxis, (1, 3, 10, 30, 100))
-            _plain_ticks(panel.yaxis, (0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
+            plain_ticks(panel.xaxis, (1, 3, 10, 30, 100))
+            plain_ticks(panel.yaxis, (0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
             head, _, tail = part.title.partition(";" if part.title.startswith("signals") else ", ")
             panel.set_title(f"{head.strip()}\n{tail.strip().replace(';', ',')}", fontsize=12)
             panel.set_xlabel("brightest pixels kept, k")
@@ -244,25 +244,13 @@ def _limit(panel: Axes, axis: str, values: Any) -> None:
 def _label(panel: Axes, axis: str, *, log_y: bool = True) -> None:
     if axis == "flux_e":
         panel.set_xscale("log")
-        _plain_ticks(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
+        plain_ticks(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
     if log_y:
         panel.set_yscale("log")
-        _plain_ticks(panel.yaxis, (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
+        plain_ticks(panel.yaxis, (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
     panel.set_xlabel(_AXIS_NAMES[axis])
     panel.tick_params(labelbottom=True)
     panel.grid(which="major", color="#e4e4e4", lw=0.7)
-
-
-def _plain_ticks(axis: Any, places: Sequence[float]) -> None:
-    axis.set_major_locator(_fixed_locator(places))
-    axis.set_minor_locator(_fixed_locator(()))
-    axis.set_major_formatter("{x:g}")
-
-
-def _fixed_locator(places: Sequence[float]) -> Any:
-    from matplotlib.ticker import FixedLocator
-
-    return FixedLocator(list(places))
 
 
 def _legend(figure: Figure, styles: dict[str, tuple[Any, str]]) -> None:

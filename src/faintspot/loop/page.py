@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from faintspot.loop.report_sections import (
+from faintspot.loop.page_sections import (
     configuration_of,
     configuration_text,
     loop_sections,

@@ -13,7 +13,7 @@ from faintspot.loop.results import BudgetResult, MagnitudeResult
 from faintspot.loop.statistics import paired_mean
 from faintspot.loop.telescope import PSF_SAMPLING
 from faintspot.loop.verdict import REFERENCE
-from faintspot.report.drawing import GREY, WIDTH, colour_bar, new_figure, styled
+from faintspot.report.drawing import GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def gain_figure(result: MagnitudeResult) -> FigureWithData:
         rows += [[name, p, v] for p, v in zip(result.photons, value, strict=True)]
     panel.axhline(1, color=GREY, lw=1)
     panel.set_xscale("log")
-    _plain_ticks(panel, result.photons)
+    plain_ticks(panel.xaxis, result.photons, ".3g")
     panel.set(xlabel="photo-electrons of a sub-aperture in a frame", ylabel="centroid gain")
     panel.set_ylim(bottom=0)
     figure.legend(loc="outside right upper", frameon=False)
@@ -229,10 +229,3 @@ def _photon_axis(panel: Axes, result: MagnitudeResult) -> None:
     top.set_xticks(result.magnitudes, [f"{photons:.3g}" for photons in result.photons])
     top.set_xlabel("photo-electrons of a sub-aperture in a frame")
     top.tick_params(labelsize=10)
-
-
-def _plain_ticks(panel: Axes, places: NDArray[Any]) -> None:
-    from matplotlib.ticker import NullLocator
-
-    panel.xaxis.set_minor_locator(NullLocator())
-    panel.set_xticks(places, [f"{place:.3g}" for place in places])

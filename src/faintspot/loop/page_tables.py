@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from faintspot.configuration import to_text
 from faintspot.loop.analysis import (
     NO_TV,
     Measurements,
@@ -184,16 +183,9 @@ def _settings_words(gain: float, text: str) -> str:
     """Return tuned values as one line."""
     if not text:
         return "not tuned yet"
-    usual = tomllib.loads(to_text(Settings(denoise=False)))
     parts = [f"gain {gain:.2g}"] if np.isfinite(gain) else []
-    for section, values in tomllib.loads(text).items():
-        others = usual.get(section)
-        if isinstance(values, dict):
-            known = others if isinstance(others, dict) else {}
-            parts += [_value_words(n, v) for n, v in values.items() if n not in known or known[n] != v]
-        elif values != others:
-            parts.append(_value_words(section, values))
-    return ", ".join(parts)
+    chosen = Settings.from_tables("settings", tomllib.loads(text)).chosen()
+    return ", ".join(parts + [_value_words(name, value) for name, value in chosen.items()])
 
 
 def _value_words(name: str, value: object) -> str:

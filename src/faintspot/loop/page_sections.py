@@ -12,15 +12,15 @@ from faintspot.loop.analysis import (
 )
 from faintspot.loop.budget import TERM_MEANINGS
 from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.interleaved_figures import interleaved_figures
-from faintspot.loop.report_figures import (
+from faintspot.loop.figures import (
     budget_figure,
     gain_figure,
     magnitude_figure,
     psf_figure,
     strehl_axis,
 )
-from faintspot.loop.report_tables import (
+from faintspot.loop.interleaved_figures import interleaved_figures
+from faintspot.loop.page_tables import (
     centroid_gain_table,
     difference_table,
     gain_table,
