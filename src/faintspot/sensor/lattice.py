@@ -77,15 +77,19 @@ class Lattice:
     def cells_inside(self, shape: tuple[int, ...], margin_px: float) -> NDArray[np.int64]:
         """Return (n, 2) rows and columns of the nodes at least `margin_px` inside a frame of this shape."""
         height, width = shape
-        reach = int(np.ceil(2.0 * (height + width + abs(self.origin)) / self.pitch_px))
-        row, column = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-        cells = np.column_stack([row.ravel(), column.ravel()])
-        at = self.positions(cells)
         low = margin_px - 0.5
+        corners = np.array([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)])
+        offset = (corners - self.origin) / self.step
+        rows = offset.imag / self.ratio.imag
+        columns = offset.real - rows * self.ratio.real
+        row, column = (
+            np.arange(int(np.floor(axis.min())) - 1, int(np.ceil(axis.max())) + 2) for axis in (rows, columns)
+        )
+        at = self.origin + self.step * (column + row[:, None] * self.ratio)
         inside = (
             (at.real >= low) & (at.real <= width - 1 - low) & (at.imag >= low) & (at.imag <= height - 1 - low)
         )
-        return cells[inside]
+        return np.asarray(np.argwhere(inside) + np.array([row[0], column[0]]))
 
     def canonical(self, shape: tuple[int, ...]) -> Lattice:
         """Return the same lattice with its angle in [-45, 45) or [-30, 30) and its origin near mid-frame."""
@@ -120,10 +124,9 @@ class Lattice:
         index[shifted[:, 0], shifted[:, 1]] = np.arange(len(cells))
         return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
 
-    def distance_px(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return how far from the node of its cell every pixel of a frame of this shape lies."""
-        y, x = np.indices(shape)
-        offset = (x + 1j * y - self.origin) / self.step
+    def distance_px(self, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return how far from the node of its cell every pixel of these rows and columns lies: (y, x)."""
+        offset = (x + 1j * y[:, None] - self.origin) / self.step
         offset -= np.rint(offset.imag / self.ratio.imag) * self.ratio
         return np.asarray(np.abs(offset - np.rint(offset.real)) * self.pitch_px)
 
@@ -179,35 +182,6 @@ def robust_std(values: NDArray[np.float64]) -> float:
     """Return the standard deviation from the median absolute deviation; the plain one when that is 0."""
     deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
     return deviation if deviation > 1e-9 * float(np.ptp(values)) else float(values.std())
-
-
-def pixels_around(
-    image: NDArray[np.float64], at: NDArray[np.complex128], reach_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the pixels around positions: values (n, m; NaN outside the frame), distances, positions."""
-    reach = int(np.ceil(reach_px)) + 1
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    column = np.rint(at.real).astype(np.int64)[:, None] + x.ravel()
-    row = np.rint(at.imag).astype(np.int64)[:, None] + y.ravel()
-    height, width = image.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    values = np.where(inside, image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.nan)
-    pixels = column + 1j * row
-    return values, np.abs(pixels - at[:, None]), pixels
-
-
-def median_where(values: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the (lower) median of the chosen values of every row, minus infinity where there are none."""
-    ordered = np.sort(np.where(chosen, values, np.inf), axis=1)
-    count = chosen.sum(axis=1)
-    index = np.arange(len(values))
-    middle = ordered[index, np.maximum(count - 1, 0) // 2]
-    return np.asarray(np.where(count > 0, middle, -np.inf))
-
-
-def count_chosen(chosen: NDArray[np.bool_], neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many neighbours of every cell are chosen."""
-    return np.asarray(np.append(chosen, False)[neighbours].sum(axis=1))
 
 
 def _candidates(
