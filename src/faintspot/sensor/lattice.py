@@ -12,6 +12,7 @@ be detected on its own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +36,8 @@ _CANDIDATES = 3
 # and whether lit lenslets are found on the lattice.
 _SIGNIFICANT = 6.0
 _COMB_SCORE = 4.5
+# With three times that, no other map of spots need be looked at: kin of the true lattice are in each of them.
+_CLEAR_SCORE = 3 * _COMB_SCORE
 
 
 @dataclass(frozen=True)
@@ -158,24 +161,26 @@ def find_lattice(
             score = _comb_score(smooth, lattice) / scatter
             if score > best[0]:
                 best = (score, lattice)
+        if best[0] > _CLEAR_SCORE:
+            break
     return best[1]
 
 
-def _spot_maps(image: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return maps of what looks like a spot, one per width, and one linear map for many very faint spots.
+def _spot_maps(image: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    """Make maps of what looks like a spot, one per width, and one linear map for many very faint spots.
 
     The difference of two Gaussians takes the background away. What is left is taken above two standard
     deviations, so that empty parts of the frame add little noise, and its logarithm, so that dim spots count.
     """
-    maps = []
     for scale in _SCALES_PX:
         band = scipy.ndimage.gaussian_filter(image, scale) - scipy.ndimage.gaussian_filter(image, 4 * scale)
         noise = robust_std(band)
         if noise > 0:
-            maps.append(np.log1p(np.maximum(band / noise - 2.0, 0.0)))
+            spots = np.log1p(np.maximum(band / noise - 2.0, 0.0))
+            if np.ptp(spots) > 0:
+                yield spots
             if scale == 1.0:
-                maps.append(np.clip(band / noise, -5.0, 5.0))
-    return [spots for spots in maps if np.ptp(spots) > 0]
+                yield np.clip(band / noise, -5.0, 5.0)
 
 
 def robust_std(values: NDArray[np.float64]) -> float:
@@ -228,18 +233,21 @@ def _polar_power(
     distribution of mean 1 whatever its spectrum.
     """
     size = int(scipy.fft.next_fast_len(2 * max(spots.shape), real=True))
-    spectrum = scipy.fft.rfft2(np.asarray(spots - spots.mean(), dtype=np.float32), (size, size), workers=-1)
-    half = np.abs(spectrum) ** 2
-    # A lattice that is stretched a little has its two peaks at not quite the same wave number.
-    half = scipy.ndimage.maximum_filter(np.fft.fftshift(half, axes=0), 3)
     low, high = size / pitch_range_px[1], min(size / pitch_range_px[0] * 2 / np.sqrt(3), size / 2 - 2)
     radius = np.arange(low, max(high, low + 1), 0.5)
+    # Only wave numbers up to the highest are wanted, which are few when the smallest pitch is many pixels.
+    reach = int(np.ceil(radius[-1])) + 2
+    rows = scipy.fft.rfft(np.asarray(spots - spots.mean(), dtype=np.float32), size)[:, : reach + 1]
+    spectrum = scipy.fft.fft(rows, size, axis=0)
+    half = np.abs(np.concatenate([spectrum[size - reach :], spectrum[: reach + 1]])) ** 2
+    # A lattice that is stretched a little has its two peaks at not quite the same wave number.
+    half = scipy.ndimage.maximum_filter(half, 3)
     # A multiple of 6 so that 60 and 90 degrees are whole numbers of columns.
     n_angles = 6 * int(np.ceil(np.pi * radius[-1] / 6))
     angle = np.pi * np.arange(n_angles) / n_angles
     kx, ky = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
     mirrored = np.where(kx < 0, -1, 1)
-    power = scipy.ndimage.map_coordinates(half, [ky * mirrored + size // 2, kx * mirrored], order=1)
+    power = scipy.ndimage.map_coordinates(half, [ky * mirrored + reach, kx * mirrored], order=1)
     floor = np.median(power, axis=1, keepdims=True) / np.log(2)
     return power / np.maximum(floor, 1e-12 * float(power.max() + 1e-300)), radius / size
 

@@ -70,7 +70,7 @@ def measure_nodes(image: NDArray[np.float64], lattice: Lattice, width_px: float)
     width_px : float
         Standard deviation of the spots' shape.
     """
-    band = _band(image, lattice, width_px)
+    band = _band(image, _haze(image, lattice), width_px)
     cells = lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px)
     peaks, _ = _peaks(band, lattice, cells)
     offsets = _cell_offsets(lattice)
@@ -107,9 +107,10 @@ def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
     widths = np.geomspace(_SHARPEST_PX, widest, _WIDTHS)
     cells = lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px)
     offsets = _cell_offsets(lattice)
+    haze = _haze(image, lattice)
     best = (-np.inf, float(widths[0]))
     for start in _STARTS:
-        band = _band(image, lattice, float(widths[start]))
+        band = _band(image, haze, float(widths[start]))
         peaks, heights = _peaks(band, lattice, cells)
         certain = np.flatnonzero(heights >= _CERTAIN * _noise(band, lattice))
         if len(certain) < 4:
@@ -126,14 +127,19 @@ def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
     return best[1]
 
 
-def _band(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> NDArray[np.float64]:
-    """Return the smoothed image less its mean over a pitch: spots without the haze they stand in.
+def _haze(image: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
+    """Return the mean over a pitch around every pixel, in which regular spots are even."""
+    haze = scipy.ndimage.uniform_filter(image, round(lattice.pitch_px), mode="nearest")
+    return np.asarray(scipy.ndimage.uniform_filter(haze, 3, mode="nearest"))
+
+
+def _band(image: NDArray[np.float64], haze: NDArray[np.float64], width_px: float) -> NDArray[np.float64]:
+    """Return the smoothed image less the haze that its spots stand in.
 
     It is dark outside the frame: a mirrored spot would move the peak to the edge.
     """
     smooth = scipy.ndimage.gaussian_filter(image, width_px, mode="constant", truncate=3.0)
-    haze = scipy.ndimage.uniform_filter(image, round(lattice.pitch_px), mode="nearest")
-    return np.asarray(smooth - scipy.ndimage.uniform_filter(haze, 3, mode="nearest"))
+    return np.asarray(smooth - haze)
 
 
 def _disc(radius_px: float) -> NDArray[np.complex128]:
