@@ -16,19 +16,19 @@ def spot_frame(
     *,
     flux_e: ArrayLike,
     spread_px: float = 0.0,
-    fwhm_px: float = 2.5,
+    width_px: float = 1.2,
     seed: int = 1,
     n_frames: int = 1,
     **detector: Any,
 ) -> NDArray[Any]:
     """Return the mean frame of Gaussian spots scattered about nodes x + 1j * y (n,), in ADU.
 
-    Spots (of one flux or n) may lie at the frame's edge, which cuts them. The detector has 3 e- of read noise
-    unless its options say otherwise.
+    Spots (of one flux or n, of this standard deviation) may lie at the frame's edge, which cuts them. The
+    detector has 3 e- of read noise unless its options say otherwise.
     """
     rng = np.random.default_rng(seed)
     nodes = nodes + spread_px * (rng.standard_normal(len(nodes)) + 1j * rng.standard_normal(len(nodes)))
-    side = 2 * int(np.ceil(2.5 * fwhm_px)) + 1
+    side = 2 * int(np.ceil(4 * width_px)) + 1
     margin = side + 1
     corners = np.stack([np.rint(nodes.imag), np.rint(nodes.real)], axis=1).astype(int) - side // 2 + margin
     wanted = np.stack([nodes.real - np.rint(nodes.real), nodes.imag - np.rint(nodes.imag)], axis=1)
@@ -40,7 +40,7 @@ def spot_frame(
         n_frames,
         flux_e=flux_e,
         profile="gaussian",
-        size=fwhm_px,
+        size=width_px * 1.1774,  # its full width at half maximum is 2 px times the size
         positions=np.tile(wanted, (n_frames, 1, 1)),
         detector=Detector(**options),
         rng=rng,

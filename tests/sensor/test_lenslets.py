@@ -258,17 +258,19 @@ def test_bench_edge_frames() -> None:
     assert grid.geometry == "square"
     # Partly lit lenslets have shifted spots, and the two rows are no good lever: 1 %.
     assert grid.pitch_px == pytest.approx(27.48, rel=0.01)
-    # Seven lit ones above, six of the seven partly lit ones below; the eighth column is cut by the edge.
-    assert len(grid.cells) == 13
+    # Seven lit ones above, seven partly lit ones below; the eighth column is cut by the edge.
+    assert len(grid.cells) == 14
+    assert "less than half" in grid.doubt
     assert grid.cells.max(axis=0).tolist() == [1, 6]
 
 
 @pytest.mark.parametrize(
     ("name", "geometry", "pitch_px", "angle_deg", "lit"),
     [
-        ("mmirs_wfs_0150", "square", 22.08, -0.5, 154),
+        ("mmirs_wfs_0150", "square", 22.08, -0.5, 157),
         ("auto_wfs_0037_ave", "square", 30.41, 0.0, 148),
         ("test_newf9", "hexagonal", 37.14, 28.5, 145),
+        ("f9wfs_20200225-205600", "hexagonal", 35.02, 28.6, 143),
     ],
 )
 def test_telescope_frames(name: str, geometry: str, pitch_px: float, angle_deg: float, lit: int) -> None:
@@ -285,3 +287,12 @@ def test_telescope_frames(name: str, geometry: str, pitch_px: float, angle_deg: 
     # Nothing is lit behind the central obstruction.
     middle = grid.centres.mean(axis=0)
     assert np.hypot(*(grid.centres - middle).T).min() > 1.2 * grid.pitch_px
+
+
+def test_reference_frame_is_lit_all_over() -> None:
+    """17 x 17, of which three corners of the lowest row and two beside are dark or cut."""
+    grid = find_lenslets(fits_frame("data/f5_hecto_ref.fits.gz"))
+    assert grid.geometry == "square"
+    assert grid.pitch_px == pytest.approx(29.67, rel=0.001)
+    assert 282 <= len(grid.cells) <= 287
+    assert grid.cells.max(axis=0).tolist() == [16, 16]

@@ -12,6 +12,7 @@ be detected on its own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,6 +36,8 @@ _CANDIDATES = 3
 # and whether lit lenslets are found on the lattice.
 _SIGNIFICANT = 6.0
 _COMB_SCORE = 4.5
+# With three times that, no other map of spots need be looked at: kin of the true lattice are in each of them.
+_CLEAR_SCORE = 3 * _COMB_SCORE
 
 
 @dataclass(frozen=True)
@@ -77,15 +80,19 @@ class Lattice:
     def cells_inside(self, shape: tuple[int, ...], margin_px: float) -> NDArray[np.int64]:
         """Return (n, 2) rows and columns of the nodes at least `margin_px` inside a frame of this shape."""
         height, width = shape
-        reach = int(np.ceil(2.0 * (height + width + abs(self.origin)) / self.pitch_px))
-        row, column = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-        cells = np.column_stack([row.ravel(), column.ravel()])
-        at = self.positions(cells)
         low = margin_px - 0.5
+        corners = np.array([0, width - 1, 1j * (height - 1), width - 1 + 1j * (height - 1)])
+        offset = (corners - self.origin) / self.step
+        rows = offset.imag / self.ratio.imag
+        columns = offset.real - rows * self.ratio.real
+        row, column = (
+            np.arange(int(np.floor(axis.min())) - 1, int(np.ceil(axis.max())) + 2) for axis in (rows, columns)
+        )
+        at = self.origin + self.step * (column + row[:, None] * self.ratio)
         inside = (
             (at.real >= low) & (at.real <= width - 1 - low) & (at.imag >= low) & (at.imag <= height - 1 - low)
         )
-        return cells[inside]
+        return np.asarray(np.argwhere(inside) + np.array([row[0], column[0]]))
 
     def canonical(self, shape: tuple[int, ...]) -> Lattice:
         """Return the same lattice with its angle in [-45, 45) or [-30, 30) and its origin near mid-frame."""
@@ -120,10 +127,9 @@ class Lattice:
         index[shifted[:, 0], shifted[:, 1]] = np.arange(len(cells))
         return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
 
-    def distance_px(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return how far from the node of its cell every pixel of a frame of this shape lies."""
-        y, x = np.indices(shape)
-        offset = (x + 1j * y - self.origin) / self.step
+    def distance_px(self, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return how far from the node of its cell every pixel of these rows and columns lies: (y, x)."""
+        offset = (x + 1j * y[:, None] - self.origin) / self.step
         offset -= np.rint(offset.imag / self.ratio.imag) * self.ratio
         return np.asarray(np.abs(offset - np.rint(offset.real)) * self.pitch_px)
 
@@ -155,59 +161,32 @@ def find_lattice(
             score = _comb_score(smooth, lattice) / scatter
             if score > best[0]:
                 best = (score, lattice)
+        if best[0] > _CLEAR_SCORE:
+            break
     return best[1]
 
 
-def _spot_maps(image: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return maps of what looks like a spot, one per width, and one linear map for many very faint spots.
+def _spot_maps(image: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    """Make maps of what looks like a spot, one per width, and one linear map for many very faint spots.
 
     The difference of two Gaussians takes the background away. What is left is taken above two standard
     deviations, so that empty parts of the frame add little noise, and its logarithm, so that dim spots count.
     """
-    maps = []
     for scale in _SCALES_PX:
         band = scipy.ndimage.gaussian_filter(image, scale) - scipy.ndimage.gaussian_filter(image, 4 * scale)
         noise = robust_std(band)
         if noise > 0:
-            maps.append(np.log1p(np.maximum(band / noise - 2.0, 0.0)))
+            spots = np.log1p(np.maximum(band / noise - 2.0, 0.0))
+            if np.ptp(spots) > 0:
+                yield spots
             if scale == 1.0:
-                maps.append(np.clip(band / noise, -5.0, 5.0))
-    return [spots for spots in maps if np.ptp(spots) > 0]
+                yield np.clip(band / noise, -5.0, 5.0)
 
 
 def robust_std(values: NDArray[np.float64]) -> float:
     """Return the standard deviation from the median absolute deviation; the plain one when that is 0."""
     deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
     return deviation if deviation > 1e-9 * float(np.ptp(values)) else float(values.std())
-
-
-def pixels_around(
-    image: NDArray[np.float64], at: NDArray[np.complex128], reach_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the pixels around positions: values (n, m; NaN outside the frame), distances, positions."""
-    reach = int(np.ceil(reach_px)) + 1
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    column = np.rint(at.real).astype(np.int64)[:, None] + x.ravel()
-    row = np.rint(at.imag).astype(np.int64)[:, None] + y.ravel()
-    height, width = image.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    values = np.where(inside, image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.nan)
-    pixels = column + 1j * row
-    return values, np.abs(pixels - at[:, None]), pixels
-
-
-def median_where(values: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the (lower) median of the chosen values of every row, minus infinity where there are none."""
-    ordered = np.sort(np.where(chosen, values, np.inf), axis=1)
-    count = chosen.sum(axis=1)
-    index = np.arange(len(values))
-    middle = ordered[index, np.maximum(count - 1, 0) // 2]
-    return np.asarray(np.where(count > 0, middle, -np.inf))
-
-
-def count_chosen(chosen: NDArray[np.bool_], neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many neighbours of every cell are chosen."""
-    return np.asarray(np.append(chosen, False)[neighbours].sum(axis=1))
 
 
 def _candidates(
@@ -254,18 +233,21 @@ def _polar_power(
     distribution of mean 1 whatever its spectrum.
     """
     size = int(scipy.fft.next_fast_len(2 * max(spots.shape), real=True))
-    spectrum = scipy.fft.rfft2(np.asarray(spots - spots.mean(), dtype=np.float32), (size, size), workers=-1)
-    half = np.abs(spectrum) ** 2
-    # A lattice that is stretched a little has its two peaks at not quite the same wave number.
-    half = scipy.ndimage.maximum_filter(np.fft.fftshift(half, axes=0), 3)
     low, high = size / pitch_range_px[1], min(size / pitch_range_px[0] * 2 / np.sqrt(3), size / 2 - 2)
     radius = np.arange(low, max(high, low + 1), 0.5)
+    # Only wave numbers up to the highest are wanted, which are few when the smallest pitch is many pixels.
+    reach = int(np.ceil(radius[-1])) + 2
+    rows = scipy.fft.rfft(np.asarray(spots - spots.mean(), dtype=np.float32), size)[:, : reach + 1]
+    spectrum = scipy.fft.fft(rows, size, axis=0)
+    half = np.abs(np.concatenate([spectrum[size - reach :], spectrum[: reach + 1]])) ** 2
+    # A lattice that is stretched a little has its two peaks at not quite the same wave number.
+    half = scipy.ndimage.maximum_filter(half, 3)
     # A multiple of 6 so that 60 and 90 degrees are whole numbers of columns.
     n_angles = 6 * int(np.ceil(np.pi * radius[-1] / 6))
     angle = np.pi * np.arange(n_angles) / n_angles
     kx, ky = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
     mirrored = np.where(kx < 0, -1, 1)
-    power = scipy.ndimage.map_coordinates(half, [ky * mirrored + size // 2, kx * mirrored], order=1)
+    power = scipy.ndimage.map_coordinates(half, [ky * mirrored + reach, kx * mirrored], order=1)
     floor = np.median(power, axis=1, keepdims=True) / np.log(2)
     return power / np.maximum(floor, 1e-12 * float(power.max() + 1e-300)), radius / size
 

@@ -11,29 +11,14 @@ from numpy.typing import NDArray
 
 from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
-from faintspot.sensor.lattice import (
-    RATIOS,
-    SMALLEST_PITCH_PX,
-    Lattice,
-    count_chosen,
-    find_lattice,
-    median_where,
-    pixels_around,
-    robust_std,
-)
+from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std
+from faintspot.sensor.layout import SMALLEST_WINDOW
+from faintspot.sensor.lit import Lit, find_lit
+from faintspot.sensor.nodes import NodeLight, measure_nodes, spot_width
+from faintspot.sensor.region import Pupil, Rectangle
 
-# A spot is looked for within this part of the pitch around its node: aberrations of +-15 % of the pitch per
-# axis and an error of the first lattice fit in, the neighbour's spot does not.
-_SEARCH = 0.35
-# A node this near to the frame's edge (part of the pitch) has its spot cut in two.
-_MARGIN = 0.12
-# Signal-to-noise ratios (of the smoothed spot) at which a spot is there for certain, and at which it is
-# believed when at least half of its neighbours are lit.
-_CERTAIN, _PROBABLE = 4.0, 3.0
-# A spot falls off on all sides: over the brightest of the four sides of its cell it keeps at least this part
-# of its height. An edge or a band of diffuse light does not.
-_ROUND = 0.35
 _FIT_PASSES = 4
+_MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 
 
 @dataclass(frozen=True)
@@ -57,6 +42,8 @@ class LensletGrid:
     flux : float array (n,)
         Flux above the local background in the frame's units, within 2.5 spot widths (standard deviations)
         of the spot's peak, at most half a pitch.
+    doubt : str
+        Why the choice of lit lenslets may be wrong, in one line; empty when it is clear.
     """
 
     geometry: str
@@ -65,29 +52,7 @@ class LensletGrid:
     cells: NDArray[np.int64]
     centres: NDArray[np.float64]
     flux: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Peaks:
-    """What was measured at every node of the lattice inside the frame.
-
-    cells (n, 2); positions of the peaks x + 1j * y, heights above the background in a smoothed image, and
-    that background, each (n,).
-    """
-
-    cells: NDArray[np.int64]
-    positions: NDArray[np.complex128]
-    heights: NDArray[np.float64]
-    background: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Measured(_Peaks):
-    """The peaks, which of them fall off on all sides, their flux and signal-to-noise ratio, each (n,)."""
-
-    is_round: NDArray[np.bool_]
-    flux: NDArray[np.float64]
-    signal_to_noise: NDArray[np.float64]
+    doubt: str = ""
 
 
 def find_lenslets(
@@ -96,14 +61,17 @@ def find_lenslets(
     geometry: str = "auto",
     pitch_px: float | None = None,
     bad_pixels: Any = None,
-    lit_fraction: float = 0.3,
+    lit_fraction: float | None = None,
+    pupil: Any = None,
+    roi: Any = None,
 ) -> LensletGrid:
     """Find the lenslet grid in a frame, without knowing anything about the sensor.
 
     The lattice comes from the power spectrum of a map of everything that looks like a spot (see
-    faintspot.sensor.lattice), then from a robust least-squares fit to the spots at its nodes. A lenslet is
-    lit when its spot stands above the noise and has at least `lit_fraction` of the median flux, so partly
-    lit lenslets at the pupil's edge and those behind the central obstruction are left out, and so is one
+    faintspot.sensor.lattice), then from a robust least-squares fit to the spots at its nodes. Which lenslets
+    are lit is decided for all together (see faintspot.sensor.lit): a lit one has a spot that stands out of
+    the noise of its own cell, enough flux above its own background, and mostly lit neighbours. So lenslets at
+    the pupil's edge with little light and those behind the central obstruction are left out, and so is one
     whose node lies within 0.12 pitch of the frame's edge.
 
     Parameters
@@ -116,8 +84,13 @@ def find_lenslets(
         The pitch, known within 20 %.
     bad_pixels : bool array (ny, nx), optional
         Pixels to ignore; they may hold NaN. Hot pixels and cosmic rays are found without it.
-    lit_fraction : float
-        The smallest flux of a lit lenslet, as a part of the median of the lit ones.
+    lit_fraction : float, optional
+        The smallest flux of a lit lenslet, as a part of the median of the lit ones. Default: the part between
+        0.18 and 0.5 that the fewest lenslets have.
+    pupil : (x, y, radius) or (x, y, radius, inner radius), optional
+        In pixels: the lenslets whose nodes lie in this disk or annulus are taken, whatever their light.
+    roi : (x0, y0, x1, y1), optional
+        Only columns x0 to x1 - 1 and rows y0 to y1 - 1 are looked at.
 
     Returns
     -------
@@ -137,28 +110,31 @@ def find_lenslets(
     with 40, and in 12 of 16 at 8 with 16 lenslets. At a ratio of 5 a sixth of the lit lenslets is missed.
     """
     one_of("geometry", geometry, ("auto", *RATIOS))
-    lit_fraction = number_between("lit_fraction", lit_fraction, 0.0, 1.0)
-    image = _clean_image(frame, bad_pixels)
+    if lit_fraction is not None:
+        lit_fraction = number_between("lit_fraction", lit_fraction, 0.0, 1.0)
+    frames, bad = _checked(frame, bad_pixels)
+    part = Rectangle.given(roi, frames.shape[-2:])
+    corner = complex(part.x0, part.y0)
+    circle = None if pupil is None else Pupil.given(pupil).moved(-corner)
+    image = _clean_image(frames[part.slices], bad[part.slices])
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
     pitch_range_px = _pitch_range(pitch_px, image.shape)
     lattice = find_lattice(image, geometries, pitch_range_px) if np.ptp(image) > 0 else None
     if lattice is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
-    lattice, spots, lit = _fitted(image, lattice, lit_fraction)
-    cells = spots.cells[lit]
+    lattice, spots, lit = _fitted(image, lattice, lit_fraction, circle)
+    cells = spots.cells[lit.nodes]
     if len(cells) < 4 or np.any(np.ptp(cells, axis=0) < 1):
-        raise InputError(
-            f"frame: found only {len(cells)} lit lenslets at a pitch of {lattice.pitch_px:.1f} px, expected "
-            "at least two rows of two; average more frames, or give pitch_px"
-        )
-    at = lattice.positions(cells)
+        raise InputError(_too_few(len(cells), lattice, circle))
+    at = lattice.positions(cells) + corner
     return LensletGrid(
         geometry=lattice.geometry,
         pitch_px=lattice.pitch_px,
         angle_deg=lattice.angle_deg,
         cells=cells - cells.min(axis=0),
         centres=np.column_stack([at.real, at.imag]),
-        flux=spots.flux[lit],
+        flux=spots.flux[lit.nodes],
+        doubt=lit.doubt,
     )
 
 
@@ -167,7 +143,17 @@ def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float,
     largest = min(shape) / 1.6
     if pitch_px is None:
         return SMALLEST_PITCH_PX, largest
-    pitch_px = number_between("pitch_px", pitch_px, 3.0, largest)
+    pitch_px = number_between("pitch_px", pitch_px, 0.0, low_open=True)
+    if pitch_px < SMALLEST_WINDOW:
+        raise InputError(
+            f"pitch_px = {pitch_px:g}: windows below {SMALLEST_WINDOW} px are not supported yet, expected "
+            f"{SMALLEST_WINDOW} to {largest:g}"
+        )
+    if pitch_px > largest:
+        raise InputError(
+            f"pitch_px = {pitch_px:g}: expected at most {largest:g}, two rows of lenslets must fit into "
+            f"{shape[1]} x {shape[0]} pixels"
+        )
     return 0.8 * pitch_px, 1.2 * pitch_px
 
 
@@ -182,13 +168,25 @@ def _nothing_found(image: NDArray[np.float64], pitch_range_px: tuple[float, floa
     )
 
 
-def _clean_image(frame: Any, bad_pixels: Any) -> NDArray[np.float64]:
-    """Return the mean frame, float64, with bad and hot pixels replaced by the median around them."""
+def _too_few(count: int, lattice: Lattice, pupil: Pupil | None) -> str:
+    """Say in one line that a lattice has too few lit lenslets."""
+    found = f"frame: a {lattice.geometry} lattice with a pitch of {lattice.pitch_px:.1f} px fits best, but "
+    expected = "expected at least two rows of two"
+    if pupil is not None:
+        return f"{found}{count} of its lenslets lie in the pupil given, {expected}"
+    number = "none of its lenslets is" if count == 0 else f"only {count} of its lenslets {_be(count)}"
+    return f"{found}{number} lit for certain, {expected}; average more frames, or give pitch_px"
+
+
+def _be(count: int) -> str:
+    return "is" if count == 1 else "are"
+
+
+def _checked(frame: Any, bad_pixels: Any) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Return frame or frames and a mask of bad pixels, which may hold NaN in the frame."""
     frames = real_array("frame", frame, minimum_dimensions=2)
     if frames.ndim > 3:
         raise InputError(f"frame: expected (ny, nx) or (n_frames, ny, nx), got shape {frames.shape}")
-    if min(frames.shape[-2:]) < 2 * SMALLEST_PITCH_PX:
-        raise InputError(f"frame: expected at least 10 x 10 pixels, got shape {frames.shape}")
     bad = np.zeros(frames.shape[-2:], dtype=bool)
     if bad_pixels is not None:
         bad = real_array("bad_pixels", bad_pixels) != 0
@@ -196,8 +194,16 @@ def _clean_image(frame: Any, bad_pixels: Any) -> NDArray[np.float64]:
             raise InputError(
                 f"bad_pixels: expected shape {frames.shape[-2:]} like the frame, got {bad.shape}"
             )
-        if bad.mean() > 0.5:
-            raise InputError(f"bad_pixels: {bad.sum()} of {bad.size} pixels are bad, expected at most half")
+    return frames, bad
+
+
+def _clean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the mean frame, float64, with bad and hot pixels replaced by the median around them."""
+    if min(frames.shape[-2:]) < 2 * SMALLEST_PITCH_PX:
+        raise InputError(f"frame: expected at least 10 x 10 pixels, got shape {frames.shape}")
+    if bad.mean() > 0.5:
+        raise InputError(f"bad_pixels: {bad.sum()} of {bad.size} pixels are bad, expected at most half")
+    if bad.any():
         frames = np.where(bad, np.median(frames[..., ~bad]).astype(frames.dtype), frames)
     image = _robust_mean(finite_array("frame", frames))
     bad = bad | _hot_pixels(image)
@@ -220,13 +226,20 @@ def _hot_pixels(image: NDArray[np.float64]) -> NDArray[np.bool_]:
     The light of a spot reaches at least three of a pixel's eight neighbours; a hot pixel reaches none and the
     track of a cosmic ray two.
     """
-    ring = np.ones((3, 3), dtype=bool)
-    ring[1, 1] = False
-    background = scipy.ndimage.median_filter(image, footprint=ring, mode="nearest")
-    third = scipy.ndimage.rank_filter(image, -3, footprint=ring, mode="nearest")
-    excess = image - background
-    noise = robust_std(excess)
-    return np.asarray((excess > 5 * noise) & (third - background < 0.2 * excess))
+    padded = np.pad(image, 1, mode="edge")
+    mean = (scipy.ndimage.uniform_filter(image, 3, mode="nearest") * 9 - image) / 8
+    above = image - mean
+    every = max(1, image.size // _MOST_FOR_NOISE)
+    noise = robust_std(above.ravel()[::every])
+    # Two neighbours on its track leave three quarters of a pixel's excess over the mean of all eight.
+    row, column = np.nonzero(above > 0.75 * 5 * noise)
+    around = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
+    ring = np.sort(np.stack([padded[row + y, column + x] for y, x in around]), axis=0)
+    peak = image[row, column]
+    lowest, median, third = ring[1], 0.5 * (ring[3] + ring[4]), ring[5]
+    bad = np.zeros(image.shape, dtype=bool)
+    bad[row, column] = (peak - median > 5 * noise) & (third - lowest < 0.2 * (peak - lowest))
+    return bad
 
 
 def _median_of_good(image: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -242,157 +255,23 @@ def _median_of_good(image: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArr
 
 
 def _fitted(
-    image: NDArray[np.float64], lattice: Lattice, lit_fraction: float
-) -> tuple[Lattice, _Measured, NDArray[np.bool_]]:
+    image: NDArray[np.float64], lattice: Lattice, lit_fraction: float | None, pupil: Pupil | None
+) -> tuple[Lattice, NodeLight, Lit]:
     """Return the lattice fitted to the spots, what was measured at its nodes, and which nodes are lit."""
     image = image - np.median(image)
-    width_px = _spot_width(image, lattice)
+    width_px = spot_width(image, lattice)
     for _ in range(_FIT_PASSES):
-        spots = _measured(image, lattice, width_px)
-        lit = _lit(spots, lattice, lit_fraction)
-        if lit.sum() < 4:
+        spots = measure_nodes(image, lattice, width_px)
+        lit = find_lit(spots, lattice, lit_fraction)
+        used = lit.nodes if pupil is None else lit.nodes & pupil.holds(lattice.positions(spots.cells))
+        if np.count_nonzero(used) < 4:
             break
-        before, lattice = (
-            lattice,
-            lattice.fitted(spots.cells[lit], spots.positions[lit]).canonical(image.shape),
-        )
+        before = lattice
+        lattice = lattice.fitted(spots.cells[used], spots.positions[used]).canonical(image.shape)
         if abs(lattice.step - before.step) * max(image.shape) < 0.02 * abs(lattice.step) ** 2:
             break
-    spots = _measured(image, lattice, width_px)
-    return lattice, spots, _lit(spots, lattice, lit_fraction)
-
-
-def _spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
-    """Return the standard deviation of the Gaussian that is most like the spots.
-
-    A Gaussian filter of width s turns a Gaussian spot of width s0 into a peak proportional to
-    1 / (s^2 + s0^2) and white noise into noise proportional to 1 / s: their ratio is highest at s = s0.
-    """
-    widths = np.geomspace(0.6, max(1.2, lattice.pitch_px / 4), 8)
-    ratios = []
-    for width in widths:
-        smooth = _smoothed(image, width)
-        heights = _peaks(smooth, lattice).heights
-        certain = heights[heights >= _CERTAIN * _noise(smooth, lattice)]
-        # The sum, as the right width also makes most spots stand out; clipped, for a cosmic ray among them.
-        limit = 3 * np.median(certain) if len(certain) else 0.0
-        ratios.append(width * float(np.minimum(certain, limit).sum()))
-    return float(widths[int(np.argmax(ratios))])
-
-
-def _smoothed(image: NDArray[np.float64], width_px: float) -> NDArray[np.float64]:
-    """Return the smoothed image, dark outside the frame: a mirrored spot would move the peak to the edge."""
-    return np.asarray(scipy.ndimage.gaussian_filter(image, width_px, mode="constant"))
-
-
-def _peaks(smooth: NDArray[np.float64], lattice: Lattice) -> _Peaks:
-    """Return the highest pixel near every node, and how it stands above the border of the node's cell."""
-    cells = lattice.cells_inside(smooth.shape, _MARGIN * lattice.pitch_px)
-    at = lattice.positions(cells)
-    values, distance, pixels = pixels_around(smooth, at, 0.6 * lattice.pitch_px)
-    border = _at_border(distance, values, lattice)
-    near = np.where((distance < _SEARCH * lattice.pitch_px) & ~np.isnan(values), values, -np.inf)
-    index = np.arange(len(cells))
-    peak = near.argmax(axis=1)
-    positions = pixels[index, peak]
-    background = median_where(values, border)
-    height = near[index, peak] - background
-    return _Peaks(cells, positions, height, background)
-
-
-def _is_round(smooth: NDArray[np.float64], peaks: _Peaks, lattice: Lattice) -> NDArray[np.bool_]:
-    """Return which peaks fall off on all sides, as a spot does and the edge of something does not."""
-    above_sides = peaks.heights + peaks.background - _brightest_side(smooth, peaks.positions, lattice)
-    x, y = peaks.positions.real, peaks.positions.imag
-    height, width = smooth.shape
-    # What rises towards the rim of the search area or of the frame belongs to something beyond it.
-    inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
-    tops = scipy.ndimage.maximum_filter(smooth, 3) == smooth
-    inside &= tops[y.astype(np.int64), x.astype(np.int64)]
-    return np.asarray(inside & (above_sides >= _ROUND * peaks.heights))
-
-
-def _brightest_side(
-    smooth: NDArray[np.float64], positions: NDArray[np.complex128], lattice: Lattice
-) -> NDArray[np.float64]:
-    """Return the highest of the medians of the four sides, half a pitch away, of every position."""
-    values, distance, pixels = pixels_around(smooth, positions, 0.6 * lattice.pitch_px)
-    border = _at_border(distance, values, lattice)
-    angle = np.angle((pixels - positions[:, None]) / lattice.step)
-    side = np.rint(angle / (np.pi / 2)).astype(np.int64) % 4
-    return np.asarray(
-        np.max([median_where(values, border & (side == number)) for number in range(4)], axis=0)
-    )
-
-
-def _at_border(
-    distance: NDArray[np.float64], values: NDArray[np.float64], lattice: Lattice
-) -> NDArray[np.bool_]:
-    """Return which pixels of the windows lie about half a pitch from the middle, and in the frame."""
-    parts = distance / lattice.pitch_px
-    return np.asarray((parts > 0.42) & (parts < 0.6) & ~np.isnan(values))
-
-
-def _measured(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> _Measured:
-    """Return what is at every node of the lattice inside the frame."""
-    smooth = _smoothed(image, width_px)
-    peaks = _peaks(smooth, lattice)
-    radius = max(1.5, min(2.5 * width_px, 0.5 * lattice.pitch_px))
-    values, distance, _ = pixels_around(image, peaks.positions, radius)
-    above = np.where(distance <= radius, values - peaks.background[:, None], 0.0)
-    noise = max(_noise(smooth, lattice), 1e-12 * float(np.ptp(image)))
-    return _Measured(
-        peaks.cells,
-        peaks.positions + _subpixel(smooth, peaks.positions),
-        peaks.heights,
-        peaks.background,
-        is_round=_is_round(smooth, peaks, lattice),
-        flux=np.nansum(above, axis=1),
-        signal_to_noise=peaks.heights / noise,
-    )
-
-
-def _subpixel(smooth: NDArray[np.float64], peaks: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return how far from the peak pixel the top of a parabola through it and its neighbours lies."""
-    height, width = smooth.shape
-    x = np.clip(peaks.real.astype(np.int64), 1, width - 2)
-    y = np.clip(peaks.imag.astype(np.int64), 1, height - 2)
-
-    def top(
-        before: NDArray[np.float64], here: NDArray[np.float64], after: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        bend = before - 2 * here + after
-        shift = 0.5 * (before - after) / np.where(bend < 0, bend, -np.inf)
-        return np.clip(shift, -0.5, 0.5)
-
-    here = smooth[y, x]
-    shift_x = top(smooth[y, x - 1], here, smooth[y, x + 1])
-    return np.asarray(shift_x + 1j * top(smooth[y - 1, x], here, smooth[y + 1, x]))
-
-
-def _noise(smooth: NDArray[np.float64], lattice: Lattice) -> float:
-    """Return the standard deviation of the smoothed noise between the spots.
-
-    The wings of the spots are the same one step of the lattice away and the background changes evenly, so
-    that second differences over one step are noise.
-    """
-    between = lattice.distance_px(smooth.shape) > 0.5 * lattice.pitch_px
-    step = np.array([round(lattice.step.imag), round(lattice.step.real)])
-    after, before = (scipy.ndimage.shift(smooth, sign * step, order=0, cval=np.nan) for sign in (-1, 1))
-    difference = (after - 2 * smooth + before)[between]
-    difference = difference[np.isfinite(difference)]
-    return robust_std(difference) / np.sqrt(6) if len(difference) else 0.0
-
-
-def _lit(spots: _Measured, lattice: Lattice, lit_fraction: float) -> NDArray[np.bool_]:
-    """Return which nodes are lit: their spot is there, is bright enough, and has a lit neighbour."""
-    neighbours = lattice.neighbours(spots.cells)
-    certain = spots.is_round & (spots.signal_to_noise >= _CERTAIN)
-    if not certain.any():
-        return certain
-    bright = spots.flux >= lit_fraction * np.median(spots.flux[certain])
-    lit = certain & bright
-    probable = spots.is_round & (spots.signal_to_noise >= _PROBABLE) & bright
-    for _ in range(3):
-        lit = lit | (probable & (2 * count_chosen(lit, neighbours) >= neighbours.shape[1]))
-    return np.asarray(lit & (count_chosen(lit, neighbours) > 0))
+    spots = measure_nodes(image, lattice, width_px)
+    lit = find_lit(spots, lattice, lit_fraction)
+    if pupil is not None:
+        lit = Lit(pupil.holds(lattice.positions(spots.cells)), "")
+    return lattice, spots, lit

@@ -1,0 +1,248 @@
+"""What light is at each node of a lattice: a spot's position, its flux, and how it stands out of the noise.
+
+A spot is a bump on a local background, so its light is measured against a plane that is fitted with it to the
+pixels of its cell, and its noise is that of the same pixels: haze, gradients, and the spots around it make no
+spot, and noise in one part of the frame hides none in another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from faintspot.sensor.lattice import Lattice, robust_std
+
+# A spot is looked for within this part of the pitch around its node: aberrations of +-15 % of the pitch per
+# axis and an error of the first lattice fit in, the neighbour's spot does not.
+SEARCH = 0.35
+# A node this near to the frame's edge (part of the pitch) has its spot cut in two.
+_MARGIN = 0.12
+# A spot and its plane are fitted to the pixels within this part of the pitch: a little beyond half-way to the
+# neighbour, so that a plane is told from the top of a broad spot.
+_CELL = 0.55
+# Peaks of this many standard deviations are spots when the width of the spots is measured.
+_CERTAIN = 4.0
+# Spot widths (standard deviation) that are tried: from the sharpest that pixels sample to a blur that fills
+# the cell, each 1.25 times the last. The peaks come from three of them, a factor of 2.5 or so apart: a filter
+# that is 1.6 times too wide or narrow keeps 0.9 of the signal-to-noise ratio.
+_SHARPEST_PX, _BROADEST = 0.6, 0.25
+_WIDTHS, _STARTS = 9, (1, 4, 7)
+_MOST_FOR_WIDTH = 500  # spots; the width of so many is known far better than is needed
+_MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
+
+
+@dataclass(frozen=True)
+class NodeLight:
+    """What was measured at the nodes of a lattice, each array (n,).
+
+    Parameters
+    ----------
+    cells : int array (n, 2)
+    positions : complex array
+        Of the brightest peak near the node, x + 1j * y.
+    flux, flux_noise : arrays
+        Light above the local plane within 2.5 standard deviations of the spot's shape (at most half a
+        pitch), and its noise.
+    signal_to_noise : array
+        Of the fitted spot, by the noise of the cell itself.
+    shifts : complex array
+        From the node to the peak, in pitches.
+    """
+
+    cells: NDArray[np.int64]
+    positions: NDArray[np.complex128]
+    flux: NDArray[np.float64]
+    flux_noise: NDArray[np.float64]
+    signal_to_noise: NDArray[np.float64]
+    shifts: NDArray[np.complex128]
+
+
+def measure_nodes(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> NodeLight:
+    """Return what is at every node that lies inside the frame.
+
+    Parameters
+    ----------
+    image : array (ny, nx)
+    lattice : Lattice
+    width_px : float
+        Standard deviation of the spots' shape.
+    """
+    band = _band(image, _haze(image, lattice), width_px)
+    cells = lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px)
+    peaks, _ = _peaks(band, lattice, cells)
+    offsets = _cell_offsets(lattice)
+    values = _around(image, peaks, offsets)
+    inside = ~np.isnan(values)
+    values = np.where(inside, values, 0.0)
+    model = _model(offsets, lattice, width_px)
+    numbers, inverse = _fits(values, inside, model)
+    spot = model[:, 3]
+    residual = np.where(inside, values - numbers @ model.T, 0.0)
+    # The noise is that of the background: where the spot is bright, its own shape differs from the model's.
+    weight = (1 - spot) ** 2
+    variance = (residual**2 @ weight) / np.maximum(inside @ weight, 1e-12)
+    variance += _coloured(image, band, lattice, width_px)
+    variance = np.maximum(variance, (1e-9 * float(np.ptp(image))) ** 2)
+    near = np.abs(offsets) <= max(1.5, min(2.5 * width_px, 0.5 * lattice.pitch_px))
+    flux = (residual + numbers[:, 3:] * spot)[:, near].sum(axis=1)
+    return NodeLight(
+        cells,
+        peaks + _subpixel(band, peaks),
+        flux,
+        np.sqrt(variance * np.count_nonzero(near)),
+        numbers[:, 3] / np.sqrt(variance * inverse[:, 3, 3]),
+        (peaks - lattice.positions(cells)) / lattice.pitch_px,
+    )
+
+
+def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
+    """Return the standard deviation (px) of the Gaussian that is most like the spots.
+
+    It is the one whose fits have the highest signal-to-noise ratio, summed over the spots there are.
+    """
+    widest = max(1.2, _BROADEST * lattice.pitch_px)
+    widths = np.geomspace(_SHARPEST_PX, widest, _WIDTHS)
+    cells = lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px)
+    offsets = _cell_offsets(lattice)
+    haze = _haze(image, lattice)
+    best = (-np.inf, float(widths[0]))
+    for start in _STARTS:
+        band = _band(image, haze, float(widths[start]))
+        peaks, heights = _peaks(band, lattice, cells)
+        certain = np.flatnonzero(heights >= _CERTAIN * _noise(band, lattice))
+        if len(certain) < 4:
+            continue
+        chosen = certain[:: -(-len(certain) // _MOST_FOR_WIDTH)]
+        values = _around(image, peaks[chosen], offsets)
+        inside = ~np.isnan(values)
+        for width in widths:
+            numbers, inverse = _fits(np.where(inside, values, 0.0), inside, _model(offsets, lattice, width))
+            ratio = numbers[:, 3] / np.sqrt(inverse[:, 3, 3])
+            # The sum, as the right width also makes most spots stand out; clipped, for a cosmic ray in it.
+            score = float(np.minimum(ratio, 3 * np.median(ratio)).mean()) * len(certain)
+            best = max(best, (score, float(width)))
+    return best[1]
+
+
+def _haze(image: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
+    """Return the mean over a pitch around every pixel, in which regular spots are even."""
+    haze = scipy.ndimage.uniform_filter(image, round(lattice.pitch_px), mode="nearest")
+    return np.asarray(scipy.ndimage.uniform_filter(haze, 3, mode="nearest"))
+
+
+def _band(image: NDArray[np.float64], haze: NDArray[np.float64], width_px: float) -> NDArray[np.float64]:
+    """Return the smoothed image less the haze that its spots stand in.
+
+    It is dark outside the frame: a mirrored spot would move the peak to the edge.
+    """
+    smooth = scipy.ndimage.gaussian_filter(image, width_px, mode="constant", truncate=3.0)
+    return np.asarray(smooth - haze)
+
+
+def _disc(radius_px: float) -> NDArray[np.complex128]:
+    """Return the whole-pixel offsets within a radius, x + 1j * y."""
+    reach = int(radius_px)
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    offsets = (x + 1j * y).ravel()
+    return np.asarray(offsets[np.abs(offsets) <= radius_px])
+
+
+def _cell_offsets(lattice: Lattice) -> NDArray[np.complex128]:
+    return _disc(max(_CELL * lattice.pitch_px, 2.9))
+
+
+def _around(
+    image: NDArray[np.float64], at: NDArray[np.complex128], offsets: NDArray[np.complex128]
+) -> NDArray[np.float64]:
+    """Return the pixels (n, m) at m offsets from the pixels nearest to n positions, NaN outside the frame."""
+    reach = int(np.max(np.abs(offsets.real)))
+    padded = np.pad(image, reach + 1, constant_values=np.nan)
+    stride = padded.shape[1]
+    first = (np.rint(at.imag).astype(np.int64) + reach + 1) * stride + np.rint(at.real).astype(np.int64)
+    steps = offsets.imag.astype(np.int64) * stride + offsets.real.astype(np.int64)
+    return np.asarray(padded.ravel()[(first + reach + 1)[:, None] + steps])
+
+
+def _peaks(
+    band: NDArray[np.float64], lattice: Lattice, cells: NDArray[np.int64]
+) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+    """Return the position and height of the highest pixel near every node."""
+    at = lattice.positions(cells)
+    offsets = _disc(max(SEARCH * lattice.pitch_px, 1.5))
+    values = _around(band, at, offsets)
+    values = np.where(np.isnan(values), -np.inf, values)
+    highest = values.argmax(axis=1)
+    middle = np.rint(at.real) + 1j * np.rint(at.imag)
+    return middle + offsets[highest], values[np.arange(len(cells)), highest]
+
+
+def _model(offsets: NDArray[np.complex128], lattice: Lattice, width_px: float) -> NDArray[np.float64]:
+    """Return the model of a cell (m, 4): a constant, x and y in pitches, and a Gaussian spot."""
+    x, y = offsets.real / lattice.pitch_px, offsets.imag / lattice.pitch_px
+    return np.stack([np.ones(len(x)), x, y, np.exp(-0.5 * (np.abs(offsets) / width_px) ** 2)], axis=1)
+
+
+def _fits(
+    values: NDArray[np.float64], inside: NDArray[np.bool_], model: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fit the model to every cell: its numbers (n, 4) and the inverse normal matrix (n, 4, 4)."""
+    # A faint ridge keeps a cell that the frame's edge cuts to a line solvable.
+    ridge = 1e-9 * len(model) * np.eye(4)
+    inverse = np.tile(np.linalg.inv(model.T @ model + ridge), (len(values), 1, 1))
+    cut = np.flatnonzero(~inside.all(axis=1))
+    products = (model[:, :, None] * model[:, None, :]).reshape(-1, 16)
+    inverse[cut] = np.linalg.inv((inside[cut] @ products).reshape(-1, 4, 4) + ridge)
+    return np.einsum("nij,nj->ni", inverse, values @ model), inverse
+
+
+def _subpixel(band: NDArray[np.float64], peaks: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return how far from the peak pixel the top of a parabola through it and its neighbours lies."""
+    height, width = band.shape
+    x = np.clip(peaks.real.astype(np.int64), 1, width - 2)
+    y = np.clip(peaks.imag.astype(np.int64), 1, height - 2)
+
+    def top(
+        before: NDArray[np.float64], here: NDArray[np.float64], after: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        bend = before - 2 * here + after
+        shift = 0.5 * (before - after) / np.where(bend < 0, bend, -np.inf)
+        return np.clip(shift, -0.5, 0.5)
+
+    here = band[y, x]
+    shift_x = top(band[y, x - 1], here, band[y, x + 1])
+    return np.asarray(shift_x + 1j * top(band[y - 1, x], here, band[y + 1, x]))
+
+
+def _coloured(
+    image: NDArray[np.float64], band: NDArray[np.float64], lattice: Lattice, width_px: float
+) -> float:
+    """Return the variance to add to that of the pixels for the noise that is not white, such as stripes.
+
+    Smoothing leaves 1 / (2 sqrt(pi) width) of white noise; what it leaves beyond that is as much as white
+    noise of this variance would leave.
+    """
+    smoothed = 2 * np.sqrt(np.pi) * width_px * _noise(band, lattice)
+    return float(max(smoothed**2 - _noise(image, lattice) ** 2, 0.0))
+
+
+def _noise(image: NDArray[np.float64], lattice: Lattice) -> float:
+    """Return the standard deviation of the noise between the spots.
+
+    The wings of the spots are the same one step of the lattice away and the background changes evenly, so
+    that second differences over one step are noise.
+    """
+    row, column = round(lattice.step.imag), round(lattice.step.real)
+    height, width = image.shape
+    every = int(np.ceil(np.sqrt(max(1.0, image.size / (4 * _MOST_FOR_NOISE)))))
+    y = np.arange(abs(row), height - abs(row), every)
+    x = np.arange(abs(column), width - abs(column), every)
+    between = lattice.distance_px(y, x) > 0.5 * lattice.pitch_px
+    if not between.any():
+        return 0.0
+    at = (y[:, None] * width + x)[between]
+    step = row * width + column
+    pixels = image.ravel()
+    return float(robust_std(pixels[at - step] - 2 * pixels[at] + pixels[at + step]) / np.sqrt(6))
