@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.estimators.base import Estimator
+from faintspot.estimators.base import Estimator, Prepared
+from faintspot.estimators.python import PythonPrepared
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import groups
 from faintspot.kernels.compiling import Direct
@@ -83,7 +84,8 @@ class Preparation:
         )
         self.estimator: Estimator = settings.estimator
         self.estimator.check(self.sensor)
-        self.prepared = self.estimator.prepared(self.sensor)
+        own = self.estimator.prepared(self.sensor)
+        self.prepared: Prepared = PythonPrepared(self.estimator, self.sensor) if own is None else own
         self.no_prior = np.zeros((1, 2, n), np.float32)
         """The prior of slopes that nobody has predicted: 0."""
         self._fixed = self._fixed_table(each)

@@ -12,7 +12,7 @@ import pytest
 from tests.io.slope_files import assert_stored, part, result, write, writer_for
 
 from faintspot.errors import InputError
-from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_files
+from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_store
 
 fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")
@@ -157,7 +157,7 @@ def test_data_are_on_the_disk_before_the_mark(
     """Whatever has content when the mark is set has been synchronised since it was written."""
     monkeypatch.setattr(slopes_zarr, "_CHUNK_NUMBERS", 70)
     monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
-    storage, marks = (slopes_zarr, zarr_files) if name.endswith("zarr") else (slopes_folder, slopes_folder)
+    storage, marks = (slopes_zarr, zarr_store) if name.endswith("zarr") else (slopes_folder, slopes_folder)
     synchronise, replace = storage.sync_file, marks.replace_file
     synchronised: dict[str, bytes] = {}
     missing: list[Mapping[str, bytes]] = []

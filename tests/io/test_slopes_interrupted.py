@@ -15,7 +15,7 @@ from tests.io.slope_files import NAMES, assert_stored, part, result, write, writ
 
 import faintspot
 from faintspot.errors import InputError
-from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_files
+from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_store
 
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")
@@ -38,7 +38,7 @@ class TestDiskFull:
         self, tmp_path: Path, name: str, writes_before: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         whole = result()
-        module = zarr_files if name.endswith(".zarr") else slopes_folder
+        module = zarr_store if name.endswith(".zarr") else slopes_folder
         original = module.replace_file
         calls = 0
 

@@ -115,17 +115,15 @@ class Estimator(Options):
 
     # What a pipeline asks for -----------------------------------------------------------------------
 
-    def prepared(self, sensor: Sensor) -> Prepared:
-        """Return what is computed once for a sensor, before the first frame.
+    def prepared(self, sensor: Sensor) -> Prepared | None:
+        """Return what is computed once for a sensor, before the first frame; None: `locate` does the work.
 
         Raises
         ------
         InputError
             When the options do not fit the sensor.
         """
-        from faintspot.estimators.python import PythonPrepared
-
-        return PythonPrepared(self, sensor)
+        return None
 
     def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> Any:
         """Return the positions of the spots of one frame: what an estimator without a kernel overrides.

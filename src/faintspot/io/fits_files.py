@@ -19,23 +19,15 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
+from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
 from faintspot.io.slopes_format import REQUIRED, StoredSlopes
 
 _BLOCK_BYTES = 2880
 _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
-
-
-def load_fits() -> Any:
-    """Return the package astropy.io.fits; MissingExtraError when it is not installed."""
-    try:
-        from astropy.io import fits
-    except ImportError:
-        raise MissingExtraError("astropy", "io", "Reading or writing a FITS file") from None
-    return fits
 
 
 class Fits(FileFormat):

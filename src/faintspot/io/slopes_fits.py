@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.io.fits_files import load_fits
+from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip, pieces
 from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, with_absent
 

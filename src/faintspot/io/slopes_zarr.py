@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.files import sync_file, sync_folder
 from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, with_absent
 from faintspot.io.slopes_writer import Begun
-from faintspot.io.zarr_files import is_store, load_zarr, replace_attributes
+from faintspot.io.zarr_store import is_store, replace_attributes
 
 zarr = load_zarr()
 _MARK = "finished_frames"

@@ -20,8 +20,9 @@ from faintspot.errors import InputError
 from faintspot.files import output_errors
 from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.io.zarr_files import is_store, load_zarr, replace_attributes
+from faintspot.io.zarr_store import is_store, replace_attributes
 
 zarr = load_zarr()
 FORMAT = "faintspot telemetry"

@@ -2,43 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import replace_file
+from faintspot.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, choose_name, one_line
+from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import Run, StoredSlopes
 from faintspot.io.slopes_writer import Begun, Storage
-
-_MARKS = ("zarr.json", ".zgroup", ".zarray")
-
-
-def is_store(path: Path) -> bool:
-    """Tell whether a directory is a Zarr group or array."""
-    return any((path / mark).is_file() for mark in _MARKS)
-
-
-def load_zarr() -> Any:
-    """Return the package zarr; MissingExtraError when it is not installed."""
-    try:
-        import zarr
-    except ImportError:
-        raise MissingExtraError("zarr", "io", "Reading or writing a Zarr store") from None
-    return zarr
-
-
-def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
-    """Change attributes of a group in one step, which the store's own setter does not promise."""
-    metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    metadata["attributes"].update(changed)
-    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
+from faintspot.io.zarr_store import is_store
 
 
 class Zarr(FileFormat):
