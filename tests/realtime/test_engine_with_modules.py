@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from tests.realtime.module_cases import LAYOUT, SETTINGS, frames, pipeline, write
 
+from faintspot.realtime.commands import commands_of
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.handlers import handlers_of
 from faintspot.realtime.modular import ModularPipeline
 from faintspot.realtime.module_loading import load_module
 from faintspot.realtime.pixel_ring import PixelRing
@@ -31,7 +31,7 @@ class Bench:
     def __init__(self) -> None:
         name = f"fs_test_{uuid4().hex[:12]}"
         self.engine = Engine(name, pipeline, SETTINGS, deadline_s=DEADLINE_S)
-        self.ask = handlers_of(self.engine)
+        self.ask = commands_of(self.engine)
         self._thread = threading.Thread(target=self.engine.run)
         self._stream = pyshmem.open(f"{name}_slopes")
         self._ring = PixelRing.create(name, LAYOUT.frame_shape, np.float32)

@@ -25,14 +25,14 @@ def made(settings: fs.Settings) -> fs.SlopePipeline:
 
 
 @pytest.fixture
-def live() -> LiveSettings:
+def live() -> LiveSettings[fs.SlopePipeline]:
     return LiveSettings(made, SETTINGS)
 
 
-def test_a_change_waits_for_the_next_frame_and_is_stamped(live: LiveSettings) -> None:
+def test_a_change_waits_for_the_next_frame_and_is_stamped(live: LiveSettings[fs.SlopePipeline]) -> None:
     before = live.take(6)
     change = live.propose({"noise_std": 2.5})
-    assert (live.frame_of(change), live.waiting(), live.pipeline is before) == (None, 1, True)
+    assert (live.frame_of(change), live.waiting(), live.running is before) == (None, 1, True)
     assert live.history() == []
     after = live.take(7)
     assert after is not before
@@ -42,7 +42,7 @@ def test_a_change_waits_for_the_next_frame_and_is_stamped(live: LiveSettings) ->
     assert live.history() == [(7, {"noise_std": 2.5}, None)]
 
 
-def test_changes_between_two_frames_build_on_each_other(live: LiveSettings) -> None:
+def test_changes_between_two_frames_build_on_each_other(live: LiveSettings[fs.SlopePipeline]) -> None:
     changes = [
         live.propose({"noise_std": 2.5}),
         live.propose({"keep_brightest": 20}, [1, 4]),
@@ -60,7 +60,7 @@ def test_changes_between_two_frames_build_on_each_other(live: LiveSettings) -> N
     assert live.get(["keep_brightest"]) == {"keep_brightest": [9, 20, 9, 9, 20, 9]}
 
 
-def test_slopes_are_those_of_the_offline_pipeline(live: LiveSettings) -> None:
+def test_slopes_are_those_of_the_offline_pipeline(live: LiveSettings[fs.SlopePipeline]) -> None:
     frame = np.random.default_rng(1).poisson(3.0, LAYOUT.frame_shape).astype(np.float32)
     live.propose({"noise_std": 1.5, "max_iterations": 4}, [2, 3])
     found = live.take(0)(frame)
@@ -133,19 +133,22 @@ def test_history_is_bounded_and_keeps_the_latest() -> None:
     assert [live.frame_of(change) for change in changes] == [0, 1, 2, 3, 4]
 
 
-def test_pipelines_that_were_replaced_are_freed_without_the_collector(live: LiveSettings) -> None:
+def test_pipelines_that_were_replaced_are_freed_without_the_collector(
+    live: LiveSettings[fs.SlopePipeline],
+) -> None:
     gc.disable()  # as it is while an engine runs
     try:
         replaced = []
         for value in range(1, 6):
             live.propose({"noise_std": value}, [0])
             replaced.append(weakref.ref(live.take(value)))
+            live.let_go()
         assert [pipeline() is None for pipeline in replaced] == [True] * 4 + [False]
     finally:
         gc.enable()
 
 
-def test_history_is_not_changed_from_outside(live: LiveSettings) -> None:
+def test_history_is_not_changed_from_outside(live: LiveSettings[fs.SlopePipeline]) -> None:
     values, where = {"noise_std": [1.0, 2.0]}, [0, 1]
     live.propose(values, where)
     live.take(5)
@@ -170,7 +173,7 @@ def test_many_threads_propose_while_frames_are_taken() -> None:
     def engine() -> None:
         while True:
             last = done.is_set()
-            if len(taken) == 0 or taken[-1] is not live.pipeline or live.waiting() or last:
+            if len(taken) == 0 or taken[-1] is not live.running or live.waiting() or last:
                 taken.append(live.take(len(taken)))
             if last:
                 return
@@ -196,7 +199,7 @@ def test_many_threads_propose_while_frames_are_taken() -> None:
         np.testing.assert_array_equal(pipeline.settings.values("noise_std", N, 64), now)
 
 
-def test_waiting_for_a_change(live: LiveSettings) -> None:
+def test_waiting_for_a_change(live: LiveSettings[fs.SlopePipeline]) -> None:
     change = live.propose({"noise_std": 2.0})
     assert live.wait(change, timeout_s=0.01) is None
     live.propose({"noise_std": 3.0})
@@ -206,7 +209,7 @@ def test_waiting_for_a_change(live: LiveSettings) -> None:
     timer.join()
 
 
-def test_get_is_plain_and_complete(live: LiveSettings) -> None:
+def test_get_is_plain_and_complete(live: LiveSettings[fs.SlopePipeline]) -> None:
     live.propose({"spot_fwhm_px": 2.0}, [0])
     live.take(0)
     values = json.loads(json.dumps(live.get(), allow_nan=False))

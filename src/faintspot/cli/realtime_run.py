@@ -79,13 +79,13 @@ def run(
       faintspot realtime run --interleave none,tv --every 50
     """
     from faintspot.pipeline import SlopePipeline
+    from faintspot.realtime.commands import LENGTHY, commands_of
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
-    from faintspot.realtime.handlers import LENGTHY, handlers_of
     from faintspot.realtime.interleaving import Interleaving
     from faintspot.realtime.live import parse_subapertures
-    from faintspot.realtime.manners import real_time
     from faintspot.realtime.module_loading import load_module
+    from faintspot.realtime.scheduling import real_time
     from faintspot.sensor import configuration
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
@@ -103,7 +103,7 @@ def run(
     )
     for source in modules:
         engine.modules.load(load_module(source))
-    server = ControlServer(socket_path(name), handlers_of(engine), lengthy=LENGTHY)
+    server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
     with server, real_time(processors, priority) as refused:
         engine.refused = refused
         for line in refused:

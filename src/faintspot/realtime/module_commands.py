@@ -33,7 +33,7 @@ class ModuleHost(Protocol):
         """Put the built-in stage back; return the first frame, None while it waits."""
 
 
-def module_handlers(host: ModuleHost) -> dict[str, Handler]:
+def module_commands(host: ModuleHost) -> dict[str, Handler]:
     """Return the commands: load, swap (both {"source"}), unload ({"stage"}: a stage or a name), modules."""
 
     def load(fields: dict[str, Any]) -> Mapping[str, Any]:
