@@ -149,26 +149,28 @@ class ControlServer:
             os.close(self._lock_file)
 
     async def _serve(self) -> None:
-        accepting = asyncio.create_task(self._accept())
-        await self._closing.wait()
-        for task in (accepting, *self._connections):
-            task.cancel()
+        self._listen()
+        await self._closing.wait()  # afterwards the runner cancels the connections
 
-    async def _accept(self) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, _ = await loop.sock_accept(self._listener)
-            except OSError:  # no file descriptor left, mostly
-                self._make_room()
-                await asyncio.sleep(_PAUSE_S)
-                continue
-            if len(self._connections) >= _MOST_CONNECTIONS:
-                self._make_room()
-            connection.setblocking(False)
-            task = loop.create_task(self._converse(connection))
-            self._connections[task] = None
-            task.add_done_callback(partial(self._end, connection))
+    def _listen(self) -> None:
+        self._loop.add_reader(self._listener, self._accept)
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except BlockingIOError:
+            return
+        except OSError:  # no file descriptor left, mostly
+            self._make_room()
+            self._loop.remove_reader(self._listener)
+            self._loop.call_later(_PAUSE_S, self._listen)
+            return
+        if len(self._connections) >= _MOST_CONNECTIONS:
+            self._make_room()
+        connection.setblocking(False)
+        task = self._loop.create_task(self._converse(connection))
+        self._connections[task] = None
+        task.add_done_callback(partial(self._end, connection))
 
     def _make_room(self) -> None:
         """End the connection that was idle longest."""
