@@ -16,7 +16,7 @@ from faintspot.cli.realtime_modules import COMMANDS
 from faintspot.realtime.control import ControlServer
 from faintspot.realtime.modular import ModularPipeline
 from faintspot.realtime.module_commands import module_commands
-from faintspot.realtime.module_loading import Module
+from faintspot.realtime.module_loading import Module, load_module
 from faintspot.realtime.private_socket import socket_path
 
 
@@ -32,6 +32,9 @@ class Host:
 
     def module_fault(self) -> str | None:
         return self.fault
+
+    def admit(self, name_or_path: str) -> Module:
+        return load_module(name_or_path)
 
     def load(self, module: Module) -> int | None:
         wanted = {**self.loaded, module.stage: module}

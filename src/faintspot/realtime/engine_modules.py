@@ -7,9 +7,11 @@ import threading
 from collections import deque
 from collections.abc import Mapping
 
+from faintspot.errors import InputError
 from faintspot.realtime.live import LiveSettings
-from faintspot.realtime.module_loading import Module
+from faintspot.realtime.module_loading import Module, load_module
 from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
+from faintspot.realtime.trial_process import Trial
 
 _EFFECT_TIMEOUT_S = 0.5
 _MOST_BEFORE = 8
@@ -39,6 +41,21 @@ class EngineModules:
     def module_fault(self) -> str | None:
         """Return why modules were taken out last, None where they never were."""
         return self._fault
+
+    def admit(self, name_or_path: str) -> Module:
+        """Try a module in a process of its own, and load it into this one when it has passed.
+
+        Raises
+        ------
+        InputError
+            When it is refused; then this process has not run any of it.
+        """
+        settings = self._preparer.of_arms(self._live.settings)
+        digest = Trial(name_or_path, self._preparer.make_pipeline, settings).elsewhere()
+        module = load_module(name_or_path)
+        if module.digest != digest:
+            raise InputError(f"module {name_or_path}: was changed while it was tried; load it again")
+        return module
 
     def load(self, module: Module) -> int | None:
         """Put a module in its stage, in place of what is there; return the first frame, None while it waits.

@@ -134,7 +134,7 @@ class SettingsPreparer:
         workers: Workers | None,
         budget_s: float,
     ) -> None:
-        self._make_pipeline, self._interleaving = make_pipeline, interleaving
+        self.make_pipeline, self._interleaving = make_pipeline, interleaving
         self._workers, self._budget_s = workers, budget_s
         self.ring: PixelRing | None = None
         """Whose frames are being measured, if any."""
@@ -149,10 +149,7 @@ class SettingsPreparer:
         InputError
             When the settings do not fit, or what an arm makes of them, or a module is refused.
         """
-        pipelines = [
-            self._make_pipeline(settings.replace(**arm.changes) if arm.changes else settings)
-            for arm in self._interleaving.arms
-        ]
+        pipelines = [self.make_pipeline(each) for each in self.of_arms(settings)]
         for pipeline in pipelines:
             check_real_time(pipeline)
         prepared = PreparedSettings(pipelines, settings, self.modules, self._workers, self._budget_s)
@@ -160,6 +157,12 @@ class SettingsPreparer:
         if ring is not None:
             prepared.paths(ring)
         return prepared
+
+    def of_arms(self, settings: Settings) -> list[Settings]:
+        """Return the settings of every arm."""
+        return [
+            settings.replace(**arm.changes) if arm.changes else settings for arm in self._interleaving.arms
+        ]
 
 
 class _WritableMemory:
