@@ -199,6 +199,31 @@ def test_many_threads_propose_while_frames_are_taken() -> None:
         np.testing.assert_array_equal(pipeline.settings.values("noise_std", N, 64), now)
 
 
+def test_what_is_being_prepared_is_said_and_nobody_waits_for_it() -> None:
+    """Neither who reads the history nor the engine."""
+    go_on, begun = threading.Event(), threading.Event()
+
+    def slow(settings: fs.Settings) -> fs.SlopePipeline:
+        if settings != SETTINGS:
+            begun.set()
+            go_on.wait(30)
+        return made(settings)
+
+    live = LiveSettings(slow, SETTINGS)
+    proposer = threading.Thread(target=live.propose, args=({"noise_std": 2.0},))
+    proposer.start()
+    begun.wait(30)
+    said = live.preparing
+    assert said is not None
+    assert said["changes"] == {"noise_std": 2.0}
+    assert said["seconds"] >= 0
+    assert (live.history(), live.take(3).settings, live.waiting()) == ([], SETTINGS, 0)
+    go_on.set()
+    proposer.join()
+    assert live.preparing is None
+    assert live.take(4).settings.noise_std == 2.0
+
+
 def test_waiting_for_a_change(live: LiveSettings[fs.SlopePipeline]) -> None:
     change = live.propose({"noise_std": 2.0})
     assert live.wait(change, timeout_s=0.01) is None
@@ -217,6 +242,20 @@ def test_get_is_plain_and_complete(live: LiveSettings[fs.SlopePipeline]) -> None
     assert values["spot_fwhm_px"] == [2.0, None, None, None, None, None]
     assert values["estimator"] == "cog"
     assert set(live.get(["rule", "steps"])) == {"rule", "steps"}
+    assert live.get(["tolerance", "max_iterations", "smoothing_px"]) == {
+        "tolerance": 0.01,
+        "max_iterations": 200,
+        "smoothing_px": 0.7,
+    }
+    live.propose({"preset": "fast", "estimator": "weighted", "spot_fwhm_px": 2.0})
+    live.take(1)
+    assert live.get(["tolerance", "max_iterations", "steps", "keep_brightest", "flux_e"]) == {
+        "tolerance": 0.0,
+        "max_iterations": 8,
+        "steps": 3,
+        "keep_brightest": 9,
+        "flux_e": None,
+    }
     for bad in (["rules"], "rule", 3, [1]):
         with pytest.raises(InputError):
             live.get(bad)  # type: ignore[arg-type]

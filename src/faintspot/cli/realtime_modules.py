@@ -8,10 +8,9 @@ from typing import Any
 
 import click
 
-from faintspot.realtime.control import request
+from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.private_socket import socket_path
 
-_TIMEOUT_S = 180.0  # the module is imported, made and tried, and may compile
 _NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
 
 
@@ -81,7 +80,7 @@ def _source(name_or_path: str) -> str:
 
 
 def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
-    return request(socket_path(name), what, timeout_s=_TIMEOUT_S, **fields)
+    return request(socket_path(name), what, timeout_s=LENGTHY_TIMEOUT_S, **fields)
 
 
 def _show(reply: dict[str, Any]) -> None:

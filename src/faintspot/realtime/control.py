@@ -27,6 +27,8 @@ Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
 """What a command does: takes the request without its command, returns what the reply says."""
 
 LARGEST_REQUEST = 64 * 1024
+LENGTHY_TIMEOUT_S = 180.0
+"""For a client to wait for a command that makes something anew, which may compile."""
 _LARGEST_REPLY = 16 * 1024 * 1024
 _MOST_CONNECTIONS = 64
 _IDLE_S = 30.0  # a connection without a request, or that does not read its reply, for so long is closed

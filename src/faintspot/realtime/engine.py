@@ -124,6 +124,7 @@ class Engine:
             "name": self.name,
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
             "source_refused": self._unfit or None,
+            "preparing": self.live.preparing,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator,

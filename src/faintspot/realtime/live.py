@@ -16,6 +16,7 @@ import numpy as np
 
 from faintspot.checks import number_between, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.presets import steps
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.settings import AUTO, PER_SUBAPERTURE, PerSubaperture, Settings
 
@@ -260,8 +261,9 @@ class LiveSettings(Generic[Prepared]):
     def get(self, names: Sequence[str] | None = None) -> dict[str, Any]:
         """Return values that run, by name (default: all), as plain numbers, texts and lists.
 
-        A setting that differs between sub-apertures is a list with one value for each; what is not set
-        is None.
+        Defaults are filled in. A setting that differs between sub-apertures is a list with one value for
+        each; None is what is not used, or not a number: found from the PSF or each frame's light, or without
+        a limit.
 
         Raises
         ------
@@ -374,9 +376,13 @@ def _check_every_value(settings: Settings, n: int, pixels: int) -> None:
 
 
 def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
-    """A setting as plain values."""
+    """A setting as plain values, with its default filled in."""
     value = getattr(settings, name)
-    if not isinstance(value, PerSubaperture | np.ndarray):
+    if name == "steps" and value is None:
+        return steps(settings.preset, settings.estimator)
+    differs = isinstance(value, PerSubaperture | np.ndarray)
+    if value is not None and not differs:
         return value
-    each = settings.values(name, n, pixels).tolist()
-    return [None if isinstance(item, float) and math.isnan(item) else item for item in each]
+    items = settings.values(name, n, pixels).tolist()
+    each = [None if isinstance(item, float) and math.isnan(item) else item for item in items]
+    return each if differs else each[0]

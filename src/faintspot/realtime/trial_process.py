@@ -27,7 +27,6 @@ from faintspot.sensor.settings import Settings
 
 LIMIT_S = 90.0
 _GRACE_S = 5.0  # for the process to end by itself
-_NICE = 10  # the engine's work goes before
 _PROGRAM = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
     "from faintspot.realtime.trial_process import main; main()"
@@ -124,7 +123,6 @@ def main() -> None:
     os.dup2(2, 1)  # what the module prints is not the answer
     trial: Trial = pickle.load(sys.stdin.buffer)
     signal.alarm(max(1, round(trial.limit_s)))  # ends compiled code as well
-    os.nice(_NICE)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a crash leaves no file behind
     reply: dict[str, str | None] = {"digest": None, "error": None}
     try:
