@@ -21,8 +21,8 @@ def load(name: str, module: str) -> None:
     """Put a module in place of a stage of a running engine.
 
     A module is a Python file, or one that is installed under that name, which replaces one of the stages
-    calibrate, denoise, background and centroid. It is made and tried beside the running engine, and refused
-    where it fails, does not return what it must, or takes too long. It runs with all rights of the engine.
+    calibrate, denoise, background and centroid. It is tried in a process of its own, and refused where it
+    fails, crashes, does not return what it must, or takes too long. It runs with all rights of the engine.
 
     \b
     Example:
