@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,8 @@ from benchmarks.measuring import Row, Table
 from benchmarks.results import Benchmark, Results
 from benchmarks.showing import number
 from faintspot.errors import MissingExtraError
-from faintspot.report.drawing import data_uri
+from faintspot.report.drawing import png
+from faintspot.report.page import data_uri, style, write_report
 
 _PIXELS_PER_INCH = 90
 
@@ -38,8 +38,6 @@ def page(results: Results) -> str:
         import jinja2
     except ImportError:
         raise MissingExtraError("jinja2", "web", "Making a page") from None
-    reports = files("faintspot.report").joinpath("templates/report.html").read_text(encoding="utf-8")
-    style = reports.partition("<style>")[2].partition("</style>")[0]  # all pages look the same
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
     targets = [
@@ -58,7 +56,7 @@ def page(results: Results) -> str:
     ]
     return template.render(
         title="faintspot: benchmarks",
-        style=style,
+        style=style(),  # all pages look the same
         facts={
             "begun": results.started.replace("T", " "),
             **results.fingerprint,
@@ -77,8 +75,6 @@ def page(results: Results) -> str:
 
 def write_page(results: Results, path: Path) -> None:
     """Write the page; an existing file is replaced."""
-    from faintspot.report.page import write_report
-
     path.parent.mkdir(parents=True, exist_ok=True)
     write_report(path, page(results))
 
@@ -152,4 +148,4 @@ def _pictures(benchmark: Benchmark) -> list[dict[str, Any]]:
     if figure is None:
         return []
     width = int(_PIXELS_PER_INCH * figure.get_figwidth())
-    return [{"data": data_uri(figure), "caption": caption, "width": width}]
+    return [{"data": data_uri("png", png(figure)), "caption": caption, "width": width}]

@@ -1,5 +1,6 @@
-"""Settings of Hypothesis: no deadline, because the first call of a kernel compiles it. Ctrl-C interrupts.
+"""Settings of Hypothesis, Ctrl-C, and cheap pictures for the tests of pages.
 
+Hypothesis has no deadline, because the first call of a kernel compiles it;
 `pytest --hypothesis-profile=thorough` looks 25 times harder.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -20,3 +22,20 @@ settings.load_profile("ci" if os.environ.get("CI") else "default")
 # A shell's background job ignores Ctrl-C, and so would the programs that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def coarse_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw without fine detail: pictures of reports take most of the time."""
+    from faintspot.report import drawing
+
+    monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
+
+
+@pytest.fixture
+def undrawn_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose the figures but do not draw them."""
+    from faintspot.report import drawing
+
+    for name in ("png", "svg"):
+        monkeypatch.setattr(drawing, name, lambda figure: b"")

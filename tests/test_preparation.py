@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot import spot_tables
-from faintspot.sensor import configuration
+from faintspot import configuration, spot_tables
 
 LAYOUT = fs.Layout.grid((3, 4), pixels=12)
 NOISE = fs.Calibration(read_noise_e=1.0)

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from faintspot.estimate.total_variation import tv_denoise as tv_denoise
     from faintspot.flags import SubapertureFlag as SubapertureFlag
     from faintspot.pipeline import SlopePipeline as SlopePipeline
-    from faintspot.pipeline import Slopes as Slopes
-    from faintspot.pipeline import Stages as Stages
     from faintspot.planner import tune as tune
     from faintspot.sensor.calibration import Calibration as Calibration
     from faintspot.sensor.layout import Layout as Layout
     from faintspot.sensor.photon_transfer import measure_detector as measure_detector
     from faintspot.sensor.psf import PSF as PSF
     from faintspot.sensor.score import TrainedScore as TrainedScore
-    from faintspot.sensor.settings import Settings as Settings
+    from faintspot.settings import Settings as Settings
+    from faintspot.slopes import Slopes as Slopes
+    from faintspot.slopes import Stages as Stages
     from faintspot.training import RunningPSF as RunningPSF
     from faintspot.training import learn_psf as learn_psf
     from faintspot.training import train_estimator as train_estimator
@@ -44,10 +44,10 @@ _HOMES = {
     "MissingExtraError": "faintspot.errors",
     "PSF": "faintspot.sensor.psf",
     "RunningPSF": "faintspot.training",
-    "Settings": "faintspot.sensor.settings",
+    "Settings": "faintspot.settings",
     "SlopePipeline": "faintspot.pipeline",
-    "Slopes": "faintspot.pipeline",
-    "Stages": "faintspot.pipeline",
+    "Slopes": "faintspot.slopes",
+    "Stages": "faintspot.slopes",
     "SubapertureFlag": "faintspot.flags",
     "TrainedScore": "faintspot.sensor.score",
     "brightest_pixels": "faintspot.estimate.brightest",

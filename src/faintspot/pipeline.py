@@ -1,78 +1,34 @@
-"""The slope pipeline: frame -> calibrate -> denoise -> background -> centroid -> slopes."""
+"""The slope pipeline: frame -> calibrate -> estimator -> slopes."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from faintspot import configuration
 from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
-from faintspot.flags import INVALID
-from faintspot.kernels import fused, located, thresholded
-from faintspot.kernels.host import WIDTHS, lanes_for
+from faintspot.estimators.base import Estimator
+from faintspot.estimators.python import PythonPrepared
+from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source, light_of_groups
+from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
-from faintspot.preparation import METHODS, Preparation, packed_calibration
-from faintspot.sensor import configuration
+from faintspot.preparation import Preparation, packed_calibration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
+from faintspot.slopes import RESULT_TYPES, Slopes, Stages
 
 if TYPE_CHECKING:
-    from faintspot.cuda import DevicePipeline
-
-RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
-
-
-@dataclass(frozen=True)
-class Slopes:
-    """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures)."""
-
-    x: NDArray[np.float32]
-    """Position of the spot along columns, px from the reference; 0 where invalid."""
-    y: NDArray[np.float32]
-    """Position along rows."""
-    flux: NDArray[np.float32]
-    """Electrons left after the background subtraction."""
-    flags: NDArray[np.uint8]
-    """Bits of `SubapertureFlag`."""
-    iterations: NDArray[np.int32]
-    """Iterations that the denoising took."""
-    bad_pixels: NDArray[np.int32]
-    """Number of pixels that were masked, NaN or infinite."""
-    standard_error_x: NDArray[np.float32]
-    """Standard error of x, px; infinite where invalid, and where the read noise is not known."""
-    standard_error_y: NDArray[np.float32]
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Whether the slope was measured."""
-        return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
-
-    @property
-    def vector(self) -> NDArray[np.float32]:
-        """All x, then all y, along the last axis: what a reconstructor multiplies."""
-        return np.concatenate([self.x, self.y], axis=-1)
-
-
-@dataclass(frozen=True)
-class Stages:
-    """The sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes."""
-
-    raw: NDArray[Any]
-    """As in the frame, ADU."""
-    calibrated: NDArray[np.float32]
-    """Electrons, bad pixels filled."""
-    denoised: NDArray[np.float32]
-    background_subtracted: NDArray[np.float32]
-    slopes: Slopes
+    from faintspot.cuda.measuring import DevicePipeline
 
 
 class SlopePipeline:
@@ -81,23 +37,23 @@ class SlopePipeline:
     Parameters
     ----------
     layout : Layout
-    settings : Settings
+    settings : Settings or Estimator
     calibration : Calibration, optional
         Default: frames are in electrons already.
     reference : array or Slopes, optional
         Reference positions, px from each sub-aperture's centre, subtracted from every position: (n, 2) x and
         y, or (2 n,) all x then all y, or the slopes of one frame. Default 0.
     psf : PSF, optional
-        Needed by the estimators "matched", "ml" and "map"; tells "weighted" and "auto" the spots' width.
+        Needed by estimators that know the spot itself; tells others the spots' width.
     score : TrainedScore, optional
-        Needed by the estimator "trained".
+        Needed by estimators that apply one.
     width : int, optional
         SIMD width in float32 numbers: 4, 8 or 16. Default: what the machine has.
     threads : int, optional
         Most threads to use. Default: all processors that the process may use. Slopes do not depend on it.
     device : {"cpu", "cuda"}, optional
-        Where frames are measured. On an NVIDIA GPU ("cuda", see `faintspot.cuda`) with the estimators "cog",
-        "smoothed" and "thresholded"; `explain` and `kernel_call` use the CPU always.
+        Where frames are measured. On an NVIDIA GPU ("cuda", see `faintspot.cuda`) with estimators that run
+        there; `explain` and real time use the CPU always.
 
     Raises
     ------
@@ -117,7 +73,7 @@ class SlopePipeline:
     def __init__(
         self,
         layout: Layout,
-        settings: Settings,
+        settings: Settings | Estimator,
         calibration: Calibration | None = None,
         reference: ArrayLike | Slopes | None = None,
         *,
@@ -128,7 +84,7 @@ class SlopePipeline:
         device: str = "cpu",
     ) -> None:
         self.layout = layout
-        self.settings = settings
+        self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
         self.calibration = Calibration() if calibration is None else calibration
         self.threads = (
             None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
@@ -136,8 +92,8 @@ class SlopePipeline:
         self._lanes = lanes_for(np.float32, width)
         self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         self._parts = psf, score, layout.offsets + _reference_positions(reference, len(layout))
-        self._preparation = self._prepared()
-        self._in_rows = self._row_arguments()
+        self.preparation = self._prepared()
+        """What was computed beforehand."""
         self._identity = _identity(*self._parts)
         self.device = one_of("device", device, ("cpu", "cuda"))
         self.on_device = self._device_pipeline() if self.device == "cuda" else None
@@ -159,7 +115,7 @@ class SlopePipeline:
         check_cuda()
         from faintspot.cuda.measuring import DevicePipeline
 
-        return DevicePipeline(self.layout, self.settings, self.calibration, self._preparation)
+        return DevicePipeline(self.layout, self.calibration, self.preparation)
 
     @property
     def width(self) -> int:
@@ -177,15 +133,54 @@ class SlopePipeline:
         other = copy.copy(self)
         other._lanes = lanes_for(np.float32, width)
         other._calibration = packed_calibration(self.layout, self.calibration, width)
-        other._preparation = other._prepared()
-        other._in_rows = other._row_arguments()
+        other.preparation = other._prepared()
         other.on_device = None if self.on_device is None else other._device_pipeline()
+        return other
+
+    def with_settings(self, settings: Settings) -> SlopePipeline:
+        """Return the same pipeline with other settings.
+
+        Raises
+        ------
+        InputError
+            When they do not fit.
+        """
+        psf, score, zero = self._parts
+        return SlopePipeline(
+            self.layout,
+            settings,
+            self.calibration,
+            zero - self.layout.offsets,
+            psf=psf,
+            score=score,
+            width=self.width,
+            threads=self.threads,
+            device=self.device,
+        )
+
+    def for_images(self) -> SlopePipeline:
+        """Return the same pipeline for calibrated images (n, ny, nx), electrons, read as one tall frame."""
+        layout, camera, (ny, nx) = self.layout, self.calibration, self.layout.window
+        n = len(layout)
+        corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
+        centres = corners[:, ::-1] + 0.5 * (np.array([nx, ny]) - 1) + layout.offsets
+        other = copy.copy(self)
+        other.layout = Layout((n * ny, nx), (ny, nx), corners, centres)
+        other.calibration = Calibration(
+            gain_e_per_adu=camera.em_gain,
+            em_gain=camera.em_gain,
+            read_noise_e=camera.read_noise_e,
+            background_e=camera.background_e,
+        )
+        other._calibration = packed_calibration(other.layout, other.calibration, self.width)
+        other.preparation = other._prepared()
+        other.device, other.on_device = "cpu", None
         return other
 
     @property
     def needs_light(self) -> bool:
         """Whether settings follow the light of each frame, which is looked at before it is measured."""
-        return self._preparation.needs_light
+        return self.preparation.needs_light
 
     def fingerprint(self) -> bytes:
         """Return bytes that differ between pipelines that could give different slopes for the same frame."""
@@ -241,90 +236,64 @@ class SlopePipeline:
         self, array: NDArray[Any], prior: ArrayLike | Slopes | None, explain: bool
     ) -> tuple[Slopes, NDArray[np.float32]]:
         """Compute the slopes, and the stages where asked for."""
-        frames = _kernel_frames(array)
+        frames = kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
-        results = tuple(np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES)
-        stages = np.empty((fused.STAGE_ROWS if explain else 0, n_frames, n, self.layout.pixels), np.float32)
-        variants = self._variants(frames, self.calibration.saturation(array.dtype))
+        results = SlopeArrays(*(np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES))
+        prepared = self.preparation.prepared
+        rows = STAGE_ROWS if explain or isinstance(prepared, PythonPrepared) else 0
+        stages = np.empty((rows, n_frames, n, self.layout.pixels), np.float32)
+        source = self.source(frames, array.dtype)
+        variants = self._variants(source)
         if self.on_device is not None and not explain:
             measured = self.on_device.measure_from_host(frames, array.dtype, variants)
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
-        kernel, before, shape = self.kernel_call(frames, array.dtype, variants, prior)
+        predicted = None if prior is None else _prior_slopes(prior, n_frames, n)
+        task = self.preparation.task(variants, predicted)
 
-        def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
-            kernel(*before, start, stop, scratch, results, stages)
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            prepared.kernel(source, task, start, stop, scratch, results, stages)
 
         n_groups = n_frames * -(-n // self._lanes.width)
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, shape)
+        own_scratch = self.preparation.own_scratch
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch)
+        if isinstance(prepared, PythonPrepared):
+            images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
+            for f in range(n_frames):
+                predicted_f = task.prior[min(f, len(task.prior) - 1)]
+                prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
         shaped: Any = (result.reshape(*array.shape[:-2], n) for result in results)
         return Slopes(*shaped), stages
 
-    def kernel_call(
-        self,
-        frames: NDArray[Any],
-        dtype: DTypeLike,
-        variants: NDArray[np.int64],
-        prior: ArrayLike | Slopes | None = None,
-    ) -> tuple[Any, tuple[Any, ...], tuple[int, int, int] | None]:
-        """Return the compiled function that measures frames, and its arguments before the range of groups.
-
-        For those who call it themselves, group by group; everybody else calls the pipeline.
+    def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
+        """Return what kernels read of frames.
 
         Parameters
         ----------
-        frames : (n, h, w) array, uint16 or float32
+        frames : (n, h, w) array, uint16 or float32, contiguous
         dtype : dtype
             Of the camera's pixels, which says at what value they saturate.
-        variants : (n,) int64
-            Table of settings of each frame: 0 unless settings depend on the light.
-        prior : array or Slopes, optional
-            As when the pipeline is called.
-
-        Returns
-        -------
-        function, arguments, scratch shape (see `faintspot.kernels.parallel.run_groups`)
         """
-        plan, n = self._preparation, len(self.layout)
         saturation = self.calibration.saturation(np.dtype(dtype))
-        tables, constants, shape = plan.arguments()
-        source = (self._lanes, frames, self.layout.corners, *self.layout.window, self._calibration)
-        if plan.estimator in METHODS:
-            predicted = plan.no_prior if prior is None else _prior_slopes(prior, len(frames), n)
-            arguments = (*source, saturation, tables, variants, predicted, *constants)
-            return located.locate_groups, arguments, shape
-        arguments = (*source, saturation, tables, variants, *constants)
-        if self._in_rows is not None:
-            return thresholded.thresholded_slopes, (*self._in_rows, *arguments), shape
-        return fused.slopes_of_groups, arguments, shape
+        corners, window = self.layout.corners, self.layout.window
+        return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
 
-    def _row_arguments(self) -> tuple[Any, ...] | None:
-        """What the kernel takes that measures pixels in rows, where that is possible."""
-        columns = self.layout.window[1]
-        widths = [width for width in WIDTHS if columns % width == 0 and width <= self._lanes.width]
-        if self.settings.estimator != "thresholded" or not widths:
-            return None
-        maps = np.ascontiguousarray(self.calibration.maps(self.layout.frame_shape), np.float32)
-        ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
-        return lanes_for(np.float32, max(widths)), maps, ramp
-
-    def _variants(self, frames: NDArray[Any], saturation: float) -> NDArray[np.int64]:
+    def _variants(self, source: Source) -> NDArray[np.int64]:
         """Which table of settings every frame is measured with, by its light where that matters."""
-        n_frames, n = len(frames), len(self.layout)
-        if not self._preparation.needs_light:
+        n_frames, n = len(source.frames), len(self.layout)
+        if not self.needs_light:
             return np.zeros(n_frames, np.int64)
         light = np.empty((n_frames, n), np.float32)
-        source = (self._lanes, frames, self.layout.corners, *self.layout.window, self._calibration)
 
-        def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
-            fused.light_of_groups(*source, saturation, start, stop, scratch, light)
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            light_of_groups(source, start, stop, scratch, light)
 
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)
-        return self._preparation.variants(light.mean(axis=1, dtype=np.float64))
+        return self.preparation.variants(light.mean(axis=1, dtype=np.float64))
 
 
-def _kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
-    """The frames as the kernel reads them: (n, h, w), contiguous, uint16 or float32."""
+def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
+    """Return frames as kernels read them: (n, h, w), contiguous, uint16 or float32."""
     dtype = np.uint16 if array.dtype in (np.uint8, np.uint16) else np.float32
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
         frames = np.ascontiguousarray(array, dtype=dtype)

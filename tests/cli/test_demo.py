@@ -11,7 +11,7 @@ from tests.cli.cli_cases import Commands
 from faintspot import SlopePipeline
 from faintspot.cli.demo import comparison_table
 from faintspot.io import read_slopes
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.study.demonstration import FLUXES_E, Arm, Comparison
 
 pytest.importorskip("matplotlib")

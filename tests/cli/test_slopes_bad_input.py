@@ -184,7 +184,7 @@ def test_full_disk(folder: Path, run: Commands, output: str, monkeypatch: pytest
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "write_atomically", full)
+        patch.setattr(module, "replace_file", full)
         run.refused("slopes", "a.npy", "-o", output, naming=(output, "disk is full"))
     assert output.endswith("zarr") or not (folder / output).exists()
     run.ok("slopes", "a.npy", "-o", output)

@@ -8,7 +8,7 @@ import pytest
 from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate import Detector, sensor_frames, subapertures
 from faintspot.study.metric import slope_error
 

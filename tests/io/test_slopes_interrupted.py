@@ -38,7 +38,7 @@ class TestDiskFull:
     ) -> None:
         whole = result()
         module = slopes_zarr if name.endswith(".zarr") else slopes_file
-        original = module.write_atomically
+        original = module.replace_file
         calls = 0
 
         def full(path: Path, text: str) -> None:
@@ -49,7 +49,7 @@ class TestDiskFull:
             original(path, text)
 
         with monkeypatch.context() as patch:
-            patch.setattr(module, "write_atomically", full)
+            patch.setattr(module, "replace_file", full)
             with pytest.raises(InputError) as error:
                 write(tmp_path / name, whole, 10)
         assert name in str(error.value)
@@ -62,8 +62,12 @@ class TestDiskFull:
     def test_file_cannot_be_made(self, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
         whole = result()
 
-        def full(_: int) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
+        synchronise = os.fsync
+
+        def full(descriptor: int) -> None:
+            if Path(f"/proc/self/fd/{descriptor}").resolve().name == "output":
+                raise OSError(errno.ENOSPC, "No space left on device")
+            synchronise(descriptor)
 
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full)

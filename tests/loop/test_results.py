@@ -8,7 +8,6 @@ import pytest
 
 from faintspot.errors import InputError
 from faintspot.loop.files import make_folder, write_atomically
-from faintspot.loop.recognise import holds_loop_results
 from faintspot.loop.results import (
     BUDGET_FILE,
     INTERLEAVED_FILE,
@@ -17,6 +16,7 @@ from faintspot.loop.results import (
     InterleavedResult,
     MagnitudeResult,
 )
+from faintspot.loop.stored_results import holds_loop_results
 
 
 def magnitude_result() -> MagnitudeResult:

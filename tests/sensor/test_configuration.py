@@ -11,8 +11,8 @@ from hypothesis.extra import numpy as hnp
 from tests.estimate.image_cases import refused
 
 import faintspot as fs
-from faintspot.sensor import configuration
-from faintspot.sensor.settings import PerSubaperture
+from faintspot import configuration
+from faintspot.settings import PerSubaperture
 
 LAYOUT = "[layout.grid]\nshape = [2, 3]\npixels = 4\n"
 SETTINGS = "[settings]\nnoise_std = 0.5\n"

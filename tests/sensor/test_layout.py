@@ -133,6 +133,37 @@ class TestLayout:
             assert len(fs.Layout((40, 40), (ny, nx), corners)) == 3
 
 
+class TestSelection:
+    def test_a_mask_numbers_or_a_slice(self) -> None:
+        layout = fs.Layout.grid((3, 4), pixels=8, outer_radius=1.9)
+        mask = np.arange(len(layout)) % 3 == 0
+        chosen = layout[mask]
+        assert len(chosen) == np.count_nonzero(mask)
+        for name in ("corners", "centres", "cells"):
+            assert np.array_equal(getattr(chosen, name), getattr(layout, name)[mask])
+        assert (chosen.frame_shape, chosen.pitch_px) == (layout.frame_shape, layout.pitch_px)
+        assert layout[np.flatnonzero(mask)] == layout[::3] == chosen
+        assert np.array_equal(layout[[5, -1]].corners, layout.corners[[5, -1]])
+        assert layout[layout.centres[:, 0] > 0] == layout
+
+    @pytest.mark.parametrize(
+        ("words", "chosen"),
+        [
+            ("mask of 4, got 3", np.ones(3, bool)),
+            ("none is chosen", np.zeros(4, bool)),
+            ("none is chosen", slice(4, 9)),
+            ("= 4: expected a number from -4 to 3", [0, 4]),
+            ("twice", [0, -4]),
+            ("whole number", [0.5]),
+            ("a mask, a slice or a list", 1),
+            ("a mask, a slice or a list", [[0, 1]]),
+        ],
+    )
+    def test_what_cannot_be_chosen(self, words: str, chosen: Any) -> None:
+        with refused("layout[", words):
+            fs.Layout.grid((2, 2), pixels=4)[chosen]
+
+
 class TestImages:
     def test_windows_of_a_frame(self) -> None:
         layout = fs.Layout((9, 13), (4, 5), np.array([[1, 2], [5, 8]]))

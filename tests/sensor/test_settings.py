@@ -8,7 +8,7 @@ import pytest
 from tests.estimate.image_cases import refused
 
 import faintspot as fs
-from faintspot.sensor.settings import PER_SUBAPERTURE, PerSubaperture
+from faintspot.settings import PER_SUBAPERTURE, PerSubaperture
 
 
 class TestSettings:

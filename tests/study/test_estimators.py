@@ -12,7 +12,7 @@ import pytest
 from tests.shared_data import shared_file
 from tests.study.study_cases import cells, dataset, power_law
 
-from faintspot.report import drawing, study_page
+from faintspot.report import drawing
 from faintspot.study import estimators
 from faintspot.study.efficiency import compares_estimators, enough_photons, findings, markdown
 from faintspot.study.estimator_figures import estimator_figures
@@ -118,7 +118,7 @@ def test_other_studies_do_not_compare_estimators() -> None:
 
 def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
-    monkeypatch.setattr(study_page, "svg", lambda figure: b"")  # another drawing, as slow
+    monkeypatch.setattr(drawing, "svg", lambda figure: b"")  # another drawing, as slow
     specification = estimators.specification(quick=True)
     quick = [asdict(cell) for cell in specification.cells()]
     few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]

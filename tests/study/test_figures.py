@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.study.study_cases import ARMS, MODES, cells, dataset, power_law
 
-from faintspot.study.figure_data import mode_in_words
+from faintspot.study.cell_numbers import mode_in_words
 from faintspot.study.figures import baselines_figure, kept_pixels_figure, sweep_figure
 from faintspot.study.kept_pixels import kept_panels, spread
 from faintspot.study.triple_picture import triple_images, triple_picture

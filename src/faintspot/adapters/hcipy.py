@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.adapters.base import UnitAdapter, largest_window, layout_around, on_detector
 from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
+from faintspot.slopes import Slopes
 
 try:
     import hcipy

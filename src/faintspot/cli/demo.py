@@ -10,12 +10,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from faintspot import configuration
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
 from faintspot.io.slopes import read_slopes
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
-from faintspot.sensor import configuration
 from faintspot.study import demonstration
 from faintspot.study.demonstration import Comparison
 from faintspot.study.metric import magnitudes

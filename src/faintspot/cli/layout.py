@@ -11,15 +11,16 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot import configuration
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.pipeline import SlopePipeline
-from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.layout import GEOMETRIES, Layout
-from faintspot.sensor.settings import Settings
+from faintspot.sensor.windows import FoundLayout, find_layout
+from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings
@@ -49,6 +50,11 @@ _FIRST_FRAMES = 20  # measured for the settings
 @click.option(
     "--pixels", type=int, metavar="N", help="Side of a window. Default: the largest without overlap."
 )
+@click.option(
+    "--move-windows",
+    is_flag=True,
+    help="Move all windows alike, off their spots, to save lenslets at the frame's edge.",
+)
 @click.option("--dark", metavar="FILE|ADU", help="Dark frame, as FILE or FILE:ARRAY, or a number of ADU.")
 @click.option(
     "--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: 1, frames in electrons."
@@ -71,6 +77,7 @@ def command(
     geometry: str,
     pitch: float | None,
     pixels: int | None,
+    move_windows: bool,
     dark: str | None,
     gain: float | None,
     mask_hot_pixels: bool,
@@ -103,12 +110,18 @@ def command(
         mean[tuple(hot.T)] = np.nan
         bad = np.isnan(mean)
         try:
-            layout = Layout.from_frame(
-                np.where(bad, 0, mean), geometry=geometry, pitch_px=pitch, pixels=pixels, bad_pixels=bad
+            found = find_layout(
+                np.where(bad, 0, mean),
+                geometry=geometry,
+                pitch_px=pitch,
+                pixels=pixels,
+                bad_pixels=bad,
+                move_windows=move_windows,
             )
         except InputError as error:
             text = str(error).replace("pitch_px", "--pitch PX")
             raise InputError(f"{source.description}: {text}") from None
+        layout = found.layout
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, layout, mean, hot)
     settings, noise, flux = _first_settings(layout, calibration, first)
@@ -118,7 +131,7 @@ def command(
     drawn = _draw(np.where(bad, np.nanmedian(mean), mean), layout, picture, target)
     for item in (layout, settings, calibration):
         configuration.save(target, item)
-    for line in [*_describe(output, layout, settings, noise, flux), *notes]:
+    for line in [*_describe(output, found, settings, noise, flux), *notes]:
         click.echo(line)
     if calibration.gain_e_per_adu == 1.0:
         click.echo("  one electron per ADU assumed; give --gain if your camera has another")
@@ -127,8 +140,9 @@ def command(
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
 
-def _describe(output: str, layout: Layout, settings: Settings, noise: float, flux: float) -> list[str]:
-    """Say in a few lines what was found."""
+def _describe(output: str, found: FoundLayout, settings: Settings, noise: float, flux: float) -> list[str]:
+    """Say in a few lines what was found, and what was left out."""
+    layout = found.layout
     rows, columns = layout.cells.max(axis=0) + 1
     height, width = layout.window
     lines = [
@@ -136,13 +150,28 @@ def _describe(output: str, layout: Layout, settings: Settings, noise: float, flu
         f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px",
         f"  background noise {noise:.2g} e-, median flux {flux:.4g} e-: noise_std {settings.noise_std}",
     ]
+    if len(found.cut):
+        lines.append(
+            f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "
+            f"{_sides(found)}; smaller windows (--pixels) or --move-windows take more"
+        )
     moved = np.abs(np.median(layout.offsets, axis=0))
     if moved.max() > 1:
         lines.append(
-            f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px, so that those at the "
-            "edge are whole; --pixels makes smaller windows"
+            f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px: "
+            "centres of gravity are worse in them"
         )
     return lines
+
+
+def _sides(found: FoundLayout) -> str:
+    """Say at which sides of the frame lenslets were left out, such as '7 left, 8 below'."""
+    height, width = found.layout.frame_shape
+    x, y = found.cut.T
+    distances = np.stack([x, width - 1 - x, y, height - 1 - y])
+    counts = np.bincount(distances.argmin(axis=0), minlength=4)
+    names = ("at small x", "at large x", "at small y", "at large y")
+    return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
 
 
 def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.float64]:
@@ -162,10 +191,10 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
 
 def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
     """Draw frame and windows and say where; without matplotlib only a picture that was asked for fails."""
-    from faintspot.report import layout_picture
-
     path = picture or str(target.with_suffix(".png"))
     try:
+        from faintspot.report import layout_picture
+
         layout_picture(frame, layout, path)
     except MissingExtraError as error:
         if picture is not None:

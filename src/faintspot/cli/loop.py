@@ -207,7 +207,7 @@ def _number(text: str) -> float:
 
 def _report(folder: str) -> None:
     """Write the page of a folder of results."""
-    from faintspot.report.loop_page import write_loop_report
+    from faintspot.loop.report_page import write_loop_report
 
     page = Path(folder) / "report.html"
     write_loop_report(folder, page)

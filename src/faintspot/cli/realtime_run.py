@@ -78,13 +78,13 @@ def run(
     On sky, with and without, 50 frames each (NAME_marks says which):
       faintspot realtime run --interleave none,tv --every 50
     """
+    from faintspot import configuration
     from faintspot.realtime.commands import LENGTHY, commands_of
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.interleaving import Interleaving
     from faintspot.realtime.live import parse_subapertures
     from faintspot.realtime.scheduling import real_time
-    from faintspot.sensor import configuration
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     processors = parse_subapertures(cpus) if cpus else None
@@ -107,7 +107,7 @@ def run(
         for line in refused:
             click.echo(f"not permitted, going on without: {line}", err=True)
         click.echo(
-            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator}; waiting for frames, "
+            f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
             "Ctrl-C stops"
         )
         with stop_on_signal() as stop:

@@ -8,8 +8,8 @@ import click
 
 from faintspot.errors import InputError
 from faintspot.io.locations import split_location
-from faintspot.loop.recognise import holds_loop_results
-from faintspot.study.recognise import study_attributes
+from faintspot.loop.stored_results import holds_loop_results
+from faintspot.study.stored_results import study_attributes
 
 
 @click.command(short_help="Make a web page of pictures and tables from slopes, a study or a loop.")
@@ -49,7 +49,7 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
     for name in frames:
         split_location(name)  # refuses what is not there
     if len(paths) == 1 and holds_loop_results(paths[0]):
-        from faintspot.report.loop_page import write_loop_report
+        from faintspot.loop.report_page import write_loop_report
 
         page = Path(output) if output is not None else paths[0] / "report.html"
         write_loop_report(paths[0], page)

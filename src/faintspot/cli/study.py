@@ -164,7 +164,7 @@ def estimators(
       faintspot study estimators --quick
       faintspot study estimators -o estimators.zarr --table efficiency.md
     """
-    from faintspot.report.pictures import write_file
+    from faintspot.report.files import write_file
     from faintspot.study import estimators as study_of_estimators
     from faintspot.study.efficiency import markdown
 

@@ -14,6 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from faintspot import configuration
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.frames import open_frames
@@ -26,7 +27,6 @@ from faintspot.planner.photometry import (
     ZERO_POINTS,
 )
 from faintspot.planner.question import PROFILES
-from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 

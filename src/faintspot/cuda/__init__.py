@@ -1,4 +1,4 @@
-"""Slopes on an NVIDIA GPU: the work of `faintspot.kernels.fused`, a warp of 32 threads per sub-aperture.
+"""Slopes on an NVIDIA GPU: the work of `faintspot.kernels.gravity`, a warp of 32 threads per sub-aperture.
 
 `SlopePipeline(..., device="cuda")` measures frames that lie in the host's memory. For more than that:
 

@@ -26,17 +26,36 @@ from faintspot.cuda.flat_start import pitch_of
 from faintspot.cuda.gather import make_fill, make_gather, make_recall, make_share, make_smooth
 from faintspot.cuda.strips import WARP, Strips, strips_of
 from faintspot.cuda.total_variation import make_denoise
-from faintspot.kernels import fused as cpu
+from faintspot.kernels.gravity import (
+    DENOISE,
+    FLOOR,
+    INFEASIBLE_STRENGTH,
+    LEVEL,
+    LIMIT,
+    NOT_CONVERGED,
+    RANK,
+    SMOOTH,
+    STRENGTH,
+    SUBTRACT,
+    TOLERANCE,
+)
+from faintspot.kernels.groups import (
+    BAD_PIXELS,
+    ERROR_SCALE,
+    EXCESS,
+    MOST_BAD,
+    NO_LIGHT,
+    RANGE,
+    SATURATED,
+    TOO_MANY_BAD_PIXELS,
+    VARIANCE,
+    ZERO_X,
+    ZERO_Y,
+)
 
 WARPS = 1 if simulated() else 2  # in a block; the twins of the simulator know of one
 FEWEST_BLOCKS = 1 if simulated() else 128  # Numba warns of fewer; those without a sub-aperture end at once
 
-NO_LIGHT, TOO_MANY_BAD_PIXELS, BAD_PIXELS = cpu.NO_LIGHT, cpu.TOO_MANY_BAD_PIXELS, cpu.BAD_PIXELS
-SATURATED, INFEASIBLE_STRENGTH, NOT_CONVERGED = cpu.SATURATED, cpu.INFEASIBLE_STRENGTH, cpu.NOT_CONVERGED
-ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE = cpu.ZERO_X, cpu.ZERO_Y, cpu.RANGE, cpu.MOST_BAD, cpu.VARIANCE
-EXCESS, ERROR_SCALE, STRENGTH, TOLERANCE = cpu.EXCESS, cpu.ERROR_SCALE, cpu.STRENGTH, cpu.TOLERANCE
-LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = cpu.LIMIT, cpu.RANK, cpu.SUBTRACT, cpu.FLOOR, cpu.LEVEL
-SMOOTH, DENOISE = cpu.SMOOTH, cpu.DENOISE
 
 # Rows of the kernel's results (n_rows, n_frames, n_subapertures): float32, and int32.
 X, Y, FLUX, ERROR_X, ERROR_Y = range(5)

@@ -24,16 +24,13 @@ from faintspot.cuda.fused import (
 )
 from faintspot.cuda.strips import WARP
 from faintspot.errors import InputError
-from faintspot.estimate.total_variation import ALGORITHMS
+from faintspot.estimators.gravity import GravityPrepared
+from faintspot.estimators.registry import estimators
 
 if TYPE_CHECKING:
     from faintspot.preparation import Preparation
     from faintspot.sensor.calibration import Calibration
     from faintspot.sensor.layout import Layout
-    from faintspot.sensor.settings import Settings
-
-ESTIMATORS = ("cog", "smoothed", "thresholded")
-"""Estimators that run on the GPU."""
 
 MOST_FRAMES = 65535
 """In one launch: so many blocks CUDA counts along y."""
@@ -105,7 +102,6 @@ class DevicePipeline:
     Parameters
     ----------
     layout : Layout
-    settings : Settings
     calibration : Calibration
     preparation : Preparation
         The pipeline's tables.
@@ -116,20 +112,19 @@ class DevicePipeline:
         For an estimator that runs on the CPU only, and windows that are too large for a warp.
     """
 
-    def __init__(
-        self, layout: Layout, settings: Settings, calibration: Calibration, preparation: Preparation
-    ) -> None:
-        if preparation.estimator not in ESTIMATORS:
+    def __init__(self, layout: Layout, calibration: Calibration, preparation: Preparation) -> None:
+        prepared = preparation.prepared
+        if not preparation.estimator.runs_on_gpu or not isinstance(prepared, GravityPrepared):
+            able = ", ".join(repr(name) for name, kind in estimators().items() if kind.runs_on_gpu)
             raise InputError(
-                f'settings.estimator = {preparation.estimator!r}: device="cuda" runs '
-                f'{", ".join(map(repr, ESTIMATORS))}; use one of these or device="cpu"'
+                f'estimator = {preparation.estimator.name!r}: device="cuda" runs {able}; use one of these or '
+                'device="cpu"'
             )
         self.layout = layout
         self.calibration = calibration
         self._preparation = preparation
-        algorithm = ALGORITHMS[settings.algorithm]
-        flat = preparation.start.size > 0
-        self._kernel = slopes_kernel(layout.window, preparation.before, algorithm, flat)
+        flat = prepared.flat_start.size > 0
+        self._kernel = slopes_kernel(layout.window, prepared.before, prepared.algorithm, flat)
         height, line = layout.frame_shape
         if height * line > MOST_FRAME_PIXELS:
             raise InputError(
@@ -140,7 +135,7 @@ class DevicePipeline:
         self._places = cuda.to_device((layout.corners @ [line, 1]).astype(np.int32))
         maps = np.asarray(calibration.maps(layout.frame_shape), np.float32)
         self._maps = cuda.to_device(np.ascontiguousarray(maps.reshape(2, -1)))
-        self._taps = cuda.to_device(np.ascontiguousarray(preparation.taps, np.float32))
+        self._taps = cuda.to_device(np.ascontiguousarray(prepared.taps, np.float32))
         self._pivots = cuda.to_device(inverse_pivots(layout.window) if flat else np.zeros(1, np.float32))
         self._tables: tuple[NDArray[np.float32], Any] | None = None
         self._first_variants = cuda.to_device(np.zeros(1, np.int32))
@@ -254,7 +249,7 @@ class DevicePipeline:
 
     def _tables_on_device(self) -> Any:
         """The tables of settings, brought over anew only where there are new ones."""
-        tables = self._preparation.arguments()[0]
+        tables = self._preparation.settings
         if self._tables is None or self._tables[0] is not tables:
             self._tables = tables, cuda.to_device(np.ascontiguousarray(tables, np.float32))
         return self._tables[1]

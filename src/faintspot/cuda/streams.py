@@ -14,7 +14,8 @@ from numpy.typing import DTypeLike
 from faintspot.cuda.availability import simulated
 from faintspot.cuda.measuring import DevicePipeline, Results
 from faintspot.errors import InputError
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Slopes
 
 
 class FrameStream:

@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import image_stack, numbers_between, one_of
 from faintspot.errors import InputError
-from faintspot.kernels.fused import subtract_stack
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
-from faintspot.sensor.settings import RULES
+from faintspot.kernels.stacks import subtract_stack
+
+RULES = ("subtract_next", "threshold", "subtract_kth")
 
 
 def most_kept(pixels: int, rule: str) -> int:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import image_stack
-from faintspot.kernels.fused import centroid_stack
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
+from faintspot.kernels.stacks import centroid_stack
 
 
 def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:

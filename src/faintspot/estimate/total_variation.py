@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.checks import image_stack, number_between, numbers_between, one_of
 from faintspot.errors import InputError
 from faintspot.kernels.flat_start import NO_TABLE, flat_start_table
-from faintspot.kernels.fused import denoise_stack
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
+from faintspot.kernels.stacks import denoise_stack
 from faintspot.kernels.total_variation import CHAMBOLLE, FGP
 from faintspot.presets import PRESETS, of_denoising, starts_flat
 

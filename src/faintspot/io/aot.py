@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import one_of
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.io.slopes_format import output_errors
+from faintspot.files import write_atomically
 from faintspot.io.telemetry import Telemetry
 
 # The standard wants both, and a sensor alone has neither.
@@ -66,13 +66,7 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", _EXPECTED)
         file = AOTFITSWriter(_system(telemetry, ao_mode)).get_hdulist()
-    unfinished = target.with_name(f".{target.name}.new")
-    with output_errors(target):
-        try:
-            file.writeto(unfinished, overwrite=True)
-            unfinished.rename(target)
-        finally:
-            unfinished.unlink(missing_ok=True)
+    write_atomically(target, file.writeto)
 
 
 def _system(telemetry: Telemetry, ao_mode: str) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError
+from faintspot.files import output_errors
 from faintspot.io import slopes_export as export
 from faintspot.io.locations import one_line
 from faintspot.io.slopes_file import (
@@ -33,7 +34,6 @@ from faintspot.io.slopes_format import (
     belongs_to_another_run,
     exists_already,
     json_values,
-    output_errors,
 )
 
 _Export = Callable[[IO[bytes], StoredSlopes], None]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import output_errors, replace_file
 from faintspot.io.slopes_format import (
     VARIABLES,
     Run,
@@ -26,9 +27,7 @@ from faintspot.io.slopes_format import (
     belongs_to_another_run,
     checked_block,
     exists_already,
-    output_errors,
     with_absent,
-    write_atomically,
 )
 
 _RUN = "run.json"
@@ -71,7 +70,7 @@ class FileWriter:
                     stream.seek(start * self._run.n_subapertures * array.itemsize)
                     stream.write(np.ascontiguousarray(array).data)
             finished = start + len(arrays["x"])
-            write_atomically(self._folder / _COUNTER, str(finished))
+            replace_file(self._folder / _COUNTER, str(finished))
         self._finished = finished
 
     def close(self) -> None:
@@ -109,7 +108,7 @@ class FileWriter:
             "attributes": self._run.attributes,
             "coordinates": {name: values.tolist() for name, values in self._run.coordinates.items()},
         }
-        write_atomically(self._folder / _RUN, json.dumps(description))
+        replace_file(self._folder / _RUN, json.dumps(description))
 
 
 class FinishedWriter:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import output_errors as output_errors
 
 
 @dataclass(frozen=True)
@@ -152,34 +150,6 @@ def with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
         else found[name]
         for name, variable in VARIABLES.items()
     }
-
-
-@contextlib.contextmanager
-def output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError while writing into one line that says what to do."""
-    advice = {
-        errno.ENOSPC: "the disk is full: free some space and run again, what is finished is kept",
-        errno.EDQUOT: "the disk quota is used up: free some space and run again, what is finished is kept",
-        errno.EACCES: "no permission to write there: choose another folder",
-        errno.EPERM: "no permission to write there: choose another folder",
-        errno.EROFS: "the file system is read-only: choose another folder",
-    }
-    try:
-        yield
-    except OSError as error:
-        reason = advice.get(error.errno or 0, f"{error.strerror or error}: choose another name")
-        raise InputError(f"{path}: cannot be written: {reason}") from None
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a small file so that a reader sees the old or the new one, never a part."""
-    temporary = path.with_name(f".{path.name}.new")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def json_values(name: str, value: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import output_errors, replace_file
 from faintspot.io.locations import one_line
 from faintspot.io.slopes_format import (
     COORDINATE_UNITS,
@@ -27,9 +28,7 @@ from faintspot.io.slopes_format import (
     belongs_to_another_run,
     checked_block,
     exists_already,
-    output_errors,
     with_absent,
-    write_atomically,
 )
 from faintspot.io.zarr_files import is_store, zarr
 
@@ -213,4 +212,4 @@ def _replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
     """Change attributes of the group in one step, which the store's own setter does not promise."""
     metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)
-    write_atomically(path / "zarr.json", json.dumps(metadata, indent=2))
+    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import output_errors, replace_file
 from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
-from faintspot.io.slopes_format import VARIABLES, output_errors, write_atomically
+from faintspot.io.slopes_format import VARIABLES
 from faintspot.io.zarr_files import is_store, zarr
 
 FORMAT = "faintspot telemetry"
@@ -260,4 +261,4 @@ def _replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
     """Change attributes of the group in one step, which the store's own setter does not promise."""
     metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)
-    write_atomically(path / "zarr.json", json.dumps(metadata, indent=2))
+    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))

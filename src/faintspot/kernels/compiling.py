@@ -15,7 +15,11 @@ def _kernels_stamp() -> tuple[tuple[float, int], ...]:
     """Modification time and size of every source file that a kernel may have inlined."""
     package = Path(__file__).parent.parent
     sources = sorted([*package.glob("kernels/*.py"), package / "checks.py", package / "flags.py"])
-    return tuple((source.stat().st_mtime, source.stat().st_size) for source in sources)
+    return tuple(_stamp(source) for source in sources)
+
+
+def _stamp(source: Path) -> tuple[float, int]:
+    return source.stat().st_mtime, source.stat().st_size
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -37,12 +41,18 @@ def compiled(function: Callable[..., Any]) -> Any:
     return _dispatcher(function, _nrt=False)
 
 
+def compiled_with(function: Callable[..., Any], source: str) -> Any:
+    """Compile as `compiled` does a function that calls one of another package, whose source file is given."""
+    inside = Path(source).is_relative_to(Path(__file__).parent)
+    return _dispatcher(function, () if inside else (Path(source),), _nrt=False)
+
+
 def allocating(function: Callable[..., Any]) -> Any:
     """Compile as `compiled` does what makes arrays."""
     return _dispatcher(function)
 
 
-def _dispatcher(function: Callable[..., Any], **options: Any) -> Any:
+def _dispatcher(function: Callable[..., Any], others: tuple[Path, ...] = (), **options: Any) -> Any:
     """Compile with a cache that asks for all kernels' sources.
 
     Numba's cache asks only whether a function's own file has changed, but kernels inline each other across
@@ -51,7 +61,7 @@ def _dispatcher(function: Callable[..., Any], **options: Any) -> Any:
     dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if cache_file is not None and hasattr(cache_file, "_source_stamp"):
-        cache_file._source_stamp = _kernels_stamp()
+        cache_file._source_stamp = _kernels_stamp() + tuple(_stamp(path) for path in others)
     return dispatcher
 
 

@@ -1,24 +1,41 @@
-"""From frames to slopes with estimators that know the spot: weighted, matched, ml, map and trained."""
+"""Estimators that know the spot: the own kernels of weighted, fitted, posterior and score estimators."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from faintspot.flags import SubapertureFlag
-from faintspot.kernels import fused, spot_numbers
+from faintspot.kernels import groups, spot_numbers
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.fused import NO_LIGHT, TOO_MANY_BAD_PIXELS, prepare_group, store_stage, within
+from faintspot.kernels.groups import (
+    COMMON_ROWS,
+    EXCESS,
+    NO_LIGHT,
+    RANGE,
+    TOO_MANY_BAD_PIXELS,
+    VARIANCE,
+    ZERO_X,
+    driver_of,
+)
+from faintspot.kernels.host import aligned_zeros
 from faintspot.kernels.likelihood import fit_group
 from faintspot.kernels.posterior import posterior_of_group
-from faintspot.kernels.simd import load, rounded, splat, store, width_of
+from faintspot.kernels.simd import Lanes, load, rounded, splat, store, width_of
 from faintspot.kernels.smoothing import gather_taps
 from faintspot.kernels.start import LEAST_LIGHT_E, find_start
 from faintspot.kernels.trained import apply_score
 from faintspot.kernels.weighted import weigh_group
 
-WEIGHTED, FITTED, POSTERIOR, TRAINED = range(4)
-"""What is done to the calibrated images."""
+# Rows of the settings' table that follow the common ones: light that is expected; weights of a fit; prior.
+FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)
+# Which model and which table of the light's; see `spot_numbers`; errors of a score; light of likely outliers.
+MODEL, KIND, START_LIGHT, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_LIGHT = range(
+    COMMON_ROWS + 5, COMMON_ROWS + 13
+)
+SETTING_ROWS = COMMON_ROWS + 13
 
 OUTLIER_LIKELY = int(SubapertureFlag.OUTLIER_LIKELY)
 LEAST_SIGNIFICANCE = 1.0
@@ -30,180 +47,244 @@ _SURELY = 3.0  # standard deviations
 _BROAD = 0.5  # standard deviation, in units of the grid's spacing, above which sums over the grid are good
 
 
-@compiled
-def locate_groups(
-    lanes: Any,
-    frames: Any,
-    corners: Any,
-    ny: Any,
-    nx: Any,
-    calibration: Any,
-    saturation: Any,
-    tables: Any,
-    variants: Any,
-    prior: Any,
-    method: Any,
-    steps: Any,
-    from_peak: Any,
-    round_electrons: Any,
-    taps: Any,
-    model: Any,
-    posterior: Any,
-    score: Any,
-    start: Any,
-    stop: Any,
-    scratch: Any,
-    slopes: Any,
-    stages: Any,
-) -> None:
-    """Compute the slopes of the groups [start, stop) of a block of frames.
+class ModelTables(NamedTuple):
+    """What the kernels read that follow a profile: of weighted and fitted estimators."""
 
-    Parameters that are not listed here are those of `fused.slopes_of_groups`.
+    steps: Any
+    round_electrons: Any
+    """Whether images are rounded to whole electrons."""
+    taps: Any
+    """(n_subapertures, 2, 1 + reach) float32: of the smoothing that finds the start."""
+    model: Any
+    """(n_models, 2, rank, 2, PHASES, length) float32: see `profiles.look_up`."""
 
-    Parameters
-    ----------
-    prior : (1 or n_frames, 2, n_subapertures) float32
-        Predicted x and y, px from the reference position.
-    method : int
-        WEIGHTED, FITTED, POSTERIOR or TRAINED.
-    steps : int
-        Of the fit or of the weighted centre of gravity.
-    from_peak : bool
-        Whether to begin with the smoothed image's peak instead of the predicted position.
-    round_electrons : bool
-        Whether images are rounded to whole electrons.
-    taps : (n_subapertures, 2, 1 + reach) float32
-        Of the smoothing that finds the start.
-    model : (n_models, 2, rank, 2, PHASES, length) float32
-        See `profiles.look_up`.
-    posterior : tuple
-        tables, constants, grid, spacing of `posterior_of_group`.
-    score : tuple
-        tables, steps_per_px, margin of `apply_score`.
-    scratch : tuple of arrays, from `new_scratch` in `spot_scratch`
-    """
-    width = width_of(lanes)
-    image, smoothed, lane_taps, numbers, profiles, rows, values, lane_counts = scratch
-    starts, models, kinds = (
-        lane_counts[:width],
-        lane_counts[width : 2 * width],
-        lane_counts[2 * width : 3 * width],
+
+class PosteriorTables(NamedTuple):
+    """What the kernel reads that begins at the posterior's mean."""
+
+    fit: Any
+    """ModelTables; without taps."""
+    logarithms: Any
+    """As `constants`, `grid` and `spacing`: see `posterior_of_group`."""
+    constants: Any
+    grid: Any
+    spacing: Any
+
+
+class ScoreTables(NamedTuple):
+    """What the kernel of a trained score reads."""
+
+    passes: Any
+    from_peak: Any
+    """Whether to begin with the smoothed image's peak instead of the predicted position."""
+    taps: Any
+    score: Any
+    """As `steps_per_px` and `margin`: see `apply_score`."""
+    steps_per_px: Any
+    margin: Any
+
+
+class SpotScratch(NamedTuple):
+    """Memory of one thread."""
+
+    taps: Any
+    numbers: Any
+    profiles: Any
+    rows: Any
+    logarithms: Any
+    starts: Any
+    models: Any
+    kinds: Any
+
+
+def spot_scratch(
+    lanes: Lanes, ny: int, nx: int, rank: int = 1, taps: int = 1, positions: int = 0
+) -> SpotScratch:
+    """Return the kernels' own memory, for models of a rank, a number of taps and of a grid's positions."""
+    width = lanes.width
+    vectors = -(-nx // width)
+    padded = -(-max(ny, nx) // width) * width
+    return SpotScratch(
+        aligned_zeros(2 * taps * width, lanes.dtype),
+        aligned_zeros(spot_numbers.LANE_ROWS * width, lanes.dtype),
+        aligned_zeros(4 * rank * padded * width, lanes.dtype).reshape(2, rank, 2, padded, width),
+        aligned_zeros(ny * vectors * width * width, lanes.dtype).reshape(ny, vectors, width, width),
+        np.zeros(positions),
+        *(np.zeros(width, np.int64) for _ in range(3)),
     )
-    flags, bad_counts = lane_counts[3 * width : 4 * width], lane_counts[4 * width :]
-    n = corners.shape[0]
-    n_groups = (n + width - 1) // width
-    for item in range(start, stop):
-        f, group = item // n_groups, item % n_groups
-        first = group * width
-        settings = tables[variants[f]]
-        prepare_group(
-            lanes,
-            frames,
-            f,
-            group,
-            corners,
-            ny,
-            nx,
-            calibration,
-            saturation,
-            settings,
-            image,
-            smoothed,
-            starts,
-            flags,
-            bad_counts,
-            numbers,
-        )
-        for stage in range(stages.shape[0]):
-            store_stage(width, image, stages[stage, f], first)
-        if round_electrons:
-            for i in range(ny * nx):
-                store(image, i * width, rounded(load(lanes, image, i * width)))
-        predicted = prior[min(f, prior.shape[0] - 1)]
-        _read_settings(width, first, ny, nx, settings, predicted, models, kinds, numbers)
-        if from_peak:
-            gather_taps(width, first, taps, lane_taps)
-            find_start(lanes, image, ny, nx, taps.shape[2] - 1, lane_taps, smoothed, numbers)
-        if method in (TRAINED, POSTERIOR):
-            _expect_light(width, first, settings, numbers)
-        if method == TRAINED:
-            apply_score(lanes, image, ny, nx, score[0], kinds, score[1], score[2], numbers, starts, rows)
-            _sum_light(lanes, image, ny, nx, first, settings, numbers)
-        elif method == WEIGHTED:
-            weigh_group(lanes, image, ny, nx, model, models, steps, numbers, starts, profiles)
-        else:
-            if method == POSTERIOR:
-                _begin_at_posterior_mean(
-                    lanes, image, ny, nx, posterior, kinds, numbers, starts, rows, values
-                )
-            _set_weights(width, first, settings, numbers)
-            fit_group(lanes, image, ny, nx, model, models, steps, numbers, starts, profiles)
-            if method == POSTERIOR:
-                _keep_broad_posteriors(width, numbers)
-        for lane in range(min(width, n - first)):
-            _store_slope(
-                width, lane, f, first + lane, method, steps, settings, numbers, flags, bad_counts, slopes
-            )
 
 
 @compiled
-def _read_settings(
-    width: Any,
-    first: Any,
-    ny: Any,
-    nx: Any,
-    settings: Any,
-    predicted: Any,
-    models: Any,
-    kinds: Any,
-    numbers: Any,
-) -> None:
+def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Follow the spots of a group with a weight."""
+    own = scratch.own
+    _begin(group, scratch)
+    _begin_at_peak(group, tables.taps, scratch)
+    weigh_group(
+        group.lanes,
+        scratch.image,
+        group.ny,
+        group.nx,
+        tables.model,
+        own.models,
+        tables.steps,
+        own.numbers,
+        own.starts,
+        own.profiles,
+    )
+    _finish(group, tables.steps, False, scratch)
+
+
+@compiled
+def locate_fitted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Fit position and light of the spots of a group."""
+    _round(group, tables.round_electrons, scratch.image)
+    _begin(group, scratch)
+    _begin_at_peak(group, tables.taps, scratch)
+    _fit(group, tables, scratch)
+    _finish(group, tables.steps, False, scratch)
+
+
+@compiled
+def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Fit the spots of a group from the posterior's mean, which stays where the posterior is broad."""
+    own = scratch.own
+    _round(group, tables.fit.round_electrons, scratch.image)
+    _begin(group, scratch)
+    _expect_light(group, own.numbers)
+    posterior_of_group(
+        group.lanes,
+        scratch.image,
+        group.ny,
+        group.nx,
+        tables.logarithms,
+        tables.constants,
+        tables.grid,
+        tables.spacing,
+        own.kinds,
+        own.numbers,
+        own.starts,
+        own.rows,
+        own.logarithms,
+    )
+    width = width_of(group.lanes)
+    for axis in range(2):
+        mean = load(group.lanes, own.numbers, (spot_numbers.MEAN_X + axis) * width)
+        store(own.numbers, (spot_numbers.X + axis) * width, mean)
+    _fit(group, tables.fit, scratch)
+    _keep_broad_posteriors(width, own.numbers)
+    _finish(group, tables.fit.steps, True, scratch)
+
+
+@compiled
+def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Apply a trained score to the spots of a group."""
+    own = scratch.own
+    _begin(group, scratch)
+    if tables.from_peak:
+        _begin_at_peak(group, tables.taps, scratch)
+    _expect_light(group, own.numbers)
+    apply_score(
+        group.lanes,
+        scratch.image,
+        group.ny,
+        group.nx,
+        tables.score,
+        own.kinds,
+        tables.steps_per_px,
+        tables.margin,
+        own.numbers,
+        own.starts,
+        own.rows,
+    )
+    _sum_light(group, scratch.image, own.numbers)
+    _finish(group, tables.passes, True, scratch)
+
+
+@compiled
+def _round(group: Any, round_electrons: Any, image: Any) -> None:
+    """Round images to whole electrons, where that is asked for."""
+    width = width_of(group.lanes)
+    if round_electrons:
+        for i in range(group.ny * group.nx):
+            store(image, i * width, rounded(load(group.lanes, image, i * width)))
+
+
+@compiled
+def _begin(group: Any, scratch: Any) -> None:
     """Copy what the lanes' sub-apertures are set to; the position is the predicted one at first."""
+    width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
+    numbers = own.numbers
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        models[lane], kinds[lane] = int(settings[fused.MODEL, s]), int(settings[fused.KIND, s])
+        own.models[lane], own.kinds[lane] = int(settings[MODEL, s]), int(settings[KIND, s])
         for axis in range(2):
-            half = 0.5 * (nx if axis == 0 else ny)
-            zero, reach = settings[fused.ZERO_X + axis, s], settings[fused.RANGE, s]
+            half = 0.5 * (group.nx if axis == 0 else group.ny)
+            zero, reach = settings[ZERO_X + axis, s], settings[RANGE, s]
             # The window is where a spot can be; half a pixel remains of a range that lies outside.
             low = min(max(zero - reach, -half), half - 0.5)
             high = max(min(zero + reach, half), low)
-            place = zero + predicted[axis, s]
+            place = zero + group.predicted[axis, s]
             numbers[(spot_numbers.LOW_X + 2 * axis) * width + lane] = low
             numbers[(spot_numbers.HIGH_X + 2 * axis) * width + lane] = high
             numbers[(spot_numbers.PRIOR_X + axis) * width + lane] = place
             numbers[(spot_numbers.X + axis) * width + lane] = min(max(place, low), high)
-        numbers[spot_numbers.VARIANCE * width + lane] = max(settings[fused.VARIANCE, s], 0.0)
-        numbers[spot_numbers.EXCESS * width + lane] = settings[fused.EXCESS, s]
-        numbers[spot_numbers.PRIOR_WEIGHT * width + lane] = settings[fused.PRIOR_WEIGHT, s]
-        numbers[spot_numbers.START_LIGHT * width + lane] = settings[fused.START_LIGHT, s]
-        numbers[spot_numbers.GAIN_X * width + lane] = settings[fused.GAIN_X, s]
-        numbers[spot_numbers.GAIN_Y * width + lane] = settings[fused.GAIN_Y, s]
+        numbers[spot_numbers.VARIANCE * width + lane] = max(settings[VARIANCE, s], 0.0)
+        numbers[spot_numbers.EXCESS * width + lane] = settings[EXCESS, s]
+        numbers[spot_numbers.PRIOR_WEIGHT * width + lane] = settings[PRIOR_WEIGHT, s]
+        numbers[spot_numbers.START_LIGHT * width + lane] = settings[START_LIGHT, s]
+        numbers[spot_numbers.GAIN_X * width + lane] = settings[GAIN_X, s]
+        numbers[spot_numbers.GAIN_Y * width + lane] = settings[GAIN_Y, s]
 
 
 @compiled
-def _set_weights(width: Any, first: Any, settings: Any, numbers: Any) -> None:
-    """Weights of the fit; the floor on them is a fraction of the light found so far."""
+def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
+    """Begin at the smoothed image's peak."""
+    lanes, own = group.lanes, scratch.own
+    gather_taps(width_of(lanes), group.first, taps, own.taps)
+    reach = taps.shape[2] - 1
+    find_start(lanes, scratch.image, group.ny, group.nx, reach, own.taps, scratch.spare, own.numbers)
+
+
+@compiled
+def _fit(group: Any, tables: Any, scratch: Any) -> None:
+    """Fit from where the lanes are; the floor on the weights is a fraction of the light found so far."""
+    width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
+    numbers = own.numbers
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        floor = settings[fused.WEIGHT_FLOOR, s] * numbers[spot_numbers.FLUX * width + lane]
+        floor = settings[WEIGHT_FLOOR, s] * numbers[spot_numbers.FLUX * width + lane]
         variance = numbers[spot_numbers.VARIANCE * width + lane] + floor
         numbers[spot_numbers.WEIGHT_VARIANCE * width + lane] = max(variance, SMALLEST_VARIANCE)
-        numbers[spot_numbers.WEIGHT_EXCESS * width + lane] = settings[fused.WEIGHT_EXCESS, s]
-        numbers[spot_numbers.MODEL_ERROR * width + lane] = settings[fused.MODEL_ERROR, s] ** 2
+        numbers[spot_numbers.WEIGHT_EXCESS * width + lane] = settings[WEIGHT_EXCESS, s]
+        numbers[spot_numbers.MODEL_ERROR * width + lane] = settings[MODEL_ERROR, s] ** 2
+    fit_group(
+        group.lanes,
+        scratch.image,
+        group.ny,
+        group.nx,
+        tables.model,
+        own.models,
+        tables.steps,
+        numbers,
+        own.starts,
+        own.profiles,
+    )
 
 
 @compiled
-def _expect_light(width: Any, first: Any, settings: Any, numbers: Any) -> None:
+def _expect_light(group: Any, numbers: Any) -> None:
     """Take the light that is expected for the light."""
+    width, first, settings = width_of(group.lanes), group.first, group.settings
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        numbers[spot_numbers.FLUX * width + lane] = max(settings[fused.FLUX, s], LEAST_LIGHT_E)
+        numbers[spot_numbers.FLUX * width + lane] = max(settings[FLUX, s], LEAST_LIGHT_E)
 
 
 @compiled
-def _sum_light(lanes: Any, image: Any, ny: Any, nx: Any, first: Any, settings: Any, numbers: Any) -> None:
+def _sum_light(group: Any, image: Any, numbers: Any) -> None:
     """Standard errors from the training, and the light that is seen in the whole window."""
+    lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
     total = zero
@@ -215,8 +296,8 @@ def _sum_light(lanes: Any, image: Any, ny: Any, nx: Any, first: Any, settings: A
     store(numbers, spot_numbers.SEEN * width, total)
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        numbers[spot_numbers.ERROR_X * width + lane] = settings[fused.TRAINED_ERROR_X, s]
-        numbers[spot_numbers.ERROR_Y * width + lane] = settings[fused.TRAINED_ERROR_Y, s]
+        numbers[spot_numbers.ERROR_X * width + lane] = settings[TRAINED_ERROR_X, s]
+        numbers[spot_numbers.ERROR_Y * width + lane] = settings[TRAINED_ERROR_Y, s]
         variance = numbers[spot_numbers.VARIANCE * width + lane]
         excess = numbers[spot_numbers.EXCESS * width + lane]
         seen = numbers[spot_numbers.SEEN * width + lane]
@@ -224,40 +305,6 @@ def _sum_light(lanes: Any, image: Any, ny: Any, nx: Any, first: Any, settings: A
             ny * nx * variance + excess * max(seen, 0.0)
         )
         numbers[spot_numbers.FLUX * width + lane] = seen
-
-
-@compiled
-def _is_lit(width: Any, lane: Any, s: Any, method: Any, settings: Any, numbers: Any) -> Any:
-    """Whether there is a spot: where its light is expected, not surely much less; else a significant one."""
-    seen = numbers[spot_numbers.SEEN * width + lane]
-    error = numbers[spot_numbers.SEEN_ERROR * width + lane]
-    if method in (TRAINED, POSTERIOR):
-        expected = settings[fused.FLUX, s]
-        return expected >= LEAST_LIGHT_E and seen + _SURELY * error > _LIT_FRACTION * expected
-    return seen >= LEAST_SIGNIFICANCE * error
-
-
-@compiled
-def _begin_at_posterior_mean(
-    lanes: Any,
-    image: Any,
-    ny: Any,
-    nx: Any,
-    posterior: Any,
-    kinds: Any,
-    numbers: Any,
-    starts: Any,
-    rows: Any,
-    values: Any,
-) -> None:
-    """Find the posterior's mean and spread; the fit begins at the mean."""
-    width = width_of(lanes)
-    tables, constants, grid, spacing = posterior
-    posterior_of_group(
-        lanes, image, ny, nx, tables, constants, grid, spacing, kinds, numbers, starts, rows, values
-    )
-    store(numbers, spot_numbers.X * width, load(lanes, numbers, spot_numbers.MEAN_X * width))
-    store(numbers, spot_numbers.Y * width, load(lanes, numbers, spot_numbers.MEAN_Y * width))
 
 
 @compiled
@@ -275,40 +322,45 @@ def _keep_broad_posteriors(width: Any, numbers: Any) -> None:
 
 
 @compiled
-def _store_slope(
-    width: Any,
-    lane: Any,
-    f: Any,
-    s: Any,
-    method: Any,
-    steps: Any,
-    settings: Any,
-    numbers: Any,
-    flags: Any,
-    bad_counts: Any,
-    slopes: Any,
-) -> None:
-    """Write one sub-aperture's result; the reference position (slope 0) where it is invalid."""
-    x, y, flux, flag, iterations, bad_pixels, error_x, error_y = slopes
-    bits = flags[lane]
-    errors = numbers[spot_numbers.ERROR_X * width + lane] + numbers[spot_numbers.ERROR_Y * width + lane]
-    light = numbers[spot_numbers.FLUX * width + lane]
-    if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
-        lit = _is_lit(width, lane, s, method, settings, numbers)
-        if not (errors < math.inf and lit and abs(light) < math.inf):
-            bits |= NO_LIGHT
-        elif light < settings[fused.LEAST_LIGHT, s]:
-            bits |= OUTLIER_LIKELY
-    valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
-    reach = settings[fused.RANGE, s]
-    place_x, place_y = numbers[spot_numbers.X * width + lane], numbers[spot_numbers.Y * width + lane]
-    x[f, s] = within(place_x - settings[fused.ZERO_X, s], reach) if valid else 0.0
-    y[f, s] = within(place_y - settings[fused.ZERO_Y, s], reach) if valid else 0.0
-    known = valid and settings[fused.VARIANCE, s] >= 0.0
-    scale = settings[fused.ERROR_SCALE, s]
-    error_x[f, s] = scale * numbers[spot_numbers.ERROR_X * width + lane] if known else math.inf
-    error_y[f, s] = scale * numbers[spot_numbers.ERROR_Y * width + lane] if known else math.inf
-    flux[f, s] = light if abs(light) < math.inf else 0.0
-    flag[f, s] = bits
-    iterations[f, s] = steps
-    bad_pixels[f, s] = bad_counts[lane]
+def _is_lit(width: Any, lane: Any, expected: Any, numbers: Any) -> Any:
+    """Whether there is a spot: where its light is expected, not surely much less; else a significant one."""
+    seen = numbers[spot_numbers.SEEN * width + lane]
+    error = numbers[spot_numbers.SEEN_ERROR * width + lane]
+    if expected >= 0.0:
+        return expected >= LEAST_LIGHT_E and seen + _SURELY * error > _LIT_FRACTION * expected
+    return seen >= LEAST_SIGNIFICANCE * error
+
+
+@compiled
+def _finish(group: Any, steps: Any, expects_light: Any, scratch: Any) -> None:
+    """Write the lanes' results, and the bits of their flags."""
+    width, settings, numbers, found = (
+        width_of(group.lanes),
+        group.settings,
+        scratch.own.numbers,
+        scratch.results,
+    )
+    for lane in range(width):
+        s = min(group.first + lane, settings.shape[1] - 1)
+        bits = scratch.flags[lane]
+        error_x = numbers[spot_numbers.ERROR_X * width + lane]
+        error_y = numbers[spot_numbers.ERROR_Y * width + lane]
+        light = numbers[spot_numbers.FLUX * width + lane]
+        if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
+            expected = settings[FLUX, s] if expects_light else np.float32(-1.0)
+            lit = _is_lit(width, lane, expected, numbers)
+            if not (error_x + error_y < math.inf and lit and abs(light) < math.inf):
+                bits |= NO_LIGHT
+            elif light < settings[LEAST_LIGHT, s]:
+                bits |= OUTLIER_LIKELY
+        scratch.flags[lane], scratch.iterations[lane] = bits, steps
+        found[groups.X * width + lane] = numbers[spot_numbers.X * width + lane]
+        found[groups.Y * width + lane] = numbers[spot_numbers.Y * width + lane]
+        found[groups.FLUX * width + lane] = light if abs(light) < math.inf else np.float32(0.0)
+        found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
+
+
+weighted_of_groups = driver_of(locate_weighted)
+fitted_of_groups = driver_of(locate_fitted)
+posterior_of_groups = driver_of(locate_posterior)
+scored_of_groups = driver_of(locate_scored)

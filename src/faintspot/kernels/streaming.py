@@ -6,19 +6,32 @@ inside the compiled code, without Python: nothing lies between the arrival of a 
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 from llvmlite import ir
 from numba.core import types
 
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.fused import slopes_of_groups
-from faintspot.kernels.located import locate_groups
+from faintspot.kernels.groups import copied
 from faintspot.kernels.simd import intrinsic
-from faintspot.kernels.thresholded import thresholded_slopes
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
+
+
+class Arrival(NamedTuple):
+    """How far a frame has arrived, as another process says it."""
+
+    cells: Any
+    """int64 array in shared memory."""
+    frame_cell: Any
+    """Where in it the number of the frame that arrives is."""
+    rows_cell: Any
+    """Where its rows so far are."""
+    control: Any
+    """int64 array: waiting ends when the number at `stop_cell` is not 0."""
+    stop_cell: Any
 
 
 @intrinsic
@@ -72,34 +85,33 @@ def wait_for_rows(
             return False
 
 
-@compiled
-def stream_gravity(
-    progress: Any,
-    frame_cell: Any,
-    rows_cell: Any,
+def measure(source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any) -> None:
+    """Stand for the compiled function that measures groups, which `streamed` puts in its place."""
+
+
+def stream_groups(
+    arrival: Any,
     frame: Any,
     last_rows: Any,
-    control: Any,
-    stop_cell: Any,
+    source: Any,
+    task: Any,
     start: Any,
     stop: Any,
-    before: Any,
-    after: Any,
+    scratch: Any,
+    slopes: Any,
+    stages: Any,
 ) -> Any:
-    """Measure the groups [start, stop) of a frame as centres of gravity while it arrives.
+    """Measure the groups [start, stop) of a frame while it arrives.
 
     Parameters
     ----------
-    progress : int64 array
-        In shared memory: at `frame_cell` the frame that arrives, at `rows_cell` its rows so far.
+    arrival : Arrival
     frame : int
         Number of the frame to measure.
     last_rows : (n_groups,) int64
         Rows of the frame that each group needs.
-    control : int64 array
-        Waiting ends when the number at `stop_cell` is not 0.
-    before, after : tuple
-        Arguments of `slopes_of_groups` before and after the range of groups.
+    source, task, scratch, slopes, stages
+        See `groups.measure_groups`.
 
     Returns
     -------
@@ -107,51 +119,21 @@ def stream_gravity(
         First group that was not measured: `stop` unless waiting was ended.
     """
     for item in range(start, stop):
-        if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
+        if not wait_for_rows(
+            arrival.cells,
+            arrival.frame_cell,
+            arrival.rows_cell,
+            frame,
+            last_rows[item],
+            arrival.control,
+            arrival.stop_cell,
+        ):
             return item
-        slopes_of_groups(*before, item, item + 1, *after)
+        measure(source, task, item, item + 1, scratch, slopes, stages)
     return stop
 
 
-@compiled
-def stream_located(
-    progress: Any,
-    frame_cell: Any,
-    rows_cell: Any,
-    frame: Any,
-    last_rows: Any,
-    control: Any,
-    stop_cell: Any,
-    start: Any,
-    stop: Any,
-    before: Any,
-    after: Any,
-) -> Any:
-    """As `stream_gravity`, with `locate_groups`."""
-    for item in range(start, stop):
-        if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
-            return item
-        locate_groups(*before, item, item + 1, *after)
-    return stop
-
-
-@compiled
-def stream_thresholded(
-    progress: Any,
-    frame_cell: Any,
-    rows_cell: Any,
-    frame: Any,
-    last_rows: Any,
-    control: Any,
-    stop_cell: Any,
-    start: Any,
-    stop: Any,
-    before: Any,
-    after: Any,
-) -> Any:
-    """As `stream_gravity`, with `thresholded_slopes`."""
-    for item in range(start, stop):
-        if not wait_for_rows(progress, frame_cell, rows_cell, frame, last_rows[item], control, stop_cell):
-            return item
-        thresholded_slopes(*before, item, item + 1, *after)
-    return stop
+@cache
+def streamed(kernel: Any) -> Any:
+    """Return `stream_groups` for a compiled function that measures groups; see `groups.copied`."""
+    return copied(stream_groups, kernel, measure=kernel)

@@ -1,19 +1,20 @@
 """Centres of gravity above a threshold, straight from the frame: one pass, W pixels of a row at once.
 
 No pixel waits for another here, so that nothing is copied and put side by side as for the denoiser. What has
-bad pixels is left to `fused`, which fills them.
+bad pixels is left to `gravity`, which fills them.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from faintspot.checks import LARGEST_FLOAT32
-from faintspot.kernels import fused
 from faintspot.kernels.compiling import compiled
+from faintspot.kernels.gravity import FLOOR, LEVEL, gravity_of_groups, lightless
+from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, Task, store_slope
 from faintspot.kernels.simd import (
     absolute,
     any_lane,
@@ -31,102 +32,52 @@ from faintspot.kernels.simd import (
 _WITHIN = 1.0 / 12.0  # of the light in a pixel, where in it is not known: px^2
 
 
+class RowTables(NamedTuple):
+    """What the kernel reads beside the settings."""
+
+    pixels: Any
+    """Lanes: of pixels in a row; their number divides nx."""
+    maps: Any
+    """(2, h, w) float32: dark and scale of every pixel of the frame."""
+    ramp: Any
+    """(nx,) float32: positions of a window's columns, px from its middle."""
+    gravity: Any
+    """GravityTables, for groups with bad pixels."""
+
+
 @compiled
-def thresholded_slopes(
-    pixels: Any,
-    maps: Any,
-    ramp: Any,
-    lanes: Any,
-    frames: Any,
-    corners: Any,
-    ny: Any,
-    nx: Any,
-    calibration: Any,
-    saturation: Any,
-    tables: Any,
-    variants: Any,
-    before: Any,
-    algorithm: Any,
-    table: Any,
-    taps: Any,
-    start: Any,
-    stop: Any,
-    scratch: Any,
-    slopes: Any,
-    stages: Any,
+def thresholded_in_rows(
+    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
 ) -> None:
-    """Compute the slopes of the groups [start, stop) of a block of frames.
-
-    Parameters that are not listed here are those of `fused.slopes_of_groups`, which does groups with bad
-    pixels.
-
-    Parameters
-    ----------
-    pixels : Lanes
-        Of pixels in a row; their number divides nx.
-    maps : (2, h, w) float32
-        Dark and scale of every pixel of the frame.
-    ramp : (nx,) float32
-        Positions of a window's columns, px from its middle.
-    """
-    width = width_of(lanes)
-    n = corners.shape[0]
+    """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
+    width = width_of(source.lanes)
+    n = source.corners.shape[0]
     n_groups = (n + width - 1) // width
     for item in range(start, stop):
         f, group = item // n_groups, item % n_groups
         first, last = group * width, min((group + 1) * width, n)
-        settings = tables[variants[f]]
+        settings = task.settings[task.variants[f]]
         whole = stages.shape[0] == 0
         for s in range(first, last):
-            done = _measure(pixels, frames, f, s, corners, ny, nx, maps, ramp, saturation, settings, slopes)
-            whole = whole and done
+            whole = _measure(source, task.tables, f, s, settings, slopes) and whole
         if whole:
             continue
-        fused.slopes_of_groups(
-            lanes,
-            frames,
-            corners,
-            ny,
-            nx,
-            calibration,
-            saturation,
-            tables,
-            variants,
-            before,
-            algorithm,
-            table,
-            taps,
-            item,
-            item + 1,
-            scratch,
-            slopes,
-            stages,
-        )
+        filled = Task(task.settings, task.variants, task.prior, task.tables.gravity)
+        gravity_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
         for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
-            _measure(pixels, frames, f, s, corners, ny, nx, maps, ramp, saturation, settings, slopes)
+            _measure(source, task.tables, f, s, settings, slopes)
 
 
 @compiled
-def _measure(
-    pixels: Any,
-    frames: Any,
-    f: Any,
-    s: Any,
-    corners: Any,
-    ny: Any,
-    nx: Any,
-    maps: Any,
-    ramp: Any,
-    saturation: Any,
-    settings: Any,
-    slopes: Any,
-) -> Any:
+def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: Any) -> Any:
     """Measure one sub-aperture; False, and nothing written, where it has bad pixels."""
+    frames, ny, nx, corners = source.frames, source.ny, source.nx, source.corners
+    pixels, maps, ramp = tables.pixels, tables.maps, tables.ramp
     width = width_of(pixels)
     height, line = frames.shape[1], frames.shape[2]
     corner = corners[s, 0] * line + corners[s, 1]
-    zero, threshold = splat(pixels, 0.0), splat(pixels, settings[fused.LEVEL, s])
-    v, e = splat(pixels, settings[fused.VARIANCE, s]), splat(pixels, settings[fused.EXCESS, s])
+    zero, threshold = splat(pixels, 0.0), splat(pixels, settings[LEVEL, s])
+    v, e = splat(pixels, settings[VARIANCE, s]), splat(pixels, settings[EXCESS, s])
     one = splat(pixels, 1.0)
     spoilt, brightest, largest = zero, splat(pixels, -math.inf), zero
     total, moment_x, moment_y = zero, zero, zero
@@ -174,23 +125,11 @@ def _measure(
         around = multiply_add(noise_y, here, noise_yy)
         around = multiply_add(noise, splat(pixels, position_y * position_y + _WITHIN), around)
         deviation_y = _root(sum_of(around)) * scale
-    bits = fused.SATURATED if any_lane(brightest >= splat(pixels, saturation)) else 0
-    slopes[4][f, s] = slopes[5][f, s] = 0
-    fused.store_centroid(
-        ny,
-        nx,
-        f,
-        s,
-        settings,
-        bits,
-        light,
-        largest_of(largest),
-        position_x,
-        position_y,
-        deviation_x,
-        deviation_y,
-        slopes,
-    )
+    bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
+    bits |= lightless(ny, nx, bits, light, settings[FLOOR, s] * largest_of(largest), position_x, position_y)
+    slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
+    slopes.flux[f, s] = light
+    store_slope(f, s, settings, position_x, position_y, deviation_x, deviation_y, bits, slopes)
     return True
 
 

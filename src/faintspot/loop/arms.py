@@ -18,7 +18,7 @@ from faintspot.loop.configuration import CLOSED, R0_WAVELENGTH_M, LoopConfigurat
 from faintspot.loop.record import Arm
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 Choice = Mapping[str, float]
 """Values of the parameters that are tuned, by name."""

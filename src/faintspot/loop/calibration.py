@@ -18,7 +18,7 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate.detector import Detector
 
 _BRIGHT_E = 1e6

@@ -19,7 +19,7 @@ from faintspot.loop.results import InterleavedResult, set_file
 from faintspot.loop.running import Advance, Unit, UnitStore, Workplace, run_units
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.tuning import FIRST_TUNING_REALISATION
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 KIND = "interleaved"
 Arrays = dict[str, NDArray[Any]]

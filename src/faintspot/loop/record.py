@@ -13,7 +13,7 @@ from faintspot.errors import InputError
 from faintspot.loop.files import load_fields, save_fields
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 
 @dataclass(frozen=True, eq=False)

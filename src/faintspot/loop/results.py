@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.loop.files import FORMAT, load_fields, make_folder, save_fields, write_atomically
-from faintspot.loop.recognise import BUDGET_FILE as BUDGET_FILE
-from faintspot.loop.recognise import INTERLEAVED_FILE as INTERLEAVED_FILE
-from faintspot.loop.recognise import MAGNITUDE_FILE as MAGNITUDE_FILE
 from faintspot.loop.record import LoopRecord
+from faintspot.loop.stored_results import BUDGET_FILE as BUDGET_FILE
+from faintspot.loop.stored_results import INTERLEAVED_FILE as INTERLEAVED_FILE
+from faintspot.loop.stored_results import MAGNITUDE_FILE as MAGNITUDE_FILE
 
 Floats = NDArray[np.float64]
 

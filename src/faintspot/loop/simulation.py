@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot import configuration as configuration_file
 from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
@@ -25,8 +26,8 @@ from faintspot.loop.mirror import DeformableMirror, make_mirror
 from faintspot.loop.record import Arm, LoopRecord
 from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pupil
 from faintspot.loop.wavefront_sensor import ShackHartmann, make_sensor
-from faintspot.pipeline import SlopePipeline, Slopes
-from faintspot.sensor import configuration as configuration_file
+from faintspot.pipeline import SlopePipeline
+from faintspot.slopes import Slopes
 
 _MOST_ARMS = 127
 

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from faintspot import configuration
 from faintspot.planner.arms import SPOT, Arm
 from faintspot.planner.curves import Curve
 from faintspot.planner.question import Question
-from faintspot.sensor import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.study.metric import Estimate, SlopeStatistics
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class Answer:
         MissingExtraError
             Without matplotlib.
         """
-        from faintspot.report.tune_figure import tune_figure
+        from faintspot.planner.figure import tune_figure
 
         return tune_figure(self)
 

@@ -14,7 +14,7 @@ from faintspot.estimate.noise import suggested_strength
 from faintspot.planner.question import Question
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 NOTHING, WIDTH, SPOT = 0, 1, 2
 KNOWLEDGE = ("noise only", "spot width", "the spot itself")

@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from faintspot import configuration
 from faintspot.errors import InputError
-from faintspot.sensor import configuration
 from faintspot.sensor.layout import Layout
 
 TABLES = {

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao
-from faintspot.pipeline import Slopes
 from faintspot.planner.answer import Answer, ArmResult
 from faintspot.planner.arms import ARMS, Arm, Choice, Workshop
 from faintspot.planner.curves import Curve, limiting_flux, magnitude_gain
@@ -21,6 +20,7 @@ from faintspot.planner.question import Question
 from faintspot.planner.scene import Sample, Scene
 from faintspot.sensor.score import TrainedScore
 from faintspot.simulate.generators import spawn
+from faintspot.slopes import Slopes
 from faintspot.study.metric import Estimate, SlopeStatistics, absolute_errors, slope_statistics
 from faintspot.training.simulation import CLASS_WIDTH, train_estimator
 

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate.generators import spawn
 from faintspot.simulate.spots import spots
 from faintspot.simulate.turbulence import speckled_spots
+from faintspot.slopes import Slopes
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from faintspot.planner.answer import Answer, ArmResult
 from faintspot.planner.arms import SPOT
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.study.metric import Estimate
 
 _SHOWN: tuple[str, ...] = (

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from faintspot.configuration import to_text
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.engine_modules import EngineModules
@@ -20,8 +21,7 @@ from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
 from faintspot.realtime.workers import Workers
-from faintspot.sensor.configuration import to_text
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher
 _LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer
@@ -127,7 +127,7 @@ class Engine:
             "preparing": self.live.preparing,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
-            "estimator": self.live.settings.estimator,
+            "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
             "arms": self.interleaving.labels,
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},

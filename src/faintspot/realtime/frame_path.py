@@ -14,20 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.kernels import fused, located, streaming, thresholded
 from faintspot.kernels.compiling import Direct
+from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import WIDTHS, lanes_for
-from faintspot.kernels.parallel import new_scratch, new_spot_scratch
-from faintspot.pipeline import RESULT_TYPES, SlopePipeline, Slopes
-from faintspot.preparation import METHODS
+from faintspot.kernels.streaming import Arrival, streamed
+from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.workers import Workers
+from faintspot.slopes import RESULT_TYPES, Slopes
 
 STOP_CELL = 0
-_STREAMED = {
-    fused.slopes_of_groups: streaming.stream_gravity,
-    located.locate_groups: streaming.stream_located,
-    thresholded.thresholded_slopes: streaming.stream_thresholded,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +64,12 @@ class _Groups:
     ) -> None:
         self._groups, self._shares = groups, shares
         self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
-        variants = np.zeros(1, np.int64)
-        made = [pipeline.kernel_call(slot[None], slot.dtype, variants) for slot in slots]
-        self._before = [arguments for _, arguments, _ in made]
-        kernel, _, shape = made[0]
-        self._kernel = Direct(_STREAMED[kernel])
+        task = pipeline.preparation.task(np.zeros(1, np.int64))
+        self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
+        self._kernel = Direct(streamed(pipeline.preparation.prepared.kernel))
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
-        self._scratch = [
-            new_scratch(lanes, *window) if shape is None else new_spot_scratch(lanes, *window, *shape)
-            for _ in range(shares)
-        ]
+        own_scratch = pipeline.preparation.own_scratch
+        self._scratch = [new_scratch(lanes, *window, own_scratch(lanes, *window)) for _ in range(shares)]
 
     def measure(
         self,
@@ -93,18 +84,10 @@ class _Groups:
         first, last = self._groups
         start = first + (last - first) * share // self._shares
         stop = first + (last - first) * (share + 1) // self._shares
+        arrival = Arrival(progress.cells, progress.frame_cell, progress.rows_cell, control, STOP_CELL)
+        scratch = self._scratch[share]
         done: int = self._kernel(
-            progress.cells,
-            progress.frame_cell,
-            progress.rows_cell,
-            number,
-            self._last_rows,
-            control,
-            STOP_CELL,
-            start,
-            stop,
-            self._before[slot],
-            (self._scratch[share], *after),
+            arrival, number, self._last_rows, *self._work[slot], start, stop, scratch, *after
         )
         return done == stop
 
@@ -141,18 +124,18 @@ class FramePath:
         self._slots = len(slots)
         self._shares = 1 + (0 if workers is None else workers.count)
         n, pixels = len(pipeline.layout), pipeline.layout.pixels
-        results = tuple(np.zeros((1, n), dtype) for dtype in RESULT_TYPES)
+        results = SlopeArrays(*(np.zeros((1, n), dtype) for dtype in RESULT_TYPES))
         self.slopes = Slopes(*(result[0] for result in results))
         """Of the frame measured last; overwritten by the next one."""
-        self._stages = np.zeros((fused.STAGE_ROWS, 1, n, pixels), np.float32)
+        self._stages = np.zeros((STAGE_ROWS, 1, n, pixels), np.float32)
         self.fault: str | None = None
         """Nothing of its own can fail; see `ModularPath`."""
         self._control = np.zeros(1, np.int64)
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide
         # What is left over is measured in a narrower group where that is faster: its rows come last.
-        gravity = pipeline.settings.estimator not in METHODS
-        narrow = [width for width in WIDTHS if rest <= width < wide] if rest and gravity else []
+        faster = rest > 0 and pipeline.preparation.prepared.fewer_lanes_are_faster
+        narrow = [width for width in WIDTHS if rest <= width < wide] if faster else []
         self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares)
         self._narrow = None
         if narrow:
@@ -165,7 +148,7 @@ class FramePath:
     @property
     def denoised(self) -> NDArray[np.float32]:
         """Denoised images of the frame that was measured last with its stages, (n, ny, nx)."""
-        images: NDArray[np.float32] = self._stages[fused.DENOISED, 0]
+        images: NDArray[np.float32] = self._stages[DENOISED, 0]
         return images.reshape(-1, *self.pipeline.layout.window)
 
     @property
@@ -242,7 +225,7 @@ def check_real_time(pipeline: SlopePipeline) -> None:
     if pipeline.needs_light:
         raise InputError(
             "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
-            'real time "map", "trained" and "auto" need it before the frame is there'
+            f'real time {pipeline.settings.estimator.label} and "auto" need it before the frame is there'
         )
 
 

@@ -7,10 +7,11 @@ from typing import Any
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
+from faintspot.estimators.registry import estimators
 from faintspot.realtime.live import parse_changes
-from faintspot.sensor.settings import ESTIMATORS
+from faintspot.settings import Settings, without_denoising
 
-_WORDS: dict[str, dict[str, Any]] = {"set": {}, "none": {"denoise": False}, "tv": {"denoise": True}}
+_SET, _NONE = "set", "none"
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,20 @@ class Arm:
 
     label: str
     changes: dict[str, Any]
+    denoises: bool = True
+    """False: the estimator's denoising is left out."""
+
+    def of(self, settings: Settings) -> Settings:
+        """Return what this arm makes of the settings that are set.
+
+        Raises
+        ------
+        InputError
+            For changes that do not fit, and where denoising is to be left out that there is not.
+        """
+        if self.changes:
+            settings = settings.replace(**self.changes)
+        return settings if self.denoises else without_denoising(settings, f"interleave: {self.label!r}")
 
 
 @dataclass(frozen=True)
@@ -53,8 +68,8 @@ class Interleaving:
     def parse(cls, text: str, every: int = 1) -> Interleaving:
         """Return what a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml" says.
 
-        Each arm is "set" (the settings as they are set), "none" (not denoised), "tv" (denoised), the name of
-        an estimator, or new values of settings, NAME=VALUE, with "+" between them.
+        Each arm is "set" (the settings as they are set), "none" (the same without denoising), the name of an
+        estimator, or new values of settings, NAME=VALUE, with "+" between them.
 
         Raises
         ------
@@ -65,11 +80,11 @@ class Interleaving:
 
 
 def _parsed_arm(text: str) -> Arm:
-    if text in _WORDS:
-        return Arm(text, _WORDS[text])
-    if text in ESTIMATORS:
+    if text in (_SET, _NONE):
+        return Arm(text, {}, denoises=text == _SET)
+    if text in estimators():
         return Arm(text, {"estimator": text})
     if "=" in text:
         return Arm(text, parse_changes(text.split("+")))
-    known = ", ".join([*_WORDS, *ESTIMATORS])
+    known = ", ".join([_SET, _NONE, *estimators()])
     raise InputError(f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several")

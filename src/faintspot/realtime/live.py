@@ -8,20 +8,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from faintspot.checks import number_between, numbers_between, one_of
+from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
-from faintspot.presets import steps
+from faintspot.estimators.stepping import Stepping
+from faintspot.options import PerSubaperture
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import AUTO, PER_SUBAPERTURE, PerSubaperture, Settings
+from faintspot.settings import Settings, check_option, option_names
+from faintspot.toml_files import check_known
 
-NAMES = tuple(field.name for field in fields(Settings))
-"""The names of all settings."""
 HISTORY_LENGTH = 1000
 _MOST_SUBAPERTURES = 1_000_000
 _POLL_S = 0.001
@@ -163,15 +163,16 @@ class LiveSettings(Generic[Prepared]):
         """
         if not isinstance(changes, Mapping) or not changes:
             raise InputError(
-                f"settings: expected new values by name, such as {NAMES[0]}, got {changes!r:.40}"
+                f"settings: expected new values by name, such as search_range_px, got {changes!r:.40}"
             )
-        checked_names(list(changes))
+        check_names(list(changes))
         with self._proposing:
             newest = self._newest.prepared
             layout = newest.layout
             places = None if where is None else _checked_places(where, len(layout))
             settings = newest.settings.replace(where=places, **changes)
-            _check_every_value(settings, len(layout), layout.pixels)
+            for name in settings.declared():  # also what the estimator does not use as it is set
+                settings.values(name, len(layout), layout.pixels)
             return self._offered(settings, copy.deepcopy(dict(changes)), places)
 
     def renew(self, changes: Mapping[str, Any]) -> Change:
@@ -272,11 +273,17 @@ class LiveSettings(Generic[Prepared]):
         """
         running = self.running
         n, pixels = len(running.layout), running.layout.pixels
-        return {name: _plain(running.settings, name, n, pixels) for name in checked_names(names)}
+        settings = running.settings
+        check_names(names)
+        for name in names or ():
+            if name != "estimator":
+                check_shared_or_own(name, settings)
+        wanted = names or ["estimator", *settings.declared()]
+        return {name: _plain(settings, name, n, pixels) for name in wanted}
 
 
-def checked_names(names: Sequence[str] | None) -> list[str]:
-    """Return the names of settings that are asked for; all when it is None or empty.
+def check_names(names: Sequence[str] | None) -> None:
+    """Refuse what is no list of names of options, of whatever estimator.
 
     Raises
     ------
@@ -285,7 +292,21 @@ def checked_names(names: Sequence[str] | None) -> list[str]:
     """
     if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
         raise InputError(f"names = {names!r}: expected a list of settings' names")
-    return [one_of("settings", name, NAMES) for name in names or NAMES]
+    known = [*option_names(), "denoise"]
+    for name in names or ():
+        check_known("settings.", str(name), known, "option")
+
+
+def check_shared_or_own(name: str, settings: Settings) -> None:
+    """Refuse an option that the estimator that is set does not have.
+
+    Raises
+    ------
+    InputError
+        It says whose it is.
+    """
+    if name not in Settings.SHARED:
+        check_option(name, type(settings.estimator))
 
 
 def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
@@ -303,8 +324,8 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
     for text in texts:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
-            raise InputError(f"{text!r}: expected NAME=VALUE, such as {NAMES[0]}=2.5")
-        one_of("settings", name, NAMES)
+            raise InputError(f"{text!r}: expected NAME=VALUE, such as search_range_px=2.5")
+        check_names([name])
         if name in changes:
             raise InputError(f"{name}: expected one new value, got two")
         items = [item.strip() for item in value.split(",")]
@@ -313,7 +334,7 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
         parsed = [_parsed_value(item) for item in items]
         changes[name] = parsed[0] if len(parsed) == 1 else parsed
     if not changes:
-        raise InputError(f"settings: expected at least one NAME=VALUE, such as {NAMES[0]}=2.5, got none")
+        raise InputError("settings: expected at least one NAME=VALUE, such as search_range_px=2.5, got none")
     return changes
 
 
@@ -364,22 +385,11 @@ def _checked_places(where: Sequence[int], n: int) -> list[int]:
     return [int(place) for place in array]
 
 
-def _check_every_value(settings: Settings, n: int, pixels: int) -> None:
-    """Check also the settings that the estimator does not use: they stay, and others may follow."""
-    for name in PER_SUBAPERTURE:
-        value = getattr(settings, name)
-        settings.values(name, n, pixels)
-        if isinstance(value, PerSubaperture) and AUTO in (value.default, *value.others.values()):
-            raise InputError(
-                f'{name}: expected "auto" for the whole sensor or numbers for all sub-apertures, got both'
-            )
-
-
 def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
     """A setting as plain values, with its default filled in."""
-    value = getattr(settings, name)
-    if name == "steps" and value is None:
-        return steps(settings.preset, settings.estimator)
+    value = settings.estimator.name if name == "estimator" else getattr(settings, name)
+    if name == "steps" and isinstance(settings.estimator, Stepping):
+        return settings.estimator.step_count
     differs = isinstance(value, PerSubaperture | np.ndarray)
     if value is not None and not differs:
         return value

@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from faintspot.checks import real_array
 from faintspot.errors import InputError
 from faintspot.flags import INVALID, SubapertureFlag
-from faintspot.kernels import fused
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.kernels import gravity, groups
+from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.built_in import BuiltIn
 from faintspot.realtime.frame_path import check_real_time
 from faintspot.realtime.module_loading import STAGES, Module, StageFunction
 from faintspot.realtime.module_trial import trial_frames, typical_frame
 from faintspot.realtime.time_limit import call_within, one_line
+from faintspot.slopes import Slopes
 
 TRIAL_LIMIT_S = 60.0  # a module may compile
 _TIMED_CALLS = 10
@@ -124,7 +125,7 @@ class ModularPipeline:
             Of the camera's pixels, which says at what value they saturate. Default: the frame's.
         """
         saturation = self.pipeline.calibration.saturation(np.dtype(frame.dtype if dtype is None else dtype))
-        self._calibrated = self._first(frame, saturation)[fused.CALIBRATED]
+        self._calibrated = self._first(frame, saturation)[groups.CALIBRATED]
         if "calibrate" in self.modules:
             self._raw = self.pipeline.layout.images(frame).astype(np.float32)
 
@@ -152,7 +153,7 @@ class ModularPipeline:
         if "denoise" in self.modules:
             images = self._applied("denoise", images)
         elif self._middle is not None:
-            images = self._middle(images)[fused.DENOISED]
+            images = self._middle(images)[groups.DENOISED]
             denoising = self._middle.slopes
         if explain and self.modules.keys() & {"denoise", "background"}:
             self.denoised = images.copy()
@@ -161,15 +162,15 @@ class ModularPipeline:
             images = self._applied("background", images)
         stages = self._last(images)
         if explain and not self.modules.keys() & {"denoise", "background"}:
-            self.denoised = stages[fused.DENOISED].copy()
+            self.denoised = stages[groups.DENOISED].copy()
         if denoising is not None:
             self.slopes.iterations[:] = denoising.iterations
             self.slopes.flags[:] |= denoising.flags & ~np.uint8(_NO_LIGHT)
         if largest is not None:
-            floor = self._last.settings[fused.FLOOR] * largest
+            floor = self._last.settings[gravity.FLOOR] * largest
             self.slopes.flags[~(self.slopes.flux > floor)] |= _NO_LIGHT
         if "centroid" in self.modules:
-            self._take_positions(self._applied("centroid", stages[fused.BACKGROUND]))
+            self._take_positions(self._applied("centroid", stages[groups.BACKGROUND]))
         self._flag()
         return self._complaint or None
 
@@ -230,11 +231,11 @@ class ModularPipeline:
     def _take_positions(self, positions: NDArray[np.float32]) -> None:
         """Slopes of positions that a module has measured."""
         table, (ny, nx) = self._last.settings, self.pipeline.layout.window
-        reach = table[fused.RANGE]
+        reach = table[groups.RANGE]
         inside = np.all(np.abs(positions) <= np.array([0.5 * nx, 0.5 * ny], np.float32), axis=1)
         self.slopes.flags[~inside] |= _NO_LIGHT
         for axis, slope in enumerate((self.slopes.x, self.slopes.y)):
-            slope[:] = np.clip(positions[:, axis] - table[fused.ZERO_X + axis], -reach, reach)
+            slope[:] = np.clip(positions[:, axis] - table[groups.ZERO_X + axis], -reach, reach)
 
     def _flag(self) -> None:
         """Flag what the calibration has found and what modules returned; slope 0 where that is invalid."""

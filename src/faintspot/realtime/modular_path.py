@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.kernels import streaming
-from faintspot.pipeline import Slopes
 from faintspot.realtime.frame_path import STOP_CELL, FramePath, Progress
 from faintspot.realtime.modular import TRIAL_LIMIT_S, ModularPipeline, title_of
 from faintspot.realtime.module_trial import typical_frame
 from faintspot.realtime.time_limit import call_is_under_way, end_thread, one_line
+from faintspot.slopes import Slopes
 
 BUDGET_S = 1e-3
 MOST_OVERRUNS = 3  # of the budget, one after the other

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.realtime.time_limit import call_within, one_line
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 STAGES = ("calibrate", "denoise", "background", "centroid")
 """What a module can replace, in the order of the pipeline."""

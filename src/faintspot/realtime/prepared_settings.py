@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.pipeline import SlopePipeline, Slopes
+from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.frame_path import FramePath, Progress, check_real_time
 from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.modular import ModularPipeline
@@ -17,7 +17,8 @@ from faintspot.realtime.module_loading import Module
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import ARRIVALS, ROWS
 from faintspot.realtime.workers import Workers
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
+from faintspot.slopes import Slopes
 
 
 class MeasuringPath(Protocol):
@@ -160,9 +161,7 @@ class SettingsPreparer:
 
     def of_arms(self, settings: Settings) -> list[Settings]:
         """Return the settings of every arm."""
-        return [
-            settings.replace(**arm.changes) if arm.changes else settings for arm in self._interleaving.arms
-        ]
+        return [arm.of(settings) for arm in self._interleaving.arms]
 
 
 class _WritableMemory:

@@ -10,8 +10,8 @@ import numpy as np
 from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.details import fill_details
-from faintspot.pipeline import Slopes
 from faintspot.realtime.shared_streams import LOCK_LIMIT_S, create_stream, lock_file
+from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""

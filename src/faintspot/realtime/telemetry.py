@@ -32,7 +32,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
-from faintspot.pipeline import Slopes
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import Header, create_segment, segment_path
 from faintspot.realtime.processes import process_start
@@ -49,6 +48,7 @@ from faintspot.realtime.telemetry_segment import (
     up_to_pages,
 )
 from faintspot.sensor.layout import Layout
+from faintspot.slopes import Slopes
 
 __all__ = ["TelemetryReader", "TelemetryRing"]
 
@@ -102,7 +102,7 @@ class TelemetryRing:
             The engine's; the segment is /dev/shm/NAME_telemetry.
         layout : Layout
         settings : str
-            The settings to begin with, for readers: TOML text (`faintspot.sensor.configuration.to_text`).
+            The settings to begin with, for readers: TOML text (`faintspot.configuration.to_text`).
         arms : sequence of str, optional
             Names of the arms of interleaved settings, for readers.
         records : int, optional

@@ -23,7 +23,7 @@ from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.modular import ModularPipeline
 from faintspot.realtime.module_loading import load_module
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 
 LIMIT_S = 90.0
 _GRACE_S = 5.0  # for the process to end by itself

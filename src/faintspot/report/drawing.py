@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import functools
 import io
 from collections.abc import Callable
@@ -74,9 +73,13 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def data_uri(figure: Figure) -> str:
-    """Return a figure as a PNG picture within a text."""
-    return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
+@styled
+def svg(figure: Figure) -> bytes:
+    """Return a figure as an SVG picture, the same bytes for the same figure."""
+    matplotlib.rcParams["svg.hashsalt"] = "faintspot"
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue()
 
 
 def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:

@@ -1,84 +1,176 @@
-"""The report page of a slopes run: one HTML text that needs nothing else."""
+"""One page made of sections: an HTML text that needs nothing else."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 import faintspot
-from faintspot.checks import finite_array, number_between
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.pipeline import Stages
-from faintspot.report.pictures import write_file
-from faintspot.report.sections import all_sections, make_run
-from faintspot.report.statistics import Arm
-from faintspot.report.wording import warnings_in_words
-from faintspot.sensor.layout import Layout
+from faintspot.errors import MissingExtraError
+from faintspot.report.figure_data import FigureWithData
+from faintspot.report.files import write_beside, write_file
+
+POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."
+"""For the foot of a page."""
+_CSS_PIXELS_PER_INCH = 100
+_MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml", "csv": "text/csv;charset=utf-8"}
 
 
-def slopes_report(
-    arms: Sequence[Arm],
-    *,
-    layout: Layout | None,
-    stages: Mapping[str, Stages] | None,
-    truth: ArrayLike | None = None,
-    title: str,
-    facts: Mapping[str, str],
-    configuration: str,
-    example_frame: int = 0,
-    warnings: Sequence[str] = (),
-    why_no_stages: str = "Not drawn: no frame was given.",
-) -> str:
-    """Return the report page of a slopes run as HTML: self-contained, without scripts.
+@dataclass(frozen=True)
+class Badge:
+    """A word on a coloured ground: an outcome. `colour`: "good", "mixed", "bad" or "grey"."""
 
-    Parameters
+    word: str
+    colour: str = "grey"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What is in a cell of a table when it is more than a text."""
+
+    text: str = ""
+    badge: Badge | None = None
+    small: str = ""
+    """Below the text, in small letters."""
+    items: Sequence[tuple[str, str]] = ()
+    """A list: each a text, and a remark in small letters below it."""
+    link: tuple[str, str] | None = None
+    """Name of a section and the words that lead there."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes
     ----------
-    arms : sequence of Arm
-        The same frames, measured in one or several ways. Others are compared with the last one.
-    layout : Layout or None
-        None leaves the maps out, which the page says.
-    stages : mapping of Stages, or None
-        `SlopePipeline.explain` of frame `example_frame`, by name. The first one's images are shown; the
-        positions of all are marked, and must be measured without a reference.
-    truth : array (n_frames, n_subapertures, 2), optional
-        True x, y, px from each sub-aperture's centre.
+    header : sequence of str
+    rows : sequence of sequences of str or Cell
+    caption : str
+    words : bool
+        The last column is prose.
+    prose : bool
+        All columns are.
+    csv : tuple of str, optional
+        Name of a file and its text, for readers to save.
+    folded : str
+        The line to click on where the table is shown only then.
+    """
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str | Cell]]
+    caption: str = ""
+    words: bool = False
+    prose: bool = False
+    csv: tuple[str, str] | None = None
+    folded: str = ""
+
+    @property
+    def csv_uri(self) -> str:
+        """The table's numbers as a data URI."""
+        return "" if self.csv is None else data_uri("csv", self.csv[1].encode())
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a page.
+
+    Attributes
+    ----------
+    name : str
+        For links to it.
     title : str
-    facts : mapping of str
-        What was run, for the top of the page, as sources and settings in words.
-    configuration : str
-        TOML text; "" when not known.
-    example_frame : int
-    warnings : sequence of str
-        Shown before those found in the slopes.
-    why_no_stages : str
-        What the page says in place of the frame.
+    text : sequence of str
+        Paragraphs.
+    tables : sequence of Table
+    figures : sequence of FigureWithData
+    missing : str
+        Why something is not in it.
+    points : sequence of str
+        A list, below the text.
+    code : str
+        Text of a file, shown after a click.
+    """
+
+    name: str
+    title: str
+    text: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    figures: Sequence[FigureWithData] = ()
+    missing: str = ""
+    points: Sequence[str] = ()
+    code: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: what it is about, what to look at first, and its sections."""
+
+    title: str
+    facts: Mapping[str, str]
+    sections: Sequence[Section]
+    warnings: Sequence[str] = ()
+    warnings_title: str = "What to look at first"
+    remark: str = ""
+    """For the foot of the page: what units and signs mean."""
+
+
+@dataclass(frozen=True)
+class DrawnFigure:
+    """A figure as files: their contents by ending, png alone or png, svg and csv."""
+
+    name: str
+    title: str
+    caption: str
+    width: int
+    """CSS pixels."""
+    contents: Mapping[str, bytes] = field(default_factory=dict)
+
+    def uri(self, ending: str) -> str:
+        """Return a file as a data URI."""
+        return data_uri(ending, self.contents[ending])
+
+
+def html_of(page: Page) -> str:
+    """Return a page as HTML: self-contained, without scripts.
+
+    Raises
+    ------
+    MissingExtraError
+        When matplotlib or jinja2 is not installed.
+    """
+    return _render(page, _drawn(page))
+
+
+def write_page(page: Page, path: str | Path) -> list[Path]:
+    """Write a page and, in a folder beside it, each figure with data as PNG and SVG and its numbers as CSV.
+
+    Returns
+    -------
+    list of Path
+        The files written, the page first.
 
     Raises
     ------
     InputError
-        When the parts do not fit together.
+        When a file cannot be written.
     MissingExtraError
         When matplotlib or jinja2 is not installed.
     """
-    arms = list(arms)
-    _check_arms(arms, layout)
-    shape = arms[0].x.shape
-    number_between("example_frame", example_frame, 0, shape[0] - 1, integer=True)
-    true = None if truth is None else _checked_truth(truth, shape)
-    stages = _checked_stages(stages or {}, shape[1])
-    run = make_run(arms, layout, stages, true, int(example_frame), why_no_stages)
-    return _render(
-        title=title,
-        facts={**facts, "Frames": str(shape[0]), "Sub-apertures": _sensor_in_words(shape[1], layout)},
-        warnings=[*warnings, *warnings_in_words(run.arms, run.summaries)],
-        sections=all_sections(run),
-        configuration=configuration.strip(),
-        version=faintspot.__version__,
-    )
+    path = Path(path)
+    drawn = _drawn(page)
+    write_report(path, _render(page, drawn))
+    contents = {
+        f"{figure.name}.{ending}": content
+        for of_section in drawn.values()
+        for figure in of_section
+        if "csv" in figure.contents
+        for ending, content in figure.contents.items()
+    }
+    return [path, *write_beside(path, contents)]
 
 
 def write_report(path: str | Path, html: str) -> None:
@@ -92,58 +184,47 @@ def write_report(path: str | Path, html: str) -> None:
     write_file(path, html.encode("utf-8"))
 
 
-def _check_arms(arms: Sequence[Arm], layout: Layout | None) -> None:
-    if not arms:
-        raise InputError("arms: expected at least one, got none")
-    names = [arm.name for arm in arms]
-    if len(set(names)) < len(names):
-        raise InputError(f"arms: expected a different name for each, got {', '.join(names)}")
-    for arm in arms[1:]:
-        if arm.x.shape != arms[0].x.shape:
-            raise InputError(
-                f"arms: expected the same frames and sub-apertures in all, got shape {arms[0].x.shape} in "
-                f"{arms[0].name!r} and {arm.x.shape} in {arm.name!r}"
-            )
-    if layout is not None and len(layout) != arms[0].n_subapertures:
-        raise InputError(
-            f"layout: expected {arms[0].n_subapertures} sub-apertures, as in the slopes, got {len(layout)}"
-        )
+def data_uri(ending: str, content: bytes) -> str:
+    """Return a file (png, svg or csv) as a link that holds it."""
+    return f"data:{_MEDIA_TYPES[ending]};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def _checked_truth(truth: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    array = finite_array("truth", truth).astype(np.float64)
-    if array.shape != (*shape, 2):
-        raise InputError(f"truth: expected shape {(*shape, 2)}, got {array.shape}")
-    return array
+def configuration_section(text: str, name: str = "Configuration") -> Section:
+    """Return the section that shows a configuration or a specification; "" when it is not known."""
+    missing = "" if text.strip() else f"The {name.lower()} of this run is not known."
+    return Section(name.lower(), name, code=text.strip(), missing=missing)
 
 
-def _checked_stages(stages: Mapping[str, Stages], n: int) -> dict[str, Stages]:
-    """Return the stages of one frame each; `explain` of a stack of one frame is accepted too."""
-    for name, item in stages.items():
-        if item.raw.ndim != 3 or len(item.raw) != n:
-            raise InputError(
-                f"stages: {name}: expected images (n_subapertures, ny, nx) of one frame with {n} "
-                f"sub-apertures, got shape {item.raw.shape}"
-            )
-    return dict(stages)
+def style() -> str:
+    """Return the style sheet of all pages."""
+    return _template("page.css")
 
 
-def _sensor_in_words(n: int, layout: Layout | None) -> str:
-    if layout is None:
-        return str(n)
-    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
-    height, width = layout.frame_shape
-    return (
-        f"{n} of {layout.window[0]} × {layout.window[1]} px, {layout.geometry}{pitch}, in frames of "
-        f"{height} × {width} px"
-    )
+def _drawn(page: Page) -> dict[str, list[DrawnFigure]]:
+    """Draw the figures of every section, by its name."""
+    return {section.name: [_draw(figure) for figure in section.figures] for section in page.sections}
 
 
-def _render(**values: object) -> str:
+def _draw(item: FigureWithData) -> DrawnFigure:
+    from faintspot.report import drawing
+
+    width = round(item.figure.get_size_inches()[0] * _CSS_PIXELS_PER_INCH)
+    contents = {"png": drawing.png(item.figure)}
+    if item.header:
+        item.figure.set_layout_engine("none")  # it has its layout now, which takes long to find
+        contents |= {"svg": drawing.svg(item.figure), "csv": item.csv().encode()}
+    return DrawnFigure(item.name, item.title, item.caption, width, contents)
+
+
+def _render(page: Page, drawn: Mapping[str, Sequence[DrawnFigure]]) -> str:
     try:
         import jinja2
     except ImportError:
         raise MissingExtraError("jinja2", "web", "Making a report page") from None
-    text = files("faintspot.report").joinpath("templates/report.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(text).render(**values)
+    template = environment.from_string(_template("page.html"))
+    return template.render(page=page, drawn=drawn, style=style(), version=faintspot.__version__)
+
+
+def _template(name: str) -> str:
+    return files("faintspot.report").joinpath("templates", name).read_text(encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,11 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between, numbers_between, real_array
 from faintspot.errors import InputError
+from faintspot.files import save_arrays
+from faintspot.io.frames import read_array
+from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_map, read_tables, save_tables
+
+_MAPS = ("dark", "flat", "bad_pixels")
 
 
 @dataclass(frozen=True)
@@ -100,15 +106,30 @@ class Calibration:
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
         """Read the table [calibration] of a configuration file (TOML)."""
-        from faintspot.sensor import configuration
+        return cls.from_tables(path, read_tables(path))
 
-        return configuration.load(path, "calibration")  # type: ignore[no-any-return]
+    @classmethod
+    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Calibration:
+        """Make a calibration from the tables of a configuration file; the default where it has none."""
+        values = document.get("calibration", {})
+        with errors_of_table(path, "calibration"):
+            check_fields("calibration", cls, values)
+            return cls(**{key: _map_or_value(Path(path), key, value) for key, value in values.items()})
 
     def save(self, path: str | Path) -> None:
         """Write the table [calibration] of a configuration file (TOML); other tables stay as they are."""
-        from faintspot.sensor import configuration
+        path = Path(path)
+        values = chosen_fields(self)
+        maps = {key: value for key, value in values.items() if is_map(value)}
+        store = path.with_suffix(".calibration.npz")
+        if maps:
+            save_arrays(store, maps)
+        save_tables(path, {"calibration": {**values, **{key: f"{store.name}:{key}" for key in maps}}})
 
-        configuration.save(path, self)
+    def to_table(self) -> dict[str, Any]:
+        """Return the table of a configuration file, with maps given by their shape only."""
+        values = chosen_fields(self)
+        return {key: f"map of {value.shape}" if is_map(value) else value for key, value in values.items()}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The maps of the size of a frame."""
@@ -197,3 +218,13 @@ def _mask_or_list(value: Any) -> NDArray[Any]:
         raise InputError(f"calibration.bad_pixels: expected shape (h, w), got {array.shape}")
     array.flags.writeable = False
     return array
+
+
+def _map_or_value(path: Path, key: str, value: Any) -> Any:
+    """A map named by its file, relative to the configuration."""
+    if key in _MAPS and isinstance(value, str):
+        array = read_array(str(path.parent / value))
+        return (
+            array.astype(bool) if key == "bad_pixels" and array.ndim == 2 and array.shape[1] != 2 else array
+        )
+    return value

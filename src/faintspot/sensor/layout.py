@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.tables import check_fields, chosen_fields, errors_of_table, read_tables, save_tables, table_of
+from faintspot.toml_files import check_keys, checked_table
 
+GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
 GEOMETRIES = ("square", "hexagonal")
 SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
-_LARGEST_SHIFT = 0.35  # of a window's side, by which windows are moved off the spots
-_WORTH_A_SHIFT = 0.05  # of the sub-apertures, which must be saved by it
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Layout:
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "frame_shape", _pair("layout.frame_shape", self.frame_shape, 1, 2**31))
-        put(self, "window", _pair("layout.window", self.window, SMALLEST_WINDOW, LARGEST_WINDOW))
+        put(self, "window", window_size("layout.window", self.window))
         corners = _rows_of_two("layout.corners", self.corners)
         corners = numbers_between("layout.corners", corners, -(2**31), 2**31, integer=True)
         middle = corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1)
@@ -94,6 +96,26 @@ class Layout:
     def __len__(self) -> int:
         """Return the number of sub-apertures."""
         return len(self.corners)
+
+    def __getitem__(self, chosen: Any) -> Layout:
+        """Return the layout of some of the sub-apertures, in the order given.
+
+        Parameters
+        ----------
+        chosen : (n,) array of bool, slice or list of int
+            Which sub-apertures: a mask of all, or their numbers.
+
+        Raises
+        ------
+        InputError
+            When the mask is not of this length, a number is out of range or twice there, or none is left.
+        """
+        index = _index(chosen, len(self))
+        return replace(
+            self, corners=self.corners[index], centres=self.centres[index], cells=self.cells[index]
+        )
+
+    __iter__ = None  # else Python would make one of __getitem__, which takes no single number
 
     @property
     def pixels(self) -> int:
@@ -142,7 +164,7 @@ class Layout:
             When nothing is lit, or as for `Layout`.
         """
         n_rows, n_columns = _pair("shape", shape, 1, 10_000)
-        window = _pair("pixels", pixels, SMALLEST_WINDOW, LARGEST_WINDOW)
+        window = window_size("pixels", pixels)
         step = window if pitch is None else _pair("pitch", pitch, 1, 10_000)
         start = _pair("origin", origin, 0, 2**31)
         outer = np.inf if outer_radius is None else number_between("outer_radius", outer_radius, 0.0)
@@ -170,7 +192,7 @@ class Layout:
         pitch_px: float | None = None,
         pixels: int | tuple[int, int] | None = None,
         bad_pixels: ArrayLike | None = None,
-        move_windows: bool = True,
+        move_windows: bool = False,
         **options: Any,
     ) -> Layout:
         """Find the sub-apertures of a square or hexagonal lenslet array in a frame.
@@ -183,11 +205,13 @@ class Layout:
         pitch_px : float, optional
             Distance between neighbouring lenslets, when known (to 20 %).
         pixels : int or (int, int), optional
-            Window. Default: the largest square in which neighbours do not overlap.
+            Window, or its height and width. Default: the largest square in which neighbours do not overlap; a
+            pitch that is a whole number within its error gives a window of that number.
         bad_pixels : (h, w) array of bool, optional
             True where a pixel must not be used.
         move_windows : bool
-            Whether windows may be moved off the spots to save those at the frame's edge, see below.
+            Whether all windows may be moved alike, off the spots by up to 0.35 of their side, to save those
+            at the frame's edge. Centres of gravity are worse in such windows.
         **options
             Passed on to `faintspot.sensor.lenslets.find_lenslets`.
 
@@ -195,57 +219,61 @@ class Layout:
         -------
         Layout
             Of the lit sub-apertures whose windows lie within the frame. Windows have the spots' mean lattice
-            in their middle; where that would lose more than 5 % of the sub-apertures at the frame's edge, all
-            windows are moved alike, by up to 0.35 of their side. `centres` always holds the lattice.
+            in their middle, unless they were moved; `centres` always holds the lattice.
+            `faintspot.sensor.windows.find_layout` says which lenslets were left out at the frame's edge.
 
         Raises
         ------
         InputError
             When no regular array of spots is found.
         """
-        from faintspot.sensor.lenslets import find_lenslets
+        from faintspot.sensor.windows import find_layout
 
-        array = finite_or_masked("frame", frame)
-        grid = find_lenslets(array, geometry=geometry, pitch_px=pitch_px, bad_pixels=bad_pixels, **options)
-        if pixels is None:
-            side = min(LARGEST_WINDOW, int(np.floor(_clear_distance(grid.centres, grid.pitch_px) + 1e-6)))
-            window = (side, side)
-        else:
-            window = _pair("pixels", pixels, SMALLEST_WINDOW, LARGEST_WINDOW)
-        shape = (int(array.shape[-2]), int(array.shape[-1]))
-        middles = grid.centres[:, ::-1]
-        if move_windows:
-            moved = [_shift_inside(middles[:, i], window[i], shape[i]) for i in range(2)]
-            middles = np.stack(moved, axis=1)
-        corners = np.floor(middles - 0.5 * (np.array(window) - 1) + 0.5).astype(np.int64)
-        within = np.all((corners >= 0) & (corners + np.array(window) <= np.array(shape)), axis=1)
-        if not within.any():
-            raise InputError(
-                f"frame: all {len(corners)} sub-apertures found leave the frame; try pixels < {window[0]}"
-            )
-        return cls(
-            shape,
-            window,
-            corners[within],
-            grid.centres[within],
-            grid.cells[within],
-            grid.geometry,
-            grid.pitch_px,
-            grid.angle_deg,
-        )
+        return find_layout(
+            frame,
+            pixels=pixels,
+            move_windows=move_windows,
+            geometry=geometry,
+            pitch_px=pitch_px,
+            bad_pixels=bad_pixels,
+            **options,
+        ).layout
 
     @classmethod
     def load(cls, path: str | Path) -> Layout:
         """Read the table [layout] of a configuration file (TOML)."""
-        from faintspot.sensor import configuration
-
-        return configuration.load(path, "layout")  # type: ignore[no-any-return]
+        values = table_of(path, read_tables(path), "layout")
+        with errors_of_table(path, "layout"):
+            return cls.from_table(values)
 
     def save(self, path: str | Path) -> None:
         """Write the table [layout] of a configuration file (TOML); other tables stay as they are."""
-        from faintspot.sensor import configuration
+        save_tables(path, {"layout": self.to_table()})
 
-        configuration.save(path, self)
+    def to_table(self) -> dict[str, Any]:
+        """Return the table of a configuration file."""
+        return chosen_fields(self)
+
+    @classmethod
+    def from_table(cls, values: Mapping[str, Any]) -> Layout:
+        """Make a layout from a table of a configuration file, which may hold the arguments of `grid`.
+
+        Raises
+        ------
+        InputError
+            For an unknown key, a missing or a bad value.
+        """
+        if "grid" not in values:
+            check_fields("layout", cls, values)
+            return cls(**values)
+        check_keys("layout.", values, ["grid"], what="key beside grid")
+        grid = checked_table("layout.grid", values["grid"])
+        check_keys("layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
+        try:
+            return cls.grid(**grid)
+        except InputError as error:
+            text = str(error)
+            raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None
 
     def images(self, frame: ArrayLike) -> NDArray[Any]:
         """Cut the windows out of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""
@@ -265,6 +293,32 @@ def finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
     if array.ndim > 3:
         raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
     return array
+
+
+def window_size(name: str, value: Any) -> tuple[int, int]:
+    """Return height and width of a window, from one number or two."""
+    return _pair(name, value, SMALLEST_WINDOW, LARGEST_WINDOW)
+
+
+def _index(chosen: Any, length: int) -> NDArray[np.int64]:
+    """Return the numbers of the chosen ones of so many sub-apertures."""
+    if isinstance(chosen, slice):
+        index = np.arange(length)[chosen]
+    else:
+        array = np.asarray(chosen)
+        if array.ndim != 1:
+            raise InputError("layout[...]: expected a mask, a slice or a list of numbers")
+        if array.dtype == np.bool_:
+            if len(array) != length:
+                raise InputError(f"layout[mask]: expected a mask of {length}, got {len(array)}")
+            index = np.flatnonzero(array)
+        else:
+            index = numbers_between("layout[...]", array, -length, length - 1, integer=True) % length
+            if len(np.unique(index)) < len(index):
+                raise InputError("layout[...]: expected each sub-aperture once, got one twice")
+    if len(index) == 0:
+        raise InputError("layout[...]: expected at least one sub-aperture, none is chosen")
+    return np.asarray(index)
 
 
 def _pair(name: str, value: Any, low: float, high: float) -> tuple[int, int]:
@@ -303,23 +357,3 @@ def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int], frame_sh
                 f"layout: sub-apertures {part.max()} and {index} overlap; use smaller windows than {window}"
             )
         part[:] = index
-
-
-def _shift_inside(centres: NDArray[np.float64], side: int, length: int) -> NDArray[np.float64]:
-    """Move all windows alike along one axis, as little as needed, where that saves many at the edge."""
-    shifts = np.arange(-_LARGEST_SHIFT * side, _LARGEST_SHIFT * side + 0.25, 0.5)
-    starts = np.floor(centres + shifts[:, None] - 0.5 * (side - 1) + 0.5)
-    inside = np.count_nonzero((starts >= 0) & (starts + side <= length), axis=1)
-    best = np.lexsort((np.abs(shifts), -inside))[0]
-    unmoved = inside[np.argmin(np.abs(shifts))]
-    worth_it = inside[best] - unmoved > _WORTH_A_SHIFT * len(centres)
-    return centres + (shifts[best] if worth_it else 0.0)
-
-
-def _clear_distance(centres: NDArray[np.float64], pitch_px: float) -> float:
-    """Largest side of axis-aligned squares around the centres that do not overlap."""
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(centres)
-    distances = np.asarray(tree.query(centres, k=2, p=np.inf)[0])[:, 1]
-    return float(np.min(distances[np.isfinite(distances)], initial=pitch_px))

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from faintspot.estimate.centroid import centre_of_gravity
 from faintspot.estimate.total_variation import tv_denoise
 from faintspot.kernels import scoring
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.study.sweep import Cell
 
 FLUX_FLOOR: float = Settings.flux_floor

@@ -17,7 +17,7 @@ from faintspot.estimate.noise import suggested_strength
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate import Detector, sensor_frames
 from faintspot.study.metric import Estimate, absolute_errors, flux_gain_with_error
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import estimators
-from faintspot.pipeline import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate import Detector
+from faintspot.slopes import Slopes
 from faintspot.study.specification import Candidate, Robustness
 from faintspot.study.sweep import Cell
 from faintspot.training import train_estimator

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.report.drawing import GREY, WIDTH, new_figure, styled
+from faintspot.report.figure_data import FigureWithData
 from faintspot.study.baselines import ARM_NAMES
-from faintspot.study.figure_data import StudyFigure, numbers_of, parameter_in_words, parameters_of
+from faintspot.study.cell_numbers import numbers_of, parameter_in_words, parameters_of
 from faintspot.study.specification import BEST, CORRECTED, ESTIMATOR_ARMS
 from faintspot.study.sweep import PARAMETERS
 
@@ -75,7 +76,7 @@ class _Group:
         return ", ".join(text for text in named if not text.startswith("no "))
 
 
-def estimator_figures(dataset: xarray.Dataset) -> Iterator[StudyFigure]:
+def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
     """Yield the figures of a study that compares estimators, as far as its cells are finished.
 
     Cells that differ in flux (or, speckled ones, in d/r0) alone are a line, where there are at least three.
@@ -112,7 +113,7 @@ def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: 
 
 
 @styled
-def _error_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+def _error_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
     figure, axes = _grid(group)
     for panel, part in zip(axes, group.panels, strict=False):
         _lines(panel, dataset, part, "error", BEST, "flux_e")
@@ -131,11 +132,11 @@ def _error_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
         "answering the centre. Bars: one standard error. All have the same search range, that of the true "
         "positions."
     )
-    return StudyFigure(f"error-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
+    return FigureWithData(f"error-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
 
 
 @styled
-def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
     figure, axes = _grid(group)
     for panel, part in zip(axes, group.panels, strict=False):
         _lines(panel, dataset, part, "photon_efficiency", BEST, "flux_e")
@@ -151,11 +152,11 @@ def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
         "What lies above 1.35 is cut off; the numbers are in the data."
     )
     name = f"efficiency-{group.name}"
-    return StudyFigure(name, title, caption, figure, *numbers_of(dataset, group.cells))
+    return FigureWithData(name, title, caption, figure, *numbers_of(dataset, group.cells))
 
 
 @styled
-def _gain_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+def _gain_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
     columns = len(group.panels)
     figure = new_figure(WIDTH * max(1.0, columns / 3), 2 * _ROW_HEIGHT + 0.9)
     axes = figure.subplots(2, columns, squeeze=False, sharex="col", sharey="row")
@@ -179,11 +180,11 @@ def _gain_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
         "back to the centre has a small R and a small gain. Below: fraction of slopes with an error "
         "beyond 1 px on either axis, linear below 0.001."
     )
-    return StudyFigure(f"gain-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
+    return FigureWithData(f"gain-{group.name}", title, caption, figure, *numbers_of(dataset, group.cells))
 
 
 @styled
-def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
+def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
     mode = CORRECTED if CORRECTED in dataset["mode"].values else BEST
     figure, axes = _grid(group)
     for panel, part in zip(axes, group.panels, strict=False):
@@ -208,7 +209,7 @@ def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> StudyFigure:
         "estimators that know the spot; dashed: those that do not."
     )
     name = f"turbulence-{group.name}"
-    return StudyFigure(name, title, caption, figure, *numbers_of(dataset, group.cells))
+    return FigureWithData(name, title, caption, figure, *numbers_of(dataset, group.cells))
 
 
 def _grid(group: _Group) -> tuple[Figure, list[Axes]]:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, styled
+from faintspot.report.figure_data import FigureWithData
 from faintspot.study.baselines import ARM_NAMES
-from faintspot.study.claims import BEST_MODE, fixed_mode
-from faintspot.study.figure_data import (
-    StudyFigure,
+from faintspot.study.cell_numbers import (
     mode_in_words,
     numbers_of,
     parameter_in_words,
     parameters_of,
 )
+from faintspot.study.claims import BEST_MODE, fixed_mode
 from faintspot.study.kept_pixels import kept_panels
 from faintspot.study.specification import BRIGHTEST_ARMS
 from faintspot.study.sweep import PARAMETERS
@@ -55,7 +55,7 @@ class _Line:
 
 
 @styled
-def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title: str) -> StudyFigure:
+def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title: str) -> FigureWithData:
     """Draw R of the cells of a sweep with TV (solid) and without (dashed), in both modes side by side.
 
     One row for each spot profile and range of positions. The axis is the flux, or what has most values in a
@@ -99,11 +99,11 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
         "Bars: one standard error of R. Dotted: R of always answering the centre, half of the positions’ "
         f"range. The same in all panels: {', '.join(fixed) or 'nothing'}."
     )
-    return StudyFigure(name, title, caption, figure, *numbers_of(dataset, cells))
+    return FigureWithData(name, title, caption, figure, *numbers_of(dataset, cells))
 
 
 @styled
-def kept_pixels_figure(dataset: xarray.Dataset) -> StudyFigure | None:
+def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     """Draw R against the number of brightest pixels kept (the paper's figure 5); None without cells."""
     profiles = sorted({str(p) for p in dataset["profile"].values[dataset["done"].values]})
     panels = [(profile, kept_panels(dataset, profile)) for profile in profiles]
@@ -136,11 +136,11 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> StudyFigure | None:
         f"mode “best k”. Dotted: fixed k = {fixed}. Bands: one standard error."
     )
     header = ["panel", "arm", "k", "R_px", "R_se_px", *PARAMETERS]
-    return StudyFigure("fig5", title, caption, figure, header, rows)
+    return FigureWithData("fig5", title, caption, figure, header, rows)
 
 
 @styled
-def baselines_figure(dataset: xarray.Dataset, profile: str) -> StudyFigure | None:
+def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | None:
     """Draw R of every arm over R without denoising, for the main read noises; None without cells."""
     cells = _main_cells(dataset, profile)
     arms = [str(arm) for arm in dataset["arm"].values if arm in BRIGHTEST_ARMS]
@@ -175,7 +175,7 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> StudyFigure | Non
         f"{_LARGEST_RATIO:g} is cut off; the numbers are in the data. Bars: one paired standard error."
     )
     every = [cell for part in cells.values() for cell in part]
-    return StudyFigure(f"baselines-{profile}", title, caption, figure, *numbers_of(dataset, every))
+    return FigureWithData(f"baselines-{profile}", title, caption, figure, *numbers_of(dataset, every))
 
 
 def _axis_of(table: list[dict[str, Any]]) -> str:

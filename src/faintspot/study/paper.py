@@ -90,7 +90,7 @@ def report(dataset: xarray.Dataset, path: str | Path) -> list[Path]:
     InputError
         When no cell is finished or a file cannot be written.
     """
-    from faintspot.report.study_page import write_study_report
+    from faintspot.study.page import write_study_report
 
     return write_study_report(dataset, path)
 

@@ -20,8 +20,8 @@ from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.locations import one_line
 from faintspot.io.slopes_format import output_errors
 from faintspot.study.metric import OUTLIER_PX
-from faintspot.study.recognise import study_attributes
 from faintspot.study.specification import StudySpecification
+from faintspot.study.stored_results import study_attributes
 from faintspot.study.sweep import PARAMETERS, RANGES
 
 try:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from faintspot.estimate.noise import suggested_strength
 from faintspot.estimate.total_variation import tv_denoise
 from faintspot.report.drawing import WIDTH, colour_bar, new_figure, styled
+from faintspot.report.figure_data import FigureWithData
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, spots
-from faintspot.study.figure_data import StudyFigure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +36,7 @@ def triple_images() -> tuple[Layout, list[NDArray[np.float64]]]:
 
 
 @styled
-def triple_picture() -> StudyFigure:
+def triple_picture() -> FigureWithData:
     """Draw the sensor in three states, and one of its spots below each."""
     layout, images = triple_images()
     shown = len(layout) // 2
@@ -63,7 +63,7 @@ def triple_picture() -> StudyFigure:
     ]
     title = "Figure 1: a sensor without noise, with noise, and after TV"
     header = ["row", "column", "without_noise_e", "noisy_e", "denoised_e"]
-    return StudyFigure("fig1", title, caption, figure, header, rows)
+    return FigureWithData("fig1", title, caption, figure, header, rows)
 
 
 def _show(panel: Axes, image: NDArray[np.float64], brightest: float, title: str) -> object:

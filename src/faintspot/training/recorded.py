@@ -14,7 +14,7 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.score import STARTS, TrainedScore, smoothed_peak, table_sums
-from faintspot.sensor.settings import Settings
+from faintspot.settings import Settings
 from faintspot.simulate.generators import spawn
 from faintspot.training.fitting import Sample, fit_passes
 from faintspot.training.simulation import MOST_PASSES, flux_classes

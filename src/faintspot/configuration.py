@@ -1,0 +1,141 @@
+"""One TOML file (faintspot.toml) for layout, calibration, estimator and settings, PSF and score.
+
+Maps of a calibration, PSF and score are kept beside it, in NAME.calibration.npz and so on, and named in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from faintspot.errors import InputError
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.settings import Settings
+from faintspot.tables import errors_of_table, read_tables, save_tables, table_of, tables_as_text
+from faintspot.toml_files import check_keys
+
+_ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
+
+Item = Layout | Calibration | Settings | PSF | TrainedScore
+
+
+class Configuration(NamedTuple):
+    """Everything that a configuration file describes."""
+
+    layout: Layout
+    settings: Settings
+    calibration: Calibration
+    psf: PSF | None
+    score: TrainedScore | None
+
+
+def load(path: str | Path, table: str) -> Any:
+    """Read one part of a configuration file as the object it describes.
+
+    Parameters
+    ----------
+    path : path
+    table : {"layout", "calibration", "settings"}
+
+    Returns
+    -------
+    Layout, Calibration or Settings
+        A file without a calibration table gives `Calibration()`.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is not TOML, lacks the table, or has an unknown key or a bad value.
+    """
+    kinds: dict[str, Any] = {"layout": Layout, "calibration": Calibration, "settings": Settings}
+    return kinds[table].load(path)
+
+
+def load_all(path: str | Path) -> Configuration:
+    """Read everything from a configuration file; PSF and score may be absent."""
+    path = Path(path)
+    document = read_tables(path)
+    with errors_of_table(path, "layout"):
+        layout = Layout.from_table(table_of(path, document, "layout"))
+    return Configuration(
+        layout,
+        Settings.from_tables(path, document),
+        Calibration.from_tables(path, document),
+        psf_of(path, document),
+        score_of(path, document),
+    )
+
+
+def has(path: str | Path, table: str) -> bool:
+    """Say whether a configuration file exists and has a table; "settings" may be its [estimator] alone.
+
+    Raises
+    ------
+    InputError
+        When the file exists and cannot be read, or is not TOML.
+    """
+    if not Path(path).exists():
+        return False
+    document = read_tables(path)
+    return table in document or (table == "settings" and "estimator" in document)
+
+
+def save(path: str | Path, item: Item) -> None:
+    """Write an object into its table of a configuration file; other tables and comments stay as they are.
+
+    Raises
+    ------
+    InputError
+        When the file exists and is not TOML, or cannot be written.
+    """
+    if not isinstance(item, PSF | TrainedScore):
+        item.save(path)
+        return
+    table = "psf" if isinstance(item, PSF) else "score"
+    store = Path(path).with_suffix(f".{table}.npz")
+    item.save(store)
+    save_tables(path, {table: {"file": store.name}})
+
+
+def to_text(*items: Layout | Calibration | Settings) -> str:
+    """Return the configuration as TOML text; maps of a calibration are given by their shape only."""
+    tables: dict[str, Any] = {}
+    for item in items:
+        if isinstance(item, Settings):
+            tables |= {name: values for name, values in item.to_tables().items() if values}
+        else:
+            tables["layout" if isinstance(item, Layout) else "calibration"] = item.to_table()
+    return tables_as_text(tables)
+
+
+def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
+    """Return the PSF that a configuration file describes or names, if any."""
+    if "psf" not in document:
+        return None
+    values = document["psf"]
+    with errors_of_table(path, "psf"):
+        if "profile" in values:
+            check_keys("psf.", values, _ANALYTIC_KEYS, what="key beside profile")
+            return PSF.analytic(**values)
+        return PSF.load(_named_file(path, "psf", values, ("file", "profile")))
+
+
+def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> TrainedScore | None:
+    """Return the score that a configuration file names, if any."""
+    if "score" not in document:
+        return None
+    with errors_of_table(path, "score"):
+        return TrainedScore.load(_named_file(path, "score", document["score"], ("file",)))
+
+
+def _named_file(path: Path, table: str, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:
+    """The file that a table names, relative to the configuration."""
+    check_keys(f"{table}.", values, known)
+    name = values.get("file")
+    if not isinstance(name, str):
+        raise InputError(f"{table}.file: expected the name of a file, found {name!r}")
+    return path.parent / name

@@ -1,0 +1,42 @@
+"""Estimators of a spot's position: one file each, objects that say everything about themselves.
+
+A new one is a file like those here: a frozen dataclass with its options, and either `locate` in NumPy or a
+compiled kernel. `docs/estimators.md` describes them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.estimators.base import Estimator as Estimator
+    from faintspot.estimators.base import Need as Need
+    from faintspot.estimators.base import Positions as Positions
+    from faintspot.estimators.base import Style as Style
+    from faintspot.estimators.images import measure as measure
+    from faintspot.estimators.registry import estimator_named as estimator_named
+    from faintspot.estimators.registry import estimators as estimators
+    from faintspot.estimators.registry import register as register
+    from faintspot.estimators.scene import Scene as Scene
+    from faintspot.estimators.sensor import Sensor as Sensor
+    from faintspot.options import option as option
+
+_HOMES = {
+    "Estimator": "faintspot.estimators.base",
+    "Need": "faintspot.estimators.base",
+    "Positions": "faintspot.estimators.base",
+    "Scene": "faintspot.estimators.scene",
+    "Sensor": "faintspot.estimators.sensor",
+    "Style": "faintspot.estimators.base",
+    "estimator_named": "faintspot.estimators.registry",
+    "estimators": "faintspot.estimators.registry",
+    "measure": "faintspot.estimators.images",
+    "option": "faintspot.options",
+    "register": "faintspot.estimators.registry",
+}
+
+__all__ = [*sorted(_HOMES)]
+
+__getattr__ = lazy_attributes(__name__, _HOMES)

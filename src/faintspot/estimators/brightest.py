@@ -1,0 +1,32 @@
+"""The brightest pixels: background subtraction and centre of gravity, without denoising."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from faintspot.estimators.base import Style
+from faintspot.estimators.gravity import GravityPrepared, KeepingBrightest
+from faintspot.estimators.registry import register
+from faintspot.estimators.sensor import Sensor
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BrightestPixels(KeepingBrightest):
+    """Centre of gravity of the brightest pixels (Basden, Myers & Gendron 2012), without denoising."""
+
+    name: ClassVar[str] = "brightest"
+    label: ClassVar[str] = "brightest pixels"
+    method: ClassVar[str] = "brightest pixels, centre of gravity"
+    cost: ClassVar[float] = 0.21
+    style: ClassVar[Style] = Style("#000000", "--", "o")
+    automatic_method: ClassVar[str] = "none"
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        return f"no denoising; {self.kept_in_words(n_subapertures, pixels)}"
+
+    def prepared(self, sensor: Sensor) -> GravityPrepared:
+        """See `Estimator`."""
+        return GravityPrepared(self, sensor)

@@ -1,0 +1,211 @@
+"""What the centres of gravity share: the background subtraction, and their compiled kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import LARGEST_FLOAT32
+from faintspot.errors import InputError
+from faintspot.estimate.automatic import automatic_kept_pixels
+from faintspot.estimate.brightest import RULES, most_kept, threshold_rank
+from faintspot.estimate.total_variation import ALGORITHMS
+from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Need, Prepared, Step
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.kernels import gravity
+from faintspot.kernels.flat_start import NO_TABLE
+from faintspot.kernels.groups import Task
+from faintspot.options import is_auto, option
+
+Floats = NDArray[np.float64]
+
+KEPT_FRACTION = 0.08  # of a window's pixels, where keep_brightest is not given: 20 of 16 x 16
+FEWEST_KEPT = 5
+FLUX_FLOOR = 1e-4
+_KEPT = (1.0, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0, 4.5)  # times the automatic number
+_PIXEL_BLUR_PX2 = 0.46  # by so much a pixel raises the square of a spot's full width at half maximum
+_USUAL_RANGE_PX = 1.0  # of positions, where no search range is set
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gravity(Estimator):
+    """A centre of gravity."""
+
+    flux_floor: Any = option(
+        FLUX_FLOOR,
+        "A sub-aperture is flagged NO_LIGHT when the flux that is left after the background subtraction is "
+        "not above this fraction of its image's largest pixel.",
+        low=0.0,
+        high=1.0,
+    )
+
+    runs_on_gpu: ClassVar[bool] = True
+    steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, BACKGROUND)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class KeepingBrightest(Gravity):
+    """A centre of gravity of the brightest pixels."""
+
+    keep_brightest: Any = option(
+        None,
+        "Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at "
+        'least 5. "auto": by `faintspot.estimate.automatic.automatic_kept_pixels`.',
+        low=1,
+        high=2**24,
+        whole=True,
+        automatic=True,
+    )
+    rule: Any = option(
+        "subtract_next",
+        "What is taken off the pixels that are kept; see `faintspot.brightest_pixels`.",
+        choices=RULES,
+    )
+
+    automatic_method: ClassVar[str]
+    """What `automatic_kept_pixels` calls it."""
+
+    @property
+    def is_automatic(self) -> bool:
+        """Whether some option follows from the light."""
+        return is_auto(self.keep_brightest)
+
+    @property
+    def required(self) -> frozenset[Need]:
+        """What the automatic options ask about, where there are any."""
+        return frozenset({Need.READ_NOISE, Need.WIDTH}) if self.is_automatic else frozenset()
+
+    def default_of(self, name: str, pixels: int) -> Any:
+        """Return the default of `keep_brightest`."""
+        if name == "keep_brightest":
+            return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
+        return super().default_of(name, pixels)
+
+    def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
+        """Say what is done after the denoising."""
+        kept, rule = (self._span(name, n_subapertures, pixels) for name in ("keep_brightest", "rule"))
+        return f"{kept} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Numbers of kept pixels around the automatic one; speckles spread the light over more."""
+        kept = float(automatic_kept_pixels(**scene.rule_arguments, method=self.automatic_method))
+        kept *= max(1.0, scene.d_over_r0)
+        numbers = (int(np.clip(round(kept * factor), 1, scene.pixels - 1)) for factor in _KEPT)
+        return {"keep_brightest": list(dict.fromkeys(numbers))}
+
+
+class GravityPrepared(Prepared):
+    """Settings and tables of a centre of gravity."""
+
+    kernel = staticmethod(gravity.gravity_of_groups)
+    setting_rows = gravity.SETTING_ROWS
+    fewer_lanes_are_faster = True
+
+    estimator: Gravity
+
+    def __init__(self, estimator: Gravity, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
+        automatic = self._keeping is not None and self._keeping.is_automatic
+        self.needs_light = automatic and bool(np.isnan(sensor.flux_e).all())
+
+    # What the kernel, and that of the GPU, reads ------------------------------------------------------
+
+    @property
+    def before(self) -> int:
+        """What is done before the background subtraction, as the kernel calls it."""
+        return gravity.NOTHING
+
+    @property
+    def algorithm(self) -> int:
+        """Of the denoising."""
+        return next(iter(ALGORITHMS.values()))
+
+    @property
+    def flat_start(self) -> NDArray[np.float32]:
+        """What the denoising's start is computed from; no elements where it begins at zero."""
+        return NO_TABLE
+
+    @cached_property
+    def taps(self) -> NDArray[np.float32]:
+        """Taps of every sub-aperture's smoothing, (n, 2, 1 + reach)."""
+        return np.ones((self.sensor.n, 2, 1), np.float32)  # not used
+
+    @cached_property
+    def tables(self) -> Any:
+        """See `Prepared`."""
+        return gravity.GravityTables(self.before, self.algorithm, self.flat_start, self.taps)
+
+    @property
+    def own_scratch(self) -> Any:
+        """See `Prepared`."""
+        return gravity.gravity_scratch
+
+    def part(self, task: Task, *, denoise: bool, background: bool) -> tuple[Any, Task]:
+        """Return the kernel and its task for some of the stages: others before and after do the rest."""
+        if background and (denoise or self.before == gravity.NOTHING):
+            return self.kernel, task
+        before = self.before if denoise else gravity.NOTHING
+        tables = gravity.GravityTables(before, self.algorithm, self.flat_start, self.taps)
+        settings = task.settings
+        if not background:
+            settings = settings.copy()
+            keep_all(settings.swapaxes(0, 1))
+        return gravity.gravity_of_groups, task._replace(settings=settings, tables=tables)
+
+    # Settings ---------------------------------------------------------------------------------------
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `Prepared`."""
+        table[gravity.FLOOR] = self.each("flux_floor")
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `Prepared`."""
+        if self._keeping is None:
+            keep_all(table)
+            return
+        keep = self.each("keep_brightest")
+        if is_auto(self._keeping.keep_brightest):
+            method = self._keeping.automatic_method
+            keep = automatic_kept_pixels(**self.rule_arguments(flux_e), method=method)
+        pixels, rules = self.sensor.pixels, self.each("rule")
+        for rule in np.unique(rules):
+            selected = rules == rule
+            limit = most_kept(pixels, rule)
+            if keep[selected].max() > limit:
+                ny, nx = self.sensor.window
+                raise InputError(
+                    f"estimator.keep_brightest = {keep[selected].max()}: expected at most {limit} "
+                    f"with rule {str(rule)!r} in windows of {ny} x {nx} pixels"
+                )
+            table[gravity.RANK, selected] = threshold_rank(keep[selected], rule)
+            table[gravity.SUBTRACT, selected] = rule != "threshold"
+
+    def rule_arguments(self, flux_e: Floats) -> dict[str, Any]:
+        """Return what the automatic rules ask: light, camera, and the spots before the pixels blur them."""
+        sensor, fwhm = self.sensor, self.sensor.spot_fwhm_px
+        optical = np.sqrt(np.maximum(fwhm**2 - _PIXEL_BLUR_PX2, 0.25 * fwhm**2))
+        # As the kernel's table holds them.
+        reach = sensor.search_range_px.astype(np.float32)
+        return {
+            "flux_e": flux_e,
+            "read_noise_e": sensor.calibration.read_noise_photoelectrons,
+            "pixels": sensor.pixels,
+            "excess_noise": sensor.excess_noise,
+            "background_e": sensor.calibration.background_e,
+            "spot_fwhm_px": np.sqrt(optical.prod(axis=1)),
+            "elongation": optical.max(axis=1) / optical.min(axis=1),
+            "position_range_px": np.where(np.isfinite(reach), reach, _USUAL_RANGE_PX),
+        }
+
+
+def keep_all(table: NDArray[np.float32]) -> None:
+    """Leave out the background subtraction: every pixel stays as it is."""
+    table[gravity.RANK] = table[gravity.SUBTRACT] = 0.0
+    table[gravity.LEVEL] = -LARGEST_FLOAT32  # below every pixel

@@ -1,0 +1,61 @@
+"""Estimators for stacks of images, each image a sub-aperture of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from faintspot.checks import real_array
+from faintspot.errors import InputError
+from faintspot.estimators.base import Estimator
+from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.settings import Settings
+from faintspot.slopes import Slopes
+
+
+def measure(
+    images: ArrayLike,
+    settings: Settings | Estimator,
+    *,
+    calibration: Calibration | None = None,
+    psf: PSF | None = None,
+    score: TrainedScore | None = None,
+    prior: ArrayLike | None = None,
+) -> Slopes:
+    """Measure the positions of the spots of a stack of images, each image a sub-aperture of its own.
+
+    Parameters
+    ----------
+    images : (n, ny, nx) array
+        ADU; electrons with the default calibration.
+    settings : Settings or Estimator
+        Its arrays hold one value per image. Light that is not given (`flux_e`) is the mean of the stack.
+    calibration : Calibration, optional
+        Without maps: gain, dark level, read noise.
+    psf, score
+        As `SlopePipeline`; an index holds the PSF or kind of each image.
+    prior : (n, 2) array, optional
+        Predicted positions, px from the images' centres.
+
+    Returns
+    -------
+    Slopes
+        Arrays of shape (n,); x and y in px from each image's centre.
+
+    Raises
+    ------
+    InputError
+        For images that are not real or not three-dimensional, and as `SlopePipeline`.
+    """
+    stack = real_array("images", images)
+    if stack.ndim != 3:
+        raise InputError(f"images: expected shape (n, ny, nx), got {stack.shape}")
+    n, ny, nx = stack.shape
+    corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
+    layout = Layout((n * ny, nx), (ny, nx), corners)
+    pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score)
+    return pipeline(stack.reshape(n * ny, nx), prior)

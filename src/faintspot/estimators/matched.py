@@ -1,0 +1,60 @@
+"""Matched filter: least squares with the PSF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from faintspot.estimators.base import Need, Style
+from faintspot.estimators.registry import register
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.estimators.spots import BLURS, PSFPrepared
+from faintspot.estimators.stepping import Stepping
+from faintspot.kernels import located
+from faintspot.options import option
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fitted(Stepping):
+    """A fit of the PSF to the image."""
+
+    blur_px: Any = option(
+        0.0,
+        "Standard deviation of a Gaussian that the PSF is blurred with, for what turbulence adds to a spot.",
+        unit="px",
+        low=0.0,
+        high=16.0,
+        per_subaperture=False,
+    )
+
+    needs: ClassVar[frozenset[Need]] = frozenset({Need.PSF})
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Blurs, of spots that are speckled."""
+        if not scene.d_over_r0:
+            return {}
+        return {"blur_px": [factor * scene.lambda_over_d_px for factor in BLURS]}
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Matched(Fitted):
+    """Matched filter: least squares of position and light, all pixels weighted alike."""
+
+    name: ClassVar[str] = "matched"
+    label: ClassVar[str] = "matched filter"
+    method: ClassVar[str] = "matched filter, least squares with the PSF"
+    cost: ClassVar[float] = 0.26
+    style: ClassVar[Style] = Style("#CC79A7", "--", "v")
+
+    def prepared(self, sensor: Sensor) -> PSFPrepared:
+        """See `Estimator`."""
+        return _Prepared(self, sensor)
+
+
+class _Prepared(PSFPrepared):
+    """Tables of a fit in which every pixel has the same weight."""
+
+    kernel = staticmethod(located.fitted_of_groups)

@@ -1,0 +1,100 @@
+"""Maximum likelihood for Poisson and Gaussian noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erfc
+
+from faintspot.estimators.base import Estimator, Need, Style
+from faintspot.estimators.matched import Fitted
+from faintspot.estimators.registry import register
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.estimators.spots import PSFPrepared
+from faintspot.kernels import located
+from faintspot.options import option
+
+_MODEL_ERRORS = (0.3, 0.0, 1.0)  # of speckled spots
+_LEARNT_WEIGHT_FLOOR = 1e-3
+_WHOLE_ELECTRONS_BELOW = 0.25  # read noise (e-) that rounding to whole electrons nearly takes away
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Likelihood(Fitted):
+    """A fit whose weights follow from the noise."""
+
+    model_error: Any = option(
+        0.0,
+        "How far the spots differ from the PSF, as a fraction of each pixel's light: bright pixels are "
+        "trusted no more than that. 0.1 to 0.5 for speckled spots.",
+        low=0.0,
+        high=10.0,
+    )
+    weight_floor: Any = option(
+        2e-4,
+        "Variance, as a fraction of the light, that is added to every pixel's weight, so that small errors "
+        "of the PSF in dark wings carry no large weights.",
+        low=0.0,
+        high=1.0,
+    )
+
+    needs: ClassVar[frozenset[Need]] = frozenset({Need.PSF, Need.READ_NOISE})
+
+    def for_scene(self, scene: Scene) -> Self:
+        """Trust the wings of a learnt PSF less."""
+        return self.replaced({"weight_floor": _LEARNT_WEIGHT_FLOOR}) if scene.learnt else self
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Model errors, too, of spots that are speckled."""
+        errors = {"model_error": list(_MODEL_ERRORS)} if scene.d_over_r0 else {}
+        return {**super().tuned(scene), **errors}
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MaximumLikelihood(Likelihood):
+    """Position and light of maximum likelihood, by Fisher scoring."""
+
+    name: ClassVar[str] = "ml"
+    label: ClassVar[str] = "maximum likelihood"
+    method: ClassVar[str] = "maximum likelihood for Poisson and Gaussian noise"
+    cost: ClassVar[float] = 0.27
+    style: ClassVar[Style] = Style("#0072B2", "-", "P")
+
+    def prepared(self, sensor: Sensor) -> LikelihoodPrepared:
+        """See `Estimator`."""
+        return LikelihoodPrepared(self, sensor)
+
+
+class LikelihoodPrepared(PSFPrepared):
+    """Tables of a fit with weights; images of low noise are rounded to whole electrons."""
+
+    kernel = staticmethod(located.fitted_of_groups)
+
+    def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        noise = sensor.calibration.read_noise_photoelectrons
+        if self.rounds_electrons and noise is not None:
+            # What rounding leaves: an electron too much or too little where the noise is beyond one half.
+            self.variance = float(erfc(0.5 / (noise * math.sqrt(2.0)))) if noise > 0 else 0.0
+
+    @property
+    def rounds_electrons(self) -> bool:
+        """See `SpotPrepared`."""
+        camera = self.sensor.calibration
+        noise = camera.read_noise_photoelectrons
+        low = noise is not None and noise < _WHOLE_ELECTRONS_BELOW
+        return low and camera.em_gain == 1 and camera.background_e == 0
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `Prepared`."""
+        super().fill(table)
+        table[located.WEIGHT_FLOOR] = self.each("weight_floor")
+        table[located.WEIGHT_EXCESS] = self.sensor.excess_noise
+        table[located.MODEL_ERROR] = self.each("model_error")

@@ -1,0 +1,107 @@
+"""Estimators in plain NumPy: images are calibrated by the compiled kernel, positions found in Python."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.estimators.base import Estimator, Positions, Prepared
+from faintspot.estimators.gravity import keep_all
+from faintspot.estimators.sensor import Sensor
+from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.kernels import gravity, groups
+from faintspot.kernels.flat_start import NO_TABLE
+from faintspot.kernels.groups import SlopeArrays
+
+_NO_LIGHT = np.uint8(SubapertureFlag.NO_LIGHT)
+
+
+class PythonPrepared(Prepared):
+    """The kernel calibrates images and flags what is bad; `locate` then finds the positions.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        With a `locate` of its own.
+    sensor : Sensor
+    """
+
+    kernel = staticmethod(gravity.gravity_of_groups)
+    setting_rows = gravity.SETTING_ROWS
+
+    def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        if type(estimator).locate is Estimator.locate:
+            raise InputError(
+                f"estimator {estimator.name!r}: expected a class with `locate` or `prepared`, got neither"
+            )
+        ones = np.ones((sensor.n, 2, 1), np.float32)
+        self._tables = gravity.GravityTables(gravity.NOTHING, 0, NO_TABLE, ones)
+
+    @property
+    def tables(self) -> Any:
+        """See `Prepared`."""
+        return self._tables
+
+    @property
+    def own_scratch(self) -> Any:
+        """See `Prepared`."""
+        return gravity.gravity_scratch
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: NDArray[np.float64]) -> None:
+        """See `Prepared`."""
+        keep_all(table)
+
+    def locate_frame(
+        self,
+        images: NDArray[np.float32],
+        prior: NDArray[np.float32],
+        table: NDArray[np.float32],
+        frame: int,
+        slopes: SlopeArrays,
+    ) -> None:
+        """Write the slopes of one frame; flags hold what the calibration has found.
+
+        Parameters
+        ----------
+        images : (n, ny, nx) float32
+        prior : (2, n) float32
+            Predicted slopes, px from the reference.
+        table : (rows, n) float32
+            Of settings.
+        frame : int
+            Number of the frame in `slopes`.
+        slopes : SlopeArrays
+
+        Raises
+        ------
+        InputError
+            When the estimator returns something of another shape.
+        """
+        sensor, n = self.sensor, self.sensor.n
+        found = self.estimator.locate(images, sensor, (sensor.zero + prior.T).astype(np.float64))
+        if not isinstance(found, Positions):
+            array = np.asarray(found)
+            if array.shape != (n, 2):
+                raise InputError(
+                    f"estimator {self.estimator.name!r}: locate: expected an array ({n}, 2), got {array.shape}"
+                )
+            found = Positions(array[:, 0], array[:, 1])
+        light = images.sum(axis=(1, 2)) if found.flux is None else found.flux
+        usable = np.isfinite(found.x) & np.isfinite(found.y) & np.isfinite(light)
+        usable &= np.ones(n, bool) if found.valid is None else np.asarray(found.valid, bool)
+        flags = slopes.flags[frame]
+        flags &= ~_NO_LIGHT
+        flags[~usable & (flags & INVALID == 0)] |= _NO_LIGHT
+        valid = (flags & INVALID) == 0
+        reach, scale = table[groups.RANGE], table[groups.ERROR_SCALE]
+        slopes.flux[frame] = np.where(usable, light, 0.0)
+        for axis, position in enumerate((found.x, found.y)):
+            away = np.where(valid, position, 0.0) - np.where(valid, sensor.zero[:, axis], 0.0)
+            (slopes.x, slopes.y)[axis][frame] = np.clip(away, -reach, reach)
+        errors = found.standard_error_x, found.standard_error_y
+        for error, result in zip(errors, (slopes.standard_error_x, slopes.standard_error_y), strict=True):
+            result[frame] = np.inf if error is None else np.where(valid, scale * error, np.inf)

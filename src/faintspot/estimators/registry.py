@@ -1,0 +1,93 @@
+"""Which estimators there are, by name: the built-in ones, those of installed packages, and one's own."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, TypeVar
+
+from faintspot.errors import InputError
+
+if TYPE_CHECKING:
+    from faintspot.estimators.base import Estimator
+
+ENTRY_POINTS = "faintspot.estimators"
+_BUILT_IN = (
+    "brightest",
+    "total_variation",
+    "smoothed",
+    "centroid",
+    "thresholded",
+    "weighted",
+    "matched",
+    "maximum_likelihood",
+    "maximum_a_posteriori",
+    "trained",
+)
+"""Modules of this package, in the order in which estimators are shown."""
+
+Kind = TypeVar("Kind", bound="type[Estimator]")
+_kinds: dict[str, type[Estimator]] = {}
+
+
+def register(kind: Kind) -> Kind:
+    """Make an estimator known by its name; a decorator of its class.
+
+    Raises
+    ------
+    InputError
+        When another one has that name.
+    """
+    name = getattr(kind, "name", None)
+    if not isinstance(name, str) or not name.isidentifier():
+        raise InputError(f"estimator {kind.__name__}: name = {name!r}: expected a word")
+    other = _kinds.get(name)
+    if other is not None and (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise InputError(f"estimator {name!r}: {other.__module__} has one of that name already")
+    _kinds[name] = kind
+    return kind
+
+
+def estimators() -> dict[str, type[Estimator]]:
+    """Return every estimator's class by name: built-in ones first, in the order in which they are shown."""
+    _load()
+    return dict(_kinds)
+
+
+def estimator_named(name: str) -> type[Estimator]:
+    """Return the class of an estimator.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+    """
+    _load()
+    if not isinstance(name, str) or name not in _kinds:
+        former = FORMER_NAMES.get(name) if isinstance(name, str) else None
+        hint = f"; {name!r} is now {former!r}" if former else ""
+        raise InputError(
+            f"estimator = {name!r}: expected one of {', '.join(repr(known) for known in _kinds)}{hint}"
+        )
+    return _kinds[name]
+
+
+FORMER_NAMES = {"plain": "brightest", "gaussian": "smoothed", "cog": "centroid"}
+"""What some were called in studies and closed loops of version 0.1."""
+
+
+@cache
+def _load() -> None:
+    """Import the built-in estimators, and those of installed packages."""
+    for module in _BUILT_IN:
+        import_module(f"faintspot.estimators.{module}")
+    for point in entry_points(group=ENTRY_POINTS):
+        try:
+            point.load()
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".split("\n")[0]
+            package = point.dist.name if point.dist else "?"
+            raise InputError(
+                f"estimator {point.name!r} of the package {package}: {reason}; mend or uninstall it"
+            ) from None

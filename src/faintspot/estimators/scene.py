@@ -1,0 +1,91 @@
+"""What is known of spots and camera when an estimator's options are chosen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+_PIXEL_BLUR_PX2 = 0.46  # that the pixel adds to the square of a Gaussian spot's width
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Light, camera and spots of a star.
+
+    Parameters
+    ----------
+    flux_e : float
+        Photo-electrons of a spot in a frame.
+    read_noise_e : float
+        Photo-electrons.
+    window : (int, int)
+        ny, nx of a sub-aperture, px.
+    spot_fwhm_px : float
+        Full width at half maximum of the optical spot, without the pixels' blur.
+    position_range_px : float
+        Spots are within plus and minus this of the reference on each axis.
+    elongation : float
+        Width along the long axis over that along the short one.
+    excess_noise : float
+        Factor on the photon noise's variance: 2 for an EMCCD at high gain.
+    background_e : float
+        Mean photo-electrons per pixel whose mean is taken off and whose noise stays.
+    d_over_r0 : float
+        Side of a sub-aperture in Fried parameters at the sensor's wavelength where that speckles the spots; 0
+        where it does not.
+    diffraction_px : float, optional
+        lambda / d on the detector, px. Default: that of a spot of this width.
+    profile : str
+        "diffraction" or "gaussian".
+    learnt : bool
+        Whether the PSF was learnt from frames.
+    """
+
+    flux_e: float
+    read_noise_e: float
+    window: tuple[int, int]
+    spot_fwhm_px: float
+    position_range_px: float
+    elongation: float = 1.0
+    excess_noise: float = 1.0
+    background_e: float = 0.0
+    d_over_r0: float = 0.0
+    diffraction_px: float | None = None
+    profile: str = "diffraction"
+    learnt: bool = False
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of a window."""
+        return self.window[0] * self.window[1]
+
+    @property
+    def dark_noise_e(self) -> float:
+        """Noise of a dark pixel, photo-electrons."""
+        return math.sqrt(self.read_noise_e**2 + self.excess_noise * self.background_e)
+
+    @property
+    def seen_fwhm_px(self) -> float:
+        """Width of the spots with the pixels' blur."""
+        return math.sqrt(self.spot_fwhm_px**2 + _PIXEL_BLUR_PX2)
+
+    @property
+    def lambda_over_d_px(self) -> float:
+        """Lambda / d, px."""
+        return self.spot_fwhm_px / 0.886 if self.diffraction_px is None else self.diffraction_px
+
+    @property
+    def rule_arguments(self) -> dict[str, Any]:
+        """Arguments of the automatic rules, see `faintspot.estimate.automatic`."""
+        return {
+            "flux_e": self.flux_e,
+            "read_noise_e": self.read_noise_e,
+            "pixels": self.pixels,
+            "spot_fwhm_px": self.spot_fwhm_px,
+            "elongation": self.elongation,
+            "excess_noise": self.excess_noise,
+            "background_e": self.background_e,
+            "position_range_px": self.position_range_px,
+            "profile": self.profile,
+        }

@@ -1,0 +1,84 @@
+"""What an estimator is prepared for: the sensor, its camera, and what is known of its spots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor as an estimator sees it.
+
+    Parameters
+    ----------
+    layout : Layout
+    calibration : Calibration
+    psf, score : PSF, TrainedScore, or None
+    zero : (n, 2) array
+        Reference positions, px from the windows' middles.
+    search_range_px : (n,) array
+        How far from it a position may be; infinite where anywhere.
+    flux_e : (n,) array
+        Expected light, electrons; NaN where it is not known.
+    given_fwhm_px : (n, 2) array
+        Full width at half maximum of the spots along x and y; NaN where it is not given.
+    width : int
+        SIMD lanes.
+    """
+
+    layout: Layout
+    calibration: Calibration
+    psf: PSF | None
+    score: TrainedScore | None
+    zero: Floats
+    search_range_px: Floats
+    flux_e: Floats
+    given_fwhm_px: Floats
+    width: int
+
+    @property
+    def n(self) -> int:
+        """Number of sub-apertures."""
+        return len(self.layout)
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """ny, nx of a sub-aperture, px."""
+        return self.layout.window
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of a sub-aperture."""
+        return self.layout.pixels
+
+    @property
+    def excess_noise(self) -> float:
+        """Factor on the photon noise's variance."""
+        return self.calibration.excess_noise
+
+    @property
+    def variance(self) -> float:
+        """Of a dark pixel, photo-electrons squared; 0 where the read noise is not known."""
+        noise = self.calibration.read_noise_photoelectrons
+        background = self.calibration.excess_noise * self.calibration.background_e
+        return 0.0 if noise is None else noise**2 + background
+
+    @cached_property
+    def spot_fwhm_px(self) -> Floats:
+        """Full width at half maximum of every spot along x and y, (n, 2); NaN where unknown."""
+        given = self.given_fwhm_px
+        if self.psf is None:
+            return given
+        learnt = self.psf.fwhm_px[self.psf.index_of(self.n)]
+        return np.where(np.isnan(given), learnt, given)

@@ -1,0 +1,90 @@
+"""Linear Gaussian smoothing, brightest pixels, centre of gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.estimate.automatic import automatic_smoothing
+from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.gravity import GravityPrepared, KeepingBrightest
+from faintspot.estimators.registry import register
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.estimators.spot_tables import gaussian_taps
+from faintspot.kernels import gravity
+from faintspot.options import option
+
+_USUAL_PX = 0.7
+_WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # times the automatic width
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Smoothed(KeepingBrightest):
+    """Centre of gravity of the brightest pixels of the image smoothed by a Gaussian."""
+
+    smoothing_px: Any = option(
+        None,
+        "Standard deviation of the Gaussian. Default 0.7.",
+        unit="px",
+        low=0.0,
+        high=16.0,
+        low_open=True,
+    )
+
+    name: ClassVar[str] = "smoothed"
+    label: ClassVar[str] = "Gaussian smoothing"
+    method: ClassVar[str] = "linear Gaussian smoothing, brightest pixels, centre of gravity"
+    cost: ClassVar[float] = 0.22
+    style: ClassVar[Style] = Style("#E69F00", "-", "D")
+    steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, Step("smoothed", "denoised"), BACKGROUND)
+    automatic_method: ClassVar[str] = "smoothed"
+
+    @property
+    def denoises(self) -> bool:
+        """See `Estimator`."""
+        return True
+
+    def without_denoising(self) -> BrightestPixels:
+        """See `Estimator`."""
+        return BrightestPixels(**{name: getattr(self, name) for name in BrightestPixels.declared()})
+
+    def default_of(self, name: str, pixels: int) -> Any:
+        """See `Options`."""
+        return _USUAL_PX if name == "smoothing_px" else super().default_of(name, pixels)
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        width = self._span("smoothing_px", n_subapertures, pixels)
+        return f"Gaussian smoothing of {width} px; {self.kept_in_words(n_subapertures, pixels)}"
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Widths around the automatic one, too."""
+        width = float(automatic_smoothing(**scene.rule_arguments)) or _USUAL_PX
+        return {**super().tuned(scene), "smoothing_px": [width * factor for factor in _WIDTHS]}
+
+    def prepared(self, sensor: Sensor) -> GravityPrepared:
+        """See `Estimator`."""
+        return _Prepared(self, sensor)
+
+
+class _Prepared(GravityPrepared):
+    """Taps of the smoothing."""
+
+    @property
+    def before(self) -> int:
+        """Smoothing."""
+        return gravity.SMOOTH
+
+    @cached_property
+    def taps(self) -> NDArray[np.float32]:
+        """See `GravityPrepared`."""
+        std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
+        return gaussian_taps(std, self.sensor.window)

@@ -1,0 +1,301 @@
+"""What the estimators that know the spot need, in the kernels' own form, computed before the first frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+from scipy.special import ndtri
+
+from faintspot.kernels.located import SMALLEST_VARIANCE
+from faintspot.kernels.profiles import MARGIN, PHASES
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+
+Floats = NDArray[np.float64]
+
+FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
+START_SMOOTHING = (
+    0.73  # standard deviation of the smoothing in units of the spot's FWHM: about a matched filter
+)
+_REACH = 2.5  # standard deviations at which a Gaussian is cut off
+_START_OFFSETS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # of the spot from the pixel that it is the brightest of, px
+_OUTLIER_FRACTION = 0.01  # from which on a slope is flagged
+_NEAR_OUTLIERS = 0.9
+_GRID_OF_FWHM = 0.25  # spacing of the posterior's grid; at most ...
+_COARSEST_OF_FWHM = 0.4
+_GRID_POSITIONS = 13  # ... and otherwise about so many positions along an axis
+
+
+@dataclass(frozen=True)
+class SpotModel:
+    """Profiles of the spots, or of the weights that follow them, as the kernels read them."""
+
+    tables: NDArray[np.float32]
+    """(n_models, 2, rank, 2, PHASES, length), see `faintspot.kernels.profiles.look_up`."""
+    index: NDArray[np.int64]
+    """Model of each sub-aperture."""
+    fwhm_px: Floats
+    """Of the spots, (n_models, 2)."""
+    taps: NDArray[np.float32]
+    """Of the smoothing that finds the start, (n_models, 2, 1 + reach)."""
+    start_light: Floats
+    """What the brightest pixel of a smoothed spot has of its light, (n_models,)."""
+    gain: Floats
+    """Factor on the steps of the weighted centre of gravity, (n_models, 2)."""
+
+    @property
+    def rank(self) -> int:
+        """Number of separable terms."""
+        return int(self.tables.shape[2])
+
+
+def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int) -> SpotModel:
+    """Prepare the PSFs of n sub-apertures."""
+    along, across = psf.separable_terms
+    tables = [_profile_tables(terms, psf.oversampling, window, width) for terms in (along, across)]
+    taps = gaussian_taps(START_SMOOTHING * psf.fwhm_px, window)
+    light = _start_light(psf, taps)
+    ones = np.ones((len(light), 2))
+    return SpotModel(np.stack(tables, axis=1), psf.index_of(n), psf.fwhm_px, taps, light, ones)
+
+
+def model_of_weights(
+    weight_fwhm_px: Floats, spot_fwhm_px: Floats, psf: PSF | None, window: tuple[int, int], width: int
+) -> SpotModel:
+    """Prepare the Gaussian weights of every sub-aperture, widths (n, 2) along x and y.
+
+    The spots are Gaussian unless the PSF is known.
+    """
+    n = len(weight_fwhm_px)
+    planes = np.zeros(n, np.int64) if psf is None else psf.index_of(n)
+    kinds, index = np.unique(
+        np.column_stack([weight_fwhm_px, spot_fwhm_px, planes]), axis=0, return_inverse=True
+    )
+    weights, fwhm, planes = kinds[:, :2], kinds[:, 2:4], kinds[:, 4].astype(np.int64)
+    std = weights * FWHM_TO_STD
+    tables = [_gaussian_tables(std[:, axis], window, width) for axis in range(2)]
+    taps = gaussian_taps(START_SMOOTHING * fwhm, window)
+    spots = psf
+    if spots is None:
+        spots, planes, gains = gaussian_psf(fwhm), np.arange(len(fwhm)), 1.0 + (fwhm / weights) ** 2
+    else:
+        gains = np.stack([_weighted_gain(spots, int(i), own) for i, own in zip(planes, std, strict=True)])
+    light = np.array([_start_light(spots, taps[i : i + 1], int(k))[0] for i, k in enumerate(planes)])
+    return SpotModel(np.stack(tables, axis=1), index.reshape(-1), fwhm, taps, light, gains)
+
+
+def gaussian_psf(fwhm_px: Floats) -> PSF:
+    """Return Gaussian spots of widths (n, 2) along x and y."""
+    longer, shorter = fwhm_px.max(axis=1), fwhm_px.min(axis=1)
+    return PSF.analytic(
+        "gaussian",
+        size=shorter / 2.0,
+        elongation=longer / shorter,
+        angle_deg=np.where(fwhm_px[:, 0] < fwhm_px[:, 1], 90.0, 0.0),
+        radius_px=10.0,
+        index=np.arange(len(fwhm_px)),
+    )
+
+
+def gaussian_taps(std_px: Floats, window: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the taps (..., 1 + reach) of Gaussians, the central one first, each with sum 1."""
+    reach = max(1, min(math.ceil(_REACH * float(np.max(std_px))), max(window) - 1))
+    exponent = -0.5 * (np.arange(reach + 1) / np.asarray(std_px)[..., None]) ** 2
+    taps = np.exp(exponent)
+    taps /= 2.0 * taps.sum(axis=-1, keepdims=True) - taps[..., :1]
+    return taps.astype(np.float32)
+
+
+def _places(window: tuple[int, int], width: int) -> tuple[int, Floats]:
+    """Return the length of a profile's table, and the offsets (PHASES, length) of its elements, px."""
+    margin = max(window) + MARGIN
+    length = 2 * margin + 2 * width
+    return length, np.arange(length) - margin + np.arange(PHASES)[:, None] / PHASES
+
+
+def _profile_tables(
+    terms: Floats, oversampling: int, window: tuple[int, int], width: int
+) -> NDArray[np.float32]:
+    """Profiles (n, rank, nodes) and their derivatives in the position, (n, rank, 2, PHASES, length)."""
+    _, offsets = _places(window, width)
+    half = (terms.shape[2] - 1) / 2 / oversampling
+    nodes = np.linspace(-half, half, terms.shape[2])
+    spline = CubicSpline(nodes, terms, axis=2)
+    inside = np.abs(offsets) <= half
+    place = np.where(inside, offsets, 0.0)
+    # An offset is pixel - position: the derivative in the position has the other sign.
+    values = np.stack([spline(place), -spline(place, 1)], axis=2)
+    return np.ascontiguousarray(np.where(inside, values, 0.0), np.float32)
+
+
+def _gaussian_tables(std_px: Floats, window: tuple[int, int], width: int) -> NDArray[np.float32]:
+    """Weights, 1 at the centre, as `_profile_tables`."""
+    _, offsets = _places(window, width)
+    z = offsets / std_px[:, None, None]
+    weight = np.exp(-0.5 * z**2)
+    values = np.stack([weight, weight * z / std_px[:, None, None]], axis=1)
+    return np.ascontiguousarray(values[:, None], np.float32)
+
+
+def _start_light(psf: PSF, taps: NDArray[np.float32], plane: int | None = None) -> Floats:
+    """Mean over sub-pixel positions of the smoothed spot's brightest pixel."""
+    offsets = np.array([(x, y) for x in _START_OFFSETS for y in _START_OFFSETS])
+    reach = taps.shape[2] - 1
+    side = 2 * reach + 1
+    light = np.empty(len(taps))
+    for i, (along, across) in enumerate(taps.astype(np.float64)):
+        images = psf.images(offsets, (side, side), which=i if plane is None else plane)
+        both = [np.concatenate([values[:0:-1], values]) for values in (along, across)]
+        light[i] = np.einsum("nyx,x,y->n", images, both[0], both[1]).mean()
+    return np.maximum(light, 1e-6)
+
+
+def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:
+    """Inverse of what the weighted centre of gravity sees of a small displacement, along x and y."""
+    side = 2 * math.ceil(4.0 * float(std_px.max())) + 5
+    u = np.arange(side) - (side - 1) / 2
+    step, seen = 0.05, np.zeros(2)
+    phases = (0.0, 0.25, 0.5, 0.75)
+    for phase in phases:
+        along, across = (np.exp(-0.5 * ((u - phase) / own) ** 2) for own in std_px)
+        for axis in range(2):
+            moved = np.full((2, 2), phase)
+            moved[:, axis] += [-step, step]
+            images = psf.images(moved, (side, side), which=plane) * along * across[:, None]
+            profile = images.sum(axis=1 if axis == 0 else 2)
+            centre = profile @ (u - phase) / profile.sum(axis=1)
+            seen[axis] += (centre[1] - centre[0]) / (2 * step) / len(phases)
+    return 1.0 / np.maximum(seen, 0.05)
+
+
+def least_light(
+    psf: PSF, plane: int, variance: float, excess: float, search_range_px: float, side: int
+) -> float:
+    """Return the light (electrons) below which about 1 % of a spot's positions are those of noise.
+
+    A spot is confused with one of the n places in the search range where the noise may make another when the
+    difference of two log-likelihood ratios, of variance twice its mean, goes the wrong way: t such that
+    n Q(t / sqrt(2)) = 0.01 standard deviations of significance, where t^2 / 2 is the expected log-likelihood
+    ratio of the spot against no spot. To that 0.9 is added, found by simulation: errors beyond 1 px come from
+    neighbouring places as well.
+    """
+    reach = min(search_range_px, 0.5 * side)
+    places = max(1.0, (2.0 * reach / float(psf.fwhm_px[plane].mean())) ** 2)
+    wanted = 0.5 * (math.sqrt(2.0) * -float(ndtri(_OUTLIER_FRACTION / places)) + _NEAR_OUTLIERS) ** 2
+    offsets = np.array([(x, y) for x in _START_OFFSETS for y in _START_OFFSETS])
+    image = np.maximum(psf.images(offsets, (side, side), which=plane), 0.0).mean(axis=0)
+    if not image.any():
+        return 0.0  # there is no spot to tell from noise
+    v = max(variance, SMALLEST_VARIANCE)
+
+    def missing(log_flux: float) -> float:
+        m = math.exp(log_flux) * image
+        ratio = ((m + v / excess) / excess * np.log1p(excess * m / v) - m / excess).sum()
+        return math.log(max(ratio, 1e-300) / wanted)
+
+    return math.exp(brentq(missing, math.log(1e-6), math.log(1e15), rtol=1e-4))
+
+
+# Posterior on a grid --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PosteriorGrid:
+    """Log-likelihoods of the positions of a grid, see `faintspot.kernels.posterior`."""
+
+    tables: NDArray[np.float32]
+    constants: NDArray[np.float32]
+    grid: NDArray[np.float32]
+    spacing: float
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """What the kernel takes."""
+        return self.tables, self.constants, self.grid, self.spacing
+
+
+NO_POSTERIOR = PosteriorGrid(
+    np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1), np.float32), np.zeros((1, 2), np.float32), 1.0
+)
+
+
+def joined(parts: list[PosteriorGrid]) -> PosteriorGrid:
+    """Return the tables of several levels of light, on one grid, one after the other."""
+    return PosteriorGrid(
+        np.concatenate([part.tables for part in parts]),
+        np.concatenate([part.constants for part in parts]),
+        parts[0].grid,
+        parts[0].spacing,
+    )
+
+
+def posterior_grid(
+    reach_px: float, fwhm_px: float, window: tuple[int, int]
+) -> tuple[NDArray[np.float32], float]:
+    """Return positions (n, 2) that cover +-reach_px around the window's centre, and their spacing."""
+    spacing = min(max(_GRID_OF_FWHM * fwhm_px, 2.0 * reach_px / _GRID_POSITIONS), _COARSEST_OF_FWHM * fwhm_px)
+    axes = []
+    for n in (window[1], window[0]):
+        count = math.floor(min(reach_px, 0.5 * n) / spacing + 0.5)
+        axes.append(spacing * np.arange(-count, count + 1))
+    x, y = np.meshgrid(*axes)
+    return np.column_stack([x.ravel(), y.ravel()]).astype(np.float32), spacing
+
+
+def posterior_tables(
+    psf: PSF,
+    planes: NDArray[np.int64],
+    flux_e: Floats,
+    variance: Floats,
+    excess: float,
+    grid: NDArray[np.float32],
+    spacing: float,
+    window: tuple[int, int],
+    width: int,
+) -> PosteriorGrid:
+    """Prepare the grid's tables for each triple of a PSF, a flux and a dark pixel's variance."""
+    ny, nx = window
+    padded = -(-nx // width) * width
+    tables = np.zeros((len(flux_e), len(grid), ny, padded), np.float32)
+    constants = np.empty((len(flux_e), len(grid)), np.float32)
+    for i, (plane, flux, v) in enumerate(zip(planes, flux_e, variance, strict=True)):
+        mean = np.maximum(psf.images(grid, window, flux, which=int(plane)), 0.0)
+        v = max(v, SMALLEST_VARIANCE)
+        logarithm = np.log1p(excess * mean / v)
+        tables[i, :, :, :nx] = logarithm / excess
+        constants[i] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))
+    return PosteriorGrid(tables, constants, grid, spacing)
+
+
+# Trained score --------------------------------------------------------------------------------------
+
+
+def score_tables(
+    score: TrainedScore, window: tuple[int, int], width: int
+) -> tuple[NDArray[np.float32], int, int]:
+    """Return the tables of `faintspot.kernels.trained.apply_score`, steps per pixel and margin.
+
+    Kind and flux class are one axis, the class counting faster.
+    """
+    steps = score.steps_per_px
+    margin = max(window) + MARGIN
+    side, length = 2 * margin + max(window), 2 * margin + max(window) + 2 * width
+    kinds, classes, passes, _, rows, columns = score.tables.shape
+    result = np.zeros((kinds * classes, passes, steps, steps, 2, side, length), np.float32)
+    flat = score.tables.reshape(kinds * classes, passes, 2, rows, columns)
+    for phase_y in range(steps):
+        # Node of element i: (i - margin) * steps + phase + (rows - 1) / 2.
+        node_y = (np.arange(side) - margin) * steps + phase_y + (rows - 1) // 2
+        inside_y = np.flatnonzero((node_y >= 0) & (node_y < rows))
+        for phase_x in range(steps):
+            node_x = (np.arange(length) - margin) * steps + phase_x + (columns - 1) // 2
+            inside_x = np.flatnonzero((node_x >= 0) & (node_x < columns))
+            picked = flat[:, :, :, node_y[inside_y][:, None], node_x[inside_x]]
+            result[:, :, phase_y, phase_x][:, :, :, inside_y[:, None], inside_x] = picked
+    return result, steps, margin

@@ -1,0 +1,106 @@
+"""What the estimators that know the spot share: its profiles, and the rows of their settings."""
+
+from __future__ import annotations
+
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.estimators import spot_tables
+from faintspot.estimators.base import Prepared
+from faintspot.estimators.spot_tables import SpotModel
+from faintspot.kernels import located
+from faintspot.kernels.groups import RANGE
+
+Floats = NDArray[np.float64]
+
+BLURS = (0.4, 0.0, 0.8, 1.2)
+"""Of a speckled spot's PSF, in units of lambda / d."""
+
+
+class SpotPrepared(Prepared):
+    """Settings and tables of an estimator that reads profiles of spots, or of weights that follow them."""
+
+    setting_rows = located.SETTING_ROWS
+
+    @cached_property
+    def model(self) -> SpotModel:
+        """Profiles of the spots, or of weights."""
+        raise NotImplementedError
+
+    @cached_property
+    def taps(self) -> NDArray[np.float32]:
+        """Taps of every sub-aperture's smoothing, (n, 2, 1 + reach)."""
+        return np.ascontiguousarray(self.model.taps[self.model.index])
+
+    @property
+    def step_count(self) -> int:
+        """Steps of the fit."""
+        return int(getattr(self.estimator, "step_count", 1))
+
+    @property
+    def rounds_electrons(self) -> bool:
+        """Whether images are rounded to whole electrons."""
+        return False
+
+    @property
+    def model_tables(self) -> located.ModelTables:
+        """What the kernels read that follow a profile."""
+        return located.ModelTables(self.step_count, self.rounds_electrons, self.taps, self.model.tables)
+
+    @property
+    def tables(self) -> Any:
+        """See `Prepared`."""
+        return self.model_tables
+
+    @cached_property
+    def own_scratch(self) -> Any:
+        """See `Prepared`."""
+        return partial(located.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `Prepared`."""
+        model, index = self.model, self.model.index
+        table[located.MODEL] = index
+        table[located.START_LIGHT] = model.start_light[index]
+        table[located.GAIN_X], table[located.GAIN_Y] = model.gain[index].T
+        table[located.LEAST_LIGHT] = self._least_light(table[RANGE])
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `Prepared`."""
+        table[located.FLUX] = np.nan_to_num(flux_e)
+
+    def _least_light(self, search_range_px: NDArray[np.float32]) -> Floats:
+        """Light of every sub-aperture below which outliers are to be expected."""
+        sensor = self.sensor
+        if sensor.psf is None:
+            widths, index = np.unique(sensor.spot_fwhm_px, axis=0, return_inverse=True)
+            spots, index = spot_tables.gaussian_psf(widths), index.reshape(-1)
+        else:
+            spots, index = self.psf, self.psf.index_of(sensor.n)
+        table: Floats = np.column_stack([index, search_range_px])
+        pairs, which = np.unique(table, axis=0, return_inverse=True)
+        side = max(sensor.window)
+        light = [
+            spot_tables.least_light(spots, int(plane), self.variance, sensor.excess_noise, float(reach), side)
+            for plane, reach in pairs
+        ]
+        least: Floats = np.array(light)[which.reshape(-1)]
+        return least
+
+    @cached_property
+    def psf(self) -> Any:
+        """The sensor's PSF, blurred where the estimator asks for that."""
+        psf, blur = self.sensor.psf, float(getattr(self.estimator, "blur_px", 0.0))
+        return psf.blurred(blur) if psf is not None and blur > 0 else psf
+
+
+class PSFPrepared(SpotPrepared):
+    """The same with the PSF itself."""
+
+    @cached_property
+    def model(self) -> SpotModel:
+        """Profiles of the spots."""
+        return spot_tables.model_of_psf(self.psf, self.sensor.n, self.sensor.window, self.sensor.width)

@@ -1,0 +1,31 @@
+"""What the estimators share that make a number of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from faintspot.estimators.base import Estimator
+from faintspot.options import option
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stepping(Estimator):
+    """An estimator that makes the same number of steps for every image, so that the time is known."""
+
+    steps: Any = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
+
+    usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3}
+    """By preset."""
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps, also where none is given."""
+        return int(self.steps or self.usual_steps[getattr(self, "preset", "accurate")])
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        own = [name for name in self.chosen() if name not in ("steps", "preset")]
+        parts = [f"{name} {self._span(name, n_subapertures, pixels)}" for name in own]
+        return f"{self.method or self.label} ({', '.join([*parts, f'{self.step_count} steps'])})"

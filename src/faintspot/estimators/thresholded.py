@@ -1,0 +1,89 @@
+"""Centre of gravity of what is above a threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.estimators.base import Style
+from faintspot.estimators.gravity import Floats, Gravity, GravityPrepared
+from faintspot.estimators.registry import register
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.kernels import gravity
+from faintspot.kernels.host import WIDTHS, lanes_for
+from faintspot.kernels.thresholded import RowTables, thresholded_in_rows
+from faintspot.options import option
+
+_OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # times that of a dark pixel
+_OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # where a spot is bright
+_SMALLEST_E = 0.01
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Thresholded(Gravity):
+    """Centre of gravity of every pixel less a threshold; what is negative then counts as 0."""
+
+    threshold_e: Any = option(None, "What is taken off every pixel.", unit="e-", low=0.0, high=1e12)
+
+    name: ClassVar[str] = "thresholded"
+    label: ClassVar[str] = "thresholded centre of gravity"
+    method: ClassVar[str] = "centre of gravity of what is above a threshold"
+    cost: ClassVar[float] = 0.15
+    style: ClassVar[Style] = Style("#9a9a9a", ":", "X")
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        return f"centre of gravity of what is above {self._span('threshold_e', n_subapertures, pixels)} e-"
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Multiples of a dark pixel's noise, and fractions of a typical spot's peak."""
+        peak = scene.flux_e / (2.5 * scene.seen_fwhm_px**2)
+        levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [
+            factor * peak for factor in _OF_PEAK
+        ]
+        return {"threshold_e": list(dict.fromkeys(max(float(f"{e:.3g}"), _SMALLEST_E) for e in levels))}
+
+    def check(self, sensor: Sensor) -> None:
+        """See `Estimator`."""
+        if np.isnan(self.values("threshold_e", sensor.n, sensor.pixels).astype(float)).any():
+            raise InputError(
+                f"estimator.threshold_e: expected a level (electrons) for estimator {self.name!r}, got none"
+            )
+
+    def prepared(self, sensor: Sensor) -> GravityPrepared:
+        """See `Estimator`."""
+        return _Prepared(self, sensor)
+
+
+class _Prepared(GravityPrepared):
+    """Thresholds, and what the kernel takes that measures pixels in rows, where that is possible."""
+
+    def __init__(self, estimator: Thresholded, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        columns = sensor.window[1]
+        self._widths = [width for width in WIDTHS if columns % width == 0 and width <= sensor.width]
+        if self._widths:
+            self.kernel = thresholded_in_rows
+
+    @cached_property
+    def tables(self) -> Any:
+        """See `Prepared`."""
+        tables = super().tables
+        if not self._widths:
+            return tables
+        maps = np.ascontiguousarray(self.sensor.calibration.maps(self.sensor.layout.frame_shape), np.float32)
+        columns = self.sensor.window[1]
+        ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
+        return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables)
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `Prepared`."""
+        table[gravity.LEVEL], table[gravity.SUBTRACT] = self.each("threshold_e"), 1.0

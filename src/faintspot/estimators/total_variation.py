@@ -1,0 +1,164 @@
+"""Total-variation denoising, brightest pixels, centre of gravity: the paper's method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.estimate.automatic import automatic_strength
+from faintspot.estimate.noise import suggested_strength
+from faintspot.estimate.total_variation import ALGORITHMS
+from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.gravity import Floats, GravityPrepared, KeepingBrightest
+from faintspot.estimators.registry import register
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.kernels import gravity
+from faintspot.kernels.flat_start import NO_TABLE, flat_start_table
+from faintspot.options import PerSubaperture, is_auto, option
+from faintspot.presets import PRESETS, of_denoising, starts_flat
+
+_STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # times the automatic strength
+_LEAST_STRENGTH_E = 1e-3
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TotalVariation(KeepingBrightest):
+    """Centre of gravity of the brightest pixels of the denoised image (Basden et al. 2015, MNRAS)."""
+
+    noise_std: Any = option(
+        None,
+        'Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from '
+        "read noise, light and spot, by `faintspot.estimate.automatic.automatic_strength`. 0: not denoised.",
+        unit="e-",
+        low=0.0,
+        automatic=True,
+    )
+    tolerance: Any = option(
+        None,
+        "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. "
+        'Default: that of the preset, 0.01 or, with "fast", 0: only the limit stops it.',
+        low=0.0,
+        high=1.0,
+    )
+    max_iterations: Any = option(
+        None, "Its iteration limit. Default: that of the preset, 200 or 8.", low=1, high=2**24, whole=True
+    )
+    algorithm: str = option(
+        "fgp", "How the denoising iterates.", choices=tuple(ALGORITHMS), per_subaperture=False
+    )
+    preset: str = option(
+        "accurate",
+        '"fast" does little work, and the same for every image: the denoising begins at the dual field of a '
+        "flat solution and makes 8 iterations. docs/fast.md says what it costs.",
+        choices=PRESETS,
+        per_subaperture=False,
+    )
+
+    name: ClassVar[str] = "tv"
+    label: ClassVar[str] = "TV denoising"
+    method: ClassVar[str] = "total-variation denoising, brightest pixels, centre of gravity"
+    cost: ClassVar[float] = 0.71
+    style: ClassVar[Style] = Style("#D55E00", "-", "s")
+    steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, Step("denoised", "denoised"), BACKGROUND)
+    automatic_method: ClassVar[str] = "tv"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        strength = self.noise_std
+        if strength is None or (isinstance(strength, PerSubaperture) and strength.default is None):
+            raise InputError(
+                'noise_std: expected a number (electrons) or "auto", got none; '
+                'or set estimator = "brightest", which does not denoise'
+            )
+
+    @property
+    def denoises(self) -> bool:
+        """See `Estimator`."""
+        return True
+
+    @property
+    def is_automatic(self) -> bool:
+        """See `KeepingBrightest`."""
+        return is_auto(self.noise_std) or is_auto(self.keep_brightest)
+
+    def without_denoising(self) -> BrightestPixels:
+        """See `Estimator`."""
+        return BrightestPixels(**{name: getattr(self, name) for name in BrightestPixels.declared()})
+
+    def default_of(self, name: str, pixels: int) -> Any:
+        """See `Options`."""
+        usual = of_denoising(self.preset)
+        return usual[name] if name in usual else super().default_of(name, pixels)
+
+    def in_words(self, n_subapertures: int, pixels: int) -> str:
+        """See `Estimator`."""
+        where, strength = "", self._span("noise_std", n_subapertures, pixels)
+        if not is_auto(self.noise_std):
+            denoised = int(np.count_nonzero(self.values("noise_std", n_subapertures, pixels)))
+            if denoised < n_subapertures:
+                where = f" in {denoised} of {n_subapertures} sub-apertures"
+        tolerance, limit = (
+            self._span(name, n_subapertures, pixels) for name in ("tolerance", "max_iterations")
+        )
+        return (
+            f"total-variation denoising{where} of strength {strength} e- ({self.algorithm}, tolerance "
+            f"{tolerance}, at most {limit} iterations); {self.kept_in_words(n_subapertures, pixels)}"
+        )
+
+    def for_scene(self, scene: Scene) -> Self:
+        """Do little work."""
+        return self.replaced({"preset": "fast"})
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Strengths around the automatic one, too."""
+        ordinary = float(
+            suggested_strength(scene.dark_noise_e, scene.excess_noise * scene.flux_e, scene.pixels)
+        )
+        strength = max(float(automatic_strength(**scene.rule_arguments)) or ordinary, _LEAST_STRENGTH_E)
+        return {**super().tuned(scene), "noise_std": [strength * factor for factor in _STRENGTHS]}
+
+    def prepared(self, sensor: Sensor) -> GravityPrepared:
+        """See `Estimator`."""
+        return _Prepared(self, sensor)
+
+
+class _Prepared(GravityPrepared):
+    """Strengths, and what the denoising starts with."""
+
+    estimator: TotalVariation
+
+    @property
+    def before(self) -> int:
+        """Denoising."""
+        return gravity.DENOISE
+
+    @property
+    def algorithm(self) -> int:
+        """Of the denoising."""
+        return ALGORITHMS[self.estimator.algorithm]
+
+    @cached_property
+    def flat_start(self) -> NDArray[np.float32]:
+        """See `GravityPrepared`."""
+        return flat_start_table(*self.sensor.window) if starts_flat(self.estimator.preset) else NO_TABLE
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `Prepared`."""
+        super().fill(table)
+        table[gravity.TOLERANCE], table[gravity.LIMIT] = self.each("tolerance"), self.each("max_iterations")
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `Prepared`."""
+        super().fill_light(table, flux_e)
+        automatic = is_auto(self.estimator.noise_std)
+        strength = automatic_strength(**self.rule_arguments(flux_e)) if automatic else self.each("noise_std")
+        table[gravity.STRENGTH] = strength

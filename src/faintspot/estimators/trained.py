@@ -1,0 +1,94 @@
+"""A linear score learnt for the sensor, applied in a few passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.estimators import spot_tables
+from faintspot.estimators.base import Estimator, Need, Prepared, Style
+from faintspot.estimators.registry import register
+from faintspot.estimators.sensor import Sensor
+from faintspot.kernels import located
+
+Floats = NDArray[np.float64]
+_LEAST_SMOOTHING_PX = 0.1
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trained(Estimator):
+    """The trained linear score; `faintspot.train_estimator` and `train_from_frames` make one."""
+
+    name: ClassVar[str] = "trained"
+    label: ClassVar[str] = "trained score"
+    method: ClassVar[str] = "a linear score learnt for the sensor, applied in a few passes"
+    needs: ClassVar[frozenset[Need]] = frozenset({Need.SCORE})
+    cost: ClassVar[float] = 0.15
+    style: ClassVar[Style] = Style("#6b3fa0", "-", "h")
+    takes_prior: ClassVar[bool] = True
+
+    def check(self, sensor: Sensor) -> None:
+        """See `Estimator`."""
+        super().check(sensor)
+        kinds = None if sensor.score is None else sensor.score.index
+        if kinds is not None and len(kinds) != sensor.n:
+            raise InputError(
+                f"score.index: expected {sensor.n} numbers, one per sub-aperture, got {len(kinds)}"
+            )
+
+    def prepared(self, sensor: Sensor) -> Prepared:
+        """See `Estimator`."""
+        return _Prepared(self, sensor)
+
+
+class _Prepared(Prepared):
+    """Tables of the score."""
+
+    kernel = staticmethod(located.scored_of_groups)
+    setting_rows = located.SETTING_ROWS
+
+    def __init__(self, estimator: Trained, sensor: Sensor) -> None:
+        super().__init__(estimator, sensor)
+        assert sensor.score is not None
+        self._score = sensor.score
+        self.needs_light = bool(np.isnan(sensor.flux_e).all())
+
+    @cached_property
+    def tables(self) -> Any:
+        """See `Prepared`."""
+        score, sensor = self._score, self.sensor
+        std = np.full((sensor.n, 2), max(score.smoothing_px, _LEAST_SMOOTHING_PX))
+        return located.ScoreTables(
+            score.passes,
+            score.start == "peak",
+            spot_tables.gaussian_taps(std, sensor.window),
+            *spot_tables.score_tables(score, sensor.window, sensor.width),
+        )
+
+    @cached_property
+    def own_scratch(self) -> Any:
+        """See `Prepared`."""
+        return partial(located.spot_scratch, taps=self.tables.taps.shape[2])
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `Prepared`."""
+        table[located.START_LIGHT] = 1.0  # the light is expected, not measured at the start
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `Prepared`."""
+        score = self._score
+        table[located.FLUX] = np.nan_to_num(flux_e)
+        classes = score.flux_class(flux_e)
+        kinds = 0 if score.index is None else score.index
+        table[located.KIND] = kinds * len(score.flux_e) + classes
+        levels = [score.standard_error(float(flux)) for flux in np.unique(flux_e)]
+        errors = np.stack(levels)[np.unique(flux_e, return_inverse=True)[1]]
+        own = np.arange(self.sensor.n) if score.index is not None else 0
+        errors = errors[np.arange(self.sensor.n), own]
+        table[located.TRAINED_ERROR_X], table[located.TRAINED_ERROR_Y] = errors.T

@@ -1,0 +1,111 @@
+"""Files that are never seen half written, whatever ends the program or the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from faintspot.errors import InputError
+
+_ADVICE = {
+    errno.ENOSPC: "the disk is full: free some space and run again, what is finished is kept",
+    errno.EDQUOT: "the disk quota is used up: free some space and run again, what is finished is kept",
+    errno.EACCES: "no permission to write there: choose another folder",
+    errno.EPERM: "no permission to write there: choose another folder",
+    errno.EROFS: "the file system is read-only: choose another folder",
+}
+Content = bytes | str | Callable[[BinaryIO], object]
+"""What a file is to contain, a text as UTF-8; or what writes that to a stream."""
+
+# Folders that cannot be synchronised: of some file systems, and those that may be written but not read.
+_CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
+
+
+@contextlib.contextmanager
+def output_errors(path: str | Path) -> Iterator[None]:
+    """Turn an OSError while writing into one line that names `path` and says what to do."""
+    try:
+        yield
+    except OSError as error:
+        reason = _ADVICE.get(error.errno or 0, f"{error.strerror or error}: choose another name")
+        raise InputError(f"{path}: cannot be written: {reason}") from None
+
+
+def write_atomically(path: str | Path, content: Content) -> None:
+    """Write a file in one step: a reader sees the old or the new one, also after the power has failed.
+
+    Parameters
+    ----------
+    path : path
+        The file; its folder must exist.
+    content : bytes, str or callable
+        See `Content`.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written; what was there before is still there.
+    """
+    path = Path(path)
+    with output_errors(path):
+        if not path.parent.is_dir():
+            raise InputError(
+                f"{path}: cannot be written: the folder {path.parent} does not exist: "
+                "create it or choose another"
+            )
+        replace_file(path, content)
+
+
+def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a compressed NumPy file (.npz) in one step, as `write_atomically` does.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    write_atomically(path, lambda stream: np.savez_compressed(stream, **arrays))
+
+
+def replace_file(path: Path, content: Content) -> None:
+    """Do what `write_atomically` does, with an OSError as it comes, for those who name another file in it."""
+    # A name of its own for each writer: two that write the same file must not share it.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.new")
+    try:
+        with temporary.open("wb") as stream:
+            if callable(content):
+                content(stream)
+            else:
+                stream.write(content.encode() if isinstance(content, str) else content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the content of a file is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_folder(path: Path) -> None:
+    """Wait until the names in a folder are on the disk, where the file system can do that."""
+    try:
+        sync_file(path)
+    except OSError as error:
+        if error.errno not in _CANNOT_SYNC:
+            raise

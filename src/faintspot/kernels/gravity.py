@@ -1,0 +1,189 @@
+"""Centres of gravity of the brightest pixels, after denoising, smoothing or nothing."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from faintspot.flags import SubapertureFlag
+from faintspot.kernels import brightest, total_variation
+from faintspot.kernels.compiling import compiled
+from faintspot.kernels.groups import (
+    BACKGROUND,
+    COMMON_ROWS,
+    DENOISED,
+    ERROR_X,
+    ERROR_Y,
+    EXCESS,
+    FLUX,
+    NO_LIGHT,
+    TOO_MANY_BAD_PIXELS,
+    VARIANCE,
+    X,
+    Y,
+    driver_of,
+    store_stage,
+)
+from faintspot.kernels.host import aligned_zeros
+from faintspot.kernels.simd import Lanes, width_of
+from faintspot.kernels.smoothing import gather_taps, smooth_group
+from faintspot.kernels.sweeps import STATE_VECTORS
+from faintspot.kernels.total_variation import denoise_group
+
+_find_threshold = brightest.find_threshold
+_subtract_background = brightest.subtract_background
+_centre_of_gravity = brightest.centre_of_gravity
+_centre_and_error = brightest.centre_and_error
+_find_largest = brightest.find_largest
+
+INFEASIBLE_STRENGTH = int(SubapertureFlag.INFEASIBLE_STRENGTH)
+NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
+
+# Rows of the settings' table that follow the common ones.
+STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(COMMON_ROWS, COMMON_ROWS + 7)
+SETTING_ROWS = COMMON_ROWS + 7
+
+NOTHING, SMOOTH, DENOISE = range(3)
+"""What is done before the background subtraction."""
+
+
+class GravityTables(NamedTuple):
+    """What the kernel reads beside the settings."""
+
+    before: Any
+    """NOTHING, SMOOTH or DENOISE."""
+    algorithm: Any
+    """Of the denoising, see `denoise_group`."""
+    flat_start: Any
+    """From `flat_start_table`; without elements, the denoising begins at zero."""
+    taps: Any
+    """(n_subapertures, 2, 1 + reach) float32: of the smoothing along x and y, the central one first."""
+
+
+class GravityScratch(NamedTuple):
+    """Memory of one thread: of the denoiser, and the lanes' values of denoiser and centroid."""
+
+    state: Any
+    rows: Any
+    denoiser: Any
+    counts: Any
+    centroid: Any
+
+
+def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
+    """Return the kernel's own memory."""
+    width, pixels = lanes.width, ny * nx
+    return GravityScratch(
+        aligned_zeros(STATE_VECTORS * pixels * width, lanes.dtype),
+        aligned_zeros((pixels + 2 * nx + 3) * width, lanes.dtype),
+        aligned_zeros(total_variation.LANE_ROWS * width, lanes.dtype),
+        np.zeros(total_variation.COUNT_ROWS * width, np.int64),
+        aligned_zeros(brightest.LANE_ROWS * width, lanes.dtype),
+    )
+
+
+@compiled
+def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Find the centres of gravity of a group; an estimator's own kernel of `groups.measure_groups`."""
+    lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
+    width = width_of(lanes)
+    image, output, own = scratch.image, scratch.spare, scratch.own
+    _read_settings(width, first, settings, own.denoiser, own.counts, own.centroid)
+    denoised = output
+    if tables.before == DENOISE:
+        denoise_group(
+            lanes,
+            tables.algorithm,
+            tables.flat_start,
+            ny,
+            nx,
+            image,
+            output,
+            own.state,
+            own.rows,
+            own.denoiser,
+            own.counts,
+        )
+    elif tables.before == SMOOTH:
+        gather_taps(width, first, tables.taps, own.rows)
+        smooth_group(lanes, image, ny, nx, tables.taps.shape[2] - 1, own.rows, own.state, output)
+    else:
+        denoised = image
+    if stages.shape[0] > 0:
+        store_stage(width, denoised, stages[DENOISED, group.frame], first)
+    _set_threshold(lanes, denoised, ny * nx, own.centroid)
+    if settings[VARIANCE, first] >= 0.0:
+        _centre_and_error(lanes, image, denoised, ny, nx, own.centroid)
+    else:
+        _centre_of_gravity(lanes, denoised, ny, nx, own.centroid)
+    if stages.shape[0] > 0:
+        _subtract_background(lanes, denoised, ny * nx, own.centroid, output)
+        store_stage(width, output, stages[BACKGROUND, group.frame], first)
+    for lane in range(width):
+        _store_result(width, lane, ny, nx, first, settings, own, scratch)
+
+
+@compiled
+def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
+    """Copy what the lanes' sub-apertures are set to."""
+    for lane in range(width):
+        s = min(first + lane, settings.shape[1] - 1)
+        denoiser[total_variation.STRENGTH * width + lane] = settings[STRENGTH, s]
+        denoiser[total_variation.TOLERANCE * width + lane] = settings[TOLERANCE, s]
+        counts[total_variation.LIMIT * width + lane] = int(settings[LIMIT, s])
+        counts[total_variation.ITERATIONS * width + lane] = 0
+        counts[total_variation.CONVERGED * width + lane] = 1
+        counts[total_variation.INFEASIBLE * width + lane] = 0
+        centroid[brightest.RANK * width + lane] = settings[RANK, s]
+        centroid[brightest.SUBTRACT * width + lane] = settings[SUBTRACT, s]
+        centroid[brightest.THRESHOLD * width + lane] = settings[LEVEL, s]
+        centroid[brightest.VARIANCE * width + lane] = settings[VARIANCE, s]
+        centroid[brightest.EXCESS * width + lane] = settings[EXCESS, s]
+
+
+@compiled
+def _set_threshold(lanes: Any, image: Any, pixels: Any, centroid: Any) -> None:
+    """Find THRESHOLD and LARGEST; without a RANK, THRESHOLD is given."""
+    if centroid[brightest.RANK * width_of(lanes)] > 0.0:
+        _find_threshold(lanes, image, pixels, centroid)
+    else:
+        _find_largest(lanes, image, pixels, centroid)
+
+
+@compiled
+def _store_result(
+    width: Any, lane: Any, ny: Any, nx: Any, first: Any, settings: Any, own: Any, scratch: Any
+) -> None:
+    """Write one lane's result, and the bits of its flags."""
+    s = min(first + lane, settings.shape[1] - 1)
+    counts, centroid, found = own.counts, own.centroid, scratch.results
+    bits = scratch.flags[lane]
+    if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
+        if counts[total_variation.INFEASIBLE * width + lane]:
+            bits |= INFEASIBLE_STRENGTH
+        if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:
+            bits |= NOT_CONVERGED
+    light, largest = centroid[brightest.SUM * width + lane], centroid[brightest.LARGEST * width + lane]
+    x, y = centroid[brightest.X * width + lane], centroid[brightest.Y * width + lane]
+    scratch.flags[lane] = bits | lightless(ny, nx, bits, light, settings[FLOOR, s] * largest, x, y)
+    scratch.iterations[lane] = counts[total_variation.ITERATIONS * width + lane]
+    found[FLUX * width + lane] = light
+    found[X * width + lane], found[Y * width + lane] = x, y
+    found[ERROR_X * width + lane] = centroid[brightest.ERROR_X * width + lane]
+    found[ERROR_Y * width + lane] = centroid[brightest.ERROR_Y * width + lane]
+
+
+@compiled
+def lightless(ny: Any, nx: Any, bits: Any, light: Any, floor: Any, x: Any, y: Any) -> Any:
+    """NO_LIGHT where nothing usable was left of an image that is not invalid for another reason, else 0.
+
+    A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
+    """
+    inside = abs(x) <= 0.5 * nx and abs(y) <= 0.5 * ny
+    if bits & TOO_MANY_BAD_PIXELS or (light > floor and inside):
+        return 0
+    return NO_LIGHT
+
+
+gravity_of_groups = driver_of(locate_gravity)

@@ -1,0 +1,296 @@
+"""From frames to slopes, group by group of W sub-apertures: one driver for every estimator.
+
+The driver gathers and calibrates a group, an estimator's own kernel locates its spots, and the driver stores
+what was found. Every function here works on the groups [start, stop), so that threads can share a job;
+results do not depend on how they do.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from faintspot.flags import SubapertureFlag
+from faintspot.kernels.compiling import compiled, compiled_with
+from faintspot.kernels.gather import calibrate, fill_bad_pixels, gather_raw, scatter_image
+from faintspot.kernels.host import aligned_zeros
+from faintspot.kernels.simd import Lanes, load, select, splat, store, width_of
+
+NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
+TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
+BAD_PIXELS = int(SubapertureFlag.BAD_PIXELS)
+SATURATED = int(SubapertureFlag.SATURATED)
+
+# Rows of the table of per-sub-aperture settings (n_rows, n_subapertures), float32, that all estimators share:
+# reference position and how far from it a position may be; bad pixels; noise of a pixel that collects m
+# electrons, VARIANCE + EXCESS m (negative where unknown); factor on the standard error. An estimator's own
+# rows follow.
+ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE, EXCESS, ERROR_SCALE = range(7)
+COMMON_ROWS = 7
+
+# Rows of a group's results (RESULT_ROWS, W): position (px from the window's middle), light (e-), standard
+# errors.
+X, Y, FLUX, ERROR_X, ERROR_Y = range(5)
+RESULT_ROWS = 5
+
+# Rows of explain's stages (n_rows, n_frames, n_subapertures, pixels).
+CALIBRATED, DENOISED, BACKGROUND = range(3)
+STAGE_ROWS = 3
+
+
+class Source(NamedTuple):
+    """Where the pixels of a block of frames come from."""
+
+    lanes: Any
+    """Lanes: W sub-apertures at once."""
+    frames: Any
+    """(n_frames, h, w) uint16 or float32."""
+    corners: Any
+    """(n_subapertures, 2) int64: row and column of every window's first pixel."""
+    ny: Any
+    nx: Any
+    calibration: Any
+    """(n_groups, pixels, 2, W) float32: dark in ADU, and electrons per ADU (NaN in bad pixels)."""
+    saturation: Any
+    """In ADU."""
+
+
+class Task(NamedTuple):
+    """What is done to them."""
+
+    settings: Any
+    """(n_variants, rows, n_subapertures) float32."""
+    variants: Any
+    """(n_frames,) int64: which of these tables a frame is measured with."""
+    prior: Any
+    """(1 or n_frames, 2, n_subapertures) float32: predicted x and y, px from the reference position."""
+    tables: Any
+    """What else the estimator's own kernel reads: a NamedTuple."""
+
+
+class Group(NamedTuple):
+    """One group of one frame, for an estimator's own kernel."""
+
+    lanes: Any
+    ny: Any
+    nx: Any
+    frame: Any
+    """Its number in the block."""
+    first: Any
+    """Number of the first sub-aperture; the last group of a frame repeats its last one to fill the lanes."""
+    settings: Any
+    """(rows, n_subapertures)."""
+    predicted: Any
+    """(2, n_subapertures), px from the reference position."""
+
+
+class Scratch(NamedTuple):
+    """Memory of one thread."""
+
+    image: Any
+    """((pixels + 1) * W,): calibrated images, all lanes of a pixel side by side."""
+    spare: Any
+    """(pixels * W,): free for any use."""
+    results: Any
+    """(RESULT_ROWS * W,): written by the estimator's kernel."""
+    places: Any
+    """(W,) int64: free for any use."""
+    flags: Any
+    """(W,) int64: bits of `SubapertureFlag`; the estimator's kernel adds its own."""
+    bad_counts: Any
+    """(W,) int64."""
+    iterations: Any
+    """(W,) int64: written by the estimator's kernel."""
+    own: Any
+    """Of the estimator's kernel."""
+
+
+class SlopeArrays(NamedTuple):
+    """Results, (n_frames, n_subapertures) each; what they are: see `faintspot.Slopes`."""
+
+    x: Any
+    y: Any
+    flux: Any
+    flags: Any
+    iterations: Any
+    bad_pixels: Any
+    standard_error_x: Any
+    standard_error_y: Any
+
+
+def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Scratch:
+    """Return the memory of one thread, aligned to cache lines."""
+    width, pixels = lanes.width, ny * nx
+    return Scratch(
+        aligned_zeros((pixels + 1) * width, lanes.dtype),
+        aligned_zeros(pixels * width, lanes.dtype),
+        aligned_zeros(RESULT_ROWS * width, lanes.dtype),
+        np.zeros(width, np.int64),
+        np.zeros(width, np.int64),
+        np.zeros(width, np.int64),
+        np.zeros(width, np.int64),
+        own,
+    )
+
+
+@compiled
+def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
+    """Gather and calibrate the W sub-apertures of a group; numbers of bad, saturated pixels in `results`."""
+    lanes, ny, nx = source.lanes, source.ny, source.nx
+    width = width_of(lanes)
+    n, line = source.corners.shape[0], source.frames.shape[2]
+    for lane in range(width):
+        s = min(first + lane, n - 1)
+        scratch.places[lane] = source.corners[s, 0] * line + source.corners[s, 1]
+    gather_raw(lanes, source.frames, f, scratch.places, ny, nx, scratch.spare, scratch.image)
+    place = first * 2 * ny * nx
+    calibrate(lanes, scratch.image, ny * nx, source.calibration, place, source.saturation, scratch.results)
+
+
+@compiled
+def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) -> None:
+    """Gather and calibrate a group, fill bad pixels and flag what there is to flag."""
+    width, ny, nx = width_of(source.lanes), source.ny, source.nx
+    gather_group(source, f, first, scratch)
+    for lane in range(width):
+        s = min(first + lane, source.corners.shape[0] - 1)
+        bad = int(scratch.results[lane])
+        scratch.bad_counts[lane] = bad
+        scratch.flags[lane] = SATURATED if scratch.results[width + lane] > 0.0 else 0
+        if bad > 0:
+            fill_bad_pixels(width, lane, ny, nx, scratch.image, scratch.spare)
+            scratch.flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else BAD_PIXELS
+
+
+@compiled
+def store_stage(width: Any, image: Any, stage: Any, first: Any) -> None:
+    """Copy a group's images to where `explain` collects them."""
+    for lane in range(min(width, stage.shape[0] - first)):
+        scatter_image(width, image, lane, stage, first + lane)
+
+
+@compiled
+def within(slope: Any, reach: Any) -> Any:
+    """Keep a slope within the allowed range."""
+    return min(max(slope, -reach), reach)
+
+
+@compiled
+def store_slope(
+    f: Any, s: Any, settings: Any, x: Any, y: Any, error_x: Any, error_y: Any, bits: Any, slopes: Any
+) -> None:
+    """Write position, flags and standard errors of one sub-aperture; the reference where it is invalid."""
+    valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
+    reach = settings[RANGE, s]
+    slopes.x[f, s] = within(x - settings[ZERO_X, s], reach) if valid else 0.0
+    slopes.y[f, s] = within(y - settings[ZERO_Y, s], reach) if valid else 0.0
+    known = valid and settings[VARIANCE, s] >= 0.0
+    scale = settings[ERROR_SCALE, s]
+    slopes.standard_error_x[f, s] = scale * error_x if known else math.inf
+    slopes.standard_error_y[f, s] = scale * error_y if known else math.inf
+    slopes.flags[f, s] = bits
+
+
+@compiled
+def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> None:
+    """Write the results of a group."""
+    f, found = group.frame, scratch.results
+    for lane in range(min(width, n - group.first)):
+        s = group.first + lane
+        slopes.flux[f, s] = found[FLUX * width + lane]
+        slopes.iterations[f, s] = scratch.iterations[lane]
+        slopes.bad_pixels[f, s] = scratch.bad_counts[lane]
+        store_slope(
+            f,
+            s,
+            group.settings,
+            found[X * width + lane],
+            found[Y * width + lane],
+            found[ERROR_X * width + lane],
+            found[ERROR_Y * width + lane],
+            scratch.flags[lane],
+            slopes,
+        )
+
+
+def locate(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
+    """Stand for an estimator's own kernel, which `driver_of` puts in its place.
+
+    It reads `scratch.image` and writes `scratch.results`, `scratch.iterations` and bits of `scratch.flags`;
+    where `stages` has rows, it may overwrite what the images are after its steps.
+    """
+
+
+def measure_groups(
+    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
+) -> None:
+    """Compute the slopes of the groups [start, stop) of a block of frames.
+
+    Group g is group g % n_groups of frame g // n_groups.
+
+    Parameters
+    ----------
+    source : Source
+    task : Task
+    scratch : Scratch
+    slopes : SlopeArrays
+        Written.
+    stages : (STAGE_ROWS or 0, n_frames, n_subapertures, pixels) float32
+        Written where it has rows.
+    """
+    lanes = source.lanes
+    width = width_of(lanes)
+    n = source.corners.shape[0]
+    n_groups = (n + width - 1) // width
+    for item in range(start, stop):
+        f, first = item // n_groups, item % n_groups * width
+        settings = task.settings[task.variants[f]]
+        prepare_group(source, f, first, settings, scratch)
+        for stage in range(stages.shape[0]):
+            store_stage(width, scratch.image, stages[stage, f], first)
+        predicted = task.prior[min(f, task.prior.shape[0] - 1)]
+        group = Group(lanes, source.ny, source.nx, f, first, settings, predicted)
+        locate(group, task.tables, scratch, stages)
+        _store_group(width, n, group, scratch, slopes)
+
+
+@cache
+def driver_of(kernel: Any) -> Any:
+    """Return `measure_groups` with an estimator's own kernel in the place of `locate`, compiled.
+
+    A copy with globals and a name of its own: Numba's disk cache finds it again in a new process, which it
+    does not for a closure or for a kernel that is passed as an argument.
+    """
+    return copied(measure_groups, kernel, locate=kernel)
+
+
+def copied(template: Any, kernel: Any, **replaced: Any) -> Any:
+    """Return a compiled copy of a template for a kernel, with other functions in place of its globals."""
+    own = kernel.py_func
+    copy = FunctionType(template.__code__, {**template.__globals__, **replaced}, template.__name__)
+    copy.__qualname__ = f"{template.__name__}_{own.__module__.replace('.', '_')}_{own.__qualname__}"
+    copy.__module__ = template.__module__
+    return compiled_with(copy, own.__code__.co_filename)
+
+
+@compiled
+def light_of_groups(source: Any, start: Any, stop: Any, scratch: Any, light: Any) -> None:
+    """Sum the pixels of every sub-aperture, electrons, bad ones as 0, into (n_frames, n_subapertures)."""
+    lanes = source.lanes
+    width = width_of(lanes)
+    n = source.corners.shape[0]
+    n_groups = (n + width - 1) // width
+    for item in range(start, stop):
+        f, first = item // n_groups, item % n_groups * width
+        gather_group(source, f, first, scratch)
+        total, zero = splat(lanes, 0.0), splat(lanes, 0.0)
+        for i in range(source.ny * source.nx):
+            g = load(lanes, scratch.image, i * width)
+            total = total + select(g >= g, g, zero)
+        store(scratch.results, 0, total)
+        for lane in range(min(width, n - first)):
+            light[f, first + lane] = scratch.results[lane]

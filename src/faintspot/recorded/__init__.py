@@ -1,0 +1,23 @@
+"""Recorded frames: slopes from files to a file (`measuring`), and the page that shows them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.recorded.measuring import Summary as Summary
+    from faintspot.recorded.measuring import measure_recorded as measure_recorded
+    from faintspot.recorded.measuring import slopes_as_variables as slopes_as_variables
+
+_HOMES = {
+    "Summary": "faintspot.recorded.measuring",
+    "measure_recorded": "faintspot.recorded.measuring",
+    "slopes_as_variables": "faintspot.recorded.measuring",
+}
+
+__all__ = sorted(_HOMES)
+
+
+__getattr__ = lazy_attributes(__name__, _HOMES)

@@ -1,0 +1,137 @@
+"""A run in words: its settings, what its flags mean, and what to do about what went wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from faintspot.flags import SubapertureFlag
+from faintspot.recorded.statistics import MeasuredSlopes, SlopesSummary
+from faintspot.sensor.layout import Layout
+from faintspot.settings import Settings
+
+FLAG_MEANINGS = {
+    SubapertureFlag.NO_LIGHT: "Nothing usable was left after the background subtraction: invalid, slope 0.",
+    SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
+    SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
+    SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
+    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std is not below the image's rms: denoised to a constant.",
+    SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
+    SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
+}
+_MOST_LISTED = 20
+_OFTEN_INFEASIBLE = 0.05
+# Fraction of the measurements from which a flag is worth a warning, and what to do then.
+_ADVICE = {
+    SubapertureFlag.TOO_MANY_BAD_PIXELS: (
+        0.001,
+        "had too many bad pixels",
+        "check the bad-pixel map and the flat, or raise max_bad_fraction",
+    ),
+    SubapertureFlag.SATURATED: (
+        0.001,
+        "were saturated, which pulls positions towards the centre of the saturated area",
+        "expose for less time or lower the camera's gain; check saturation_adu",
+    ),
+    SubapertureFlag.INFEASIBLE_STRENGTH: (
+        _OFTEN_INFEASIBLE,
+        "were noisier on paper (noise_std) than their images are, so nothing of the spot survives denoising",
+        "lower noise_std; a good value at low read noise is sqrt(read_noise² + 0.25 × flux / pixels)",
+    ),
+    SubapertureFlag.NOT_CONVERGED: (
+        0.10,
+        "hit the iteration limit before the tolerance was reached",
+        "raise max_iterations, or raise tolerance if the time does not allow it",
+    ),
+}
+
+
+def settings_in_words(settings: Settings, layout: Layout) -> str:
+    """Return what the settings do, in one line."""
+    pixels = layout.pixels
+
+    def span(name: str) -> str:
+        values = settings.values(name, len(layout), pixels)
+        low, high = values.min(), values.max()
+        return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+    denoised = int(np.count_nonzero(settings.values("denoise", len(layout), pixels)))
+    rules = ", ".join(str(rule) for rule in np.unique(settings.values("rule", len(layout), pixels)))
+    kept = f"{span('keep_brightest')} brightest of {pixels} pixels kept (rule {rules}), centre of gravity"
+    if denoised == 0:
+        return f"no denoising; {kept}"
+    where = "" if denoised == len(layout) else f" in {denoised} of {len(layout)} sub-apertures"
+    return (
+        f"total-variation denoising{where} of strength {span('noise_std')} e- ({settings.algorithm}, "
+        f"tolerance {span('tolerance')}, at most {span('max_iterations')} iterations); {kept}"
+    )
+
+
+def percentage(fraction: float) -> str:
+    """Return a fraction as per cent, without rounding small ones to 0 or nearly all to 100."""
+    if not np.isfinite(fraction):
+        return "–"
+    percent = 100.0 * fraction
+    if 0 < percent < 0.1:
+        return "< 0.1 %"
+    if 99.9 < percent < 100:
+        return "> 99.9 %"
+    return f"{percent:.0f} %" if percent in (0, 100) else f"{percent:.1f} %"
+
+
+def warnings_in_words(arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary]) -> list[str]:
+    """Return what is wrong with a run and what to do next, a sentence or two each."""
+    lines = []
+    for arm, summary in zip(arms, summaries, strict=True):
+        prefix = f"{arm.name}: " if len(arms) > 1 else ""
+        lines += [prefix + line for line in _of_arm(arm, summary)]
+    if arms[0].n_frames == 1:
+        lines.append(
+            "There is one frame only: no jitter can be given. Measure several frames of the same field."
+        )
+    fractions = [summary.valid_fraction for summary in summaries]
+    if max(fractions) - min(fractions) > 0.01:
+        lines.append(
+            "The arms differ in how many measurements are valid. Jitter and slope error compare the "
+            "measurements that are valid in every arm, which may be the easier ones."
+        )
+    return lines
+
+
+def _of_arm(arm: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
+    lines = _no_light(arm)
+    if summary.valid_fraction == 0:
+        lines.insert(0, "No measurement is valid, so there are no slopes.")
+    for flag, (least, what, advice) in _ADVICE.items():
+        count = arm.flag_count(flag)
+        if flag is SubapertureFlag.INFEASIBLE_STRENGTH:  # those without light are spoken of already
+            count -= arm.flag_count(flag | SubapertureFlag.NO_LIGHT)
+        fraction = count / arm.x.size
+        if fraction > least:
+            lines.append(f"{percentage(fraction)} of the measurements {what}. Next: {advice}.")
+    never = np.flatnonzero(summary.valid_frames == 0)
+    if 0 < len(never) < arm.n_subapertures:
+        listed = ", ".join(str(number) for number in never[:_MOST_LISTED])
+        more = f" and {len(never) - _MOST_LISTED} more" if len(never) > _MOST_LISTED else ""
+        lines.append(
+            f"{len(never)} of {arm.n_subapertures} sub-apertures were never valid (no. {listed}{more}). "
+            "Next: leave them out of the layout if they are outside the pupil."
+        )
+    return lines
+
+
+def _no_light(arm: MeasuredSlopes) -> list[str]:
+    dark = arm.flag_count(SubapertureFlag.NO_LIGHT)
+    fraction = dark / arm.x.size
+    if fraction <= 0.01:
+        return []
+    both = arm.flag_count(SubapertureFlag.NO_LIGHT | SubapertureFlag.INFEASIBLE_STRENGTH)
+    advice = (
+        "check that the windows lie on the spots (faintspot layout draws them) and that the dark is right"
+    )
+    if both > dark / 2:
+        advice = (
+            "lower noise_std: in most of them it was larger than the image's own rms, which removes the spot"
+        )
+    return [f"{percentage(fraction)} of the measurements had no light. Next: {advice}."]

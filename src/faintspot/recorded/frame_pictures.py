@@ -1,0 +1,208 @@
+"""Pictures of a frame: the sensor and single sub-apertures after every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from faintspot.report.drawing import (
+    LIGHT_GREY,
+    TRUTH_COLOUR,
+    WIDTH,
+    colour_bar,
+    limits_of,
+    new_figure,
+    styled,
+)
+from faintspot.sensor.layout import Layout
+from faintspot.slopes import Stages
+
+Floats = NDArray[np.float64]
+
+STEPS = {
+    "raw": "raw",
+    "calibrated": "calibrated",
+    "denoised": "denoised",
+    "background_subtracted": "after background",
+}
+MOST_MARKED = 150
+"""With more sub-apertures than this the whole sensor's picture has no marks: they would hide the spots."""
+_MARKS = (("+", "white"), ("x", "#D55E00"), ("1", "#E69F00"), ("2", "#CC79A7"))  # with a black outline
+
+
+@dataclass(frozen=True)
+class Example:
+    """One frame after every step.
+
+    Attributes
+    ----------
+    layout : Layout
+    stages : mapping of Stages
+        By arm; images (n_subapertures, ny, nx). The first one's images are shown, the positions of all are
+        marked. They must be measured from the sub-apertures' centres (no other reference).
+    truth : array (n_subapertures, 2), optional
+        True x, y, px.
+    """
+
+    layout: Layout
+    stages: Mapping[str, Stages]
+    truth: Floats | None = None
+
+    @property
+    def first(self) -> Stages:
+        """What is shown."""
+        return next(iter(self.stages.values()))
+
+    @property
+    def raw_is_calibrated(self) -> bool:
+        """Whether the raw frame is in electrons already."""
+        return bool(np.allclose(self.first.raw, self.first.calibrated, rtol=1e-5, equal_nan=True))
+
+    def positions(self) -> dict[str, Floats]:
+        """Return valid positions by arm, and the truth, from the middle of the window, px; NaN if invalid."""
+        found = {}
+        for name, stages in self.stages.items():
+            xy = np.stack([stages.slopes.x, stages.slopes.y], axis=-1).astype(np.float64)
+            found[name] = np.where(stages.slopes.valid[:, None], xy, np.nan) + self.layout.offsets
+        if self.truth is not None:
+            found["truth"] = self.truth + self.layout.offsets
+        return found
+
+
+@styled
+def whole_sensor(example: Example) -> Figure:
+    """Draw all windows at their places after every step; on the last, the positions of the spots."""
+    layout = example.layout
+    sheets = {step: assembled(layout, getattr(example.first, step)) for step in STEPS}
+    n_rows, n_columns = sheets["raw"].shape
+    height = min(max(0.42 * WIDTH * n_rows / n_columns, 1.2), 9.0) + 0.7
+    figure = new_figure(WIDTH, 2 * height)
+    grid = figure.subplots(2, 2, sharex=True, sharey=True)
+    start = layout.corners.min(axis=0) - 0.5
+    extent = (start[1], start[1] + n_columns, start[0], start[0] + n_rows)
+    shown = _draw_steps(list(grid.flat), sheets, example.raw_is_calibrated, extent)
+    if not example.raw_is_calibrated:
+        colour_bar(list(grid[:, 0]), shown["raw"], "raw: ADU", location="left")
+    colour_bar(list(grid[:, 1]), shown["denoised"], "e- per pixel")
+    for panel in grid[:, 0]:
+        panel.set_ylabel("row (px)")
+    for panel in grid[1]:
+        panel.set_xlabel("column (px)")
+    if len(layout) <= MOST_MARKED:
+        middles = layout.corners[:, ::-1] + 0.5 * (np.array(layout.window[::-1]) - 1)
+        _mark(grid[1, 1], {name: xy + middles for name, xy in example.positions().items()}, size=6)
+        _legend(figure, grid[1, 1])
+    return figure
+
+
+@styled
+def zoom(example: Example) -> Figure:
+    """Draw the faintest, a median and the brightest valid sub-aperture after every step."""
+    chosen = example_subapertures(example.first)
+    height, width = example.layout.window
+    figure = new_figure(WIDTH, len(chosen) * (WIDTH / 5.3 * min(height / width, 2.0) + 0.25) + 0.9)
+    grid = figure.subplots(len(chosen), 4, squeeze=False, sharex=True, sharey=True)
+    extent = (-width / 2, width / 2, -height / 2, height / 2)
+    positions = example.positions()
+    for row, (what, index) in enumerate(chosen.items()):
+        axes = list(grid[row])
+        images = {step: getattr(example.first, step)[index] for step in STEPS}
+        shown = _draw_steps(axes, images, example.raw_is_calibrated, extent, titles=row == 0)
+        if not example.raw_is_calibrated:
+            colour_bar(axes[0], shown["raw"], "ADU")
+        colour_bar(axes if example.raw_is_calibrated else axes[1:], shown["denoised"], "e- per pixel")
+        axes[0].set_ylabel(f"{what}\nno. {index}, {_flux(example.first, index)} e-\ny (px)")
+        for panel in axes[1:]:
+            _mark(panel, {name: xy[index : index + 1] for name, xy in positions.items()}, size=13)
+    for panel in grid[-1]:
+        panel.set_xlabel("x (px)")
+    _legend(figure, grid[0, 1])
+    return figure
+
+
+def _flux(stages: Stages, index: int) -> str:
+    flux = float(stages.slopes.flux[index])
+    return f"{flux:.0f}" if abs(flux) >= 100 else f"{flux:.3g}"
+
+
+def example_subapertures(stages: Stages) -> dict[str, int]:
+    """Return the numbers of the faintest, a median and the brightest valid sub-aperture, each once.
+
+    Without any valid one it is the sub-aperture with the most light after calibration.
+    """
+    valid = np.flatnonzero(stages.slopes.valid)
+    if valid.size == 0:
+        light = stages.calibrated.sum(axis=(-2, -1))
+        return {"none is valid": int(np.argmax(light))}
+    order = valid[np.argsort(stages.slopes.flux[valid], kind="stable")]
+    chosen = {"brightest": int(order[-1])}
+    if len(order) > 1:
+        chosen = {"faintest": int(order[0]), **chosen}
+    if len(order) > 2:
+        chosen = {"faintest": int(order[0]), "median": int(order[len(order) // 2]), **chosen}
+    return chosen
+
+
+def assembled(layout: Layout, images: NDArray[Any]) -> Floats:
+    """Return the windows' images (n, ny, nx) at their places; NaN between them."""
+    start = layout.corners.min(axis=0)
+    height, width = layout.corners.max(axis=0) - start + np.array(layout.window)
+    sheet = np.full((height, width), np.nan)
+    rows = (layout.corners[:, 0] - start[0])[:, None, None] + np.arange(layout.window[0])[:, None]
+    columns = (layout.corners[:, 1] - start[1])[:, None, None] + np.arange(layout.window[1])
+    sheet[rows, columns] = images
+    return sheet
+
+
+def _draw_steps(
+    axes: list[Axes], images: Mapping[str, Floats], one_unit: bool, extent: Any, titles: bool = True
+) -> dict[str, Any]:
+    """Draw the four steps on one colour scale, raw on its own one when it is in ADU; return the images."""
+    electrons = limits_of(images["calibrated"], percent=99.8)
+    adu = electrons if one_unit else limits_of(images["raw"], percent=99.8)
+    shown = {}
+    for panel, (step, image) in zip(axes, images.items(), strict=True):
+        low, high = adu if step == "raw" else electrons
+        shown[step] = panel.imshow(image, vmin=low, vmax=high, extent=extent, interpolation="nearest")
+        panel.set_facecolor(LIGHT_GREY)
+        if titles:
+            panel.set_title(STEPS[step] + (" (ADU)" if step == "raw" and not one_unit else ""))
+    return shown
+
+
+def _mark(axes: Axes, positions: Mapping[str, Floats], size: float) -> None:
+    """Mark positions: each arm by a cross of its own, the first one's on top, and the truth by a circle."""
+    width = 0.5 + 0.08 * size
+    outline: list[patheffects.AbstractPathEffect] = [
+        patheffects.withStroke(linewidth=2.6 * width, foreground="black")
+    ]
+    crosses = dict(zip((name for name in positions if name != "truth"), _MARKS, strict=False))
+    for name, xy in positions.items():
+        if name == "truth":
+            axes.plot(*xy.T, "o", ms=1.5 * size, mfc="none", mec=TRUTH_COLOUR, mew=width, ls="", label=name)
+        elif name in crosses:
+            marker, colour = crosses[name]
+            order = 3.0 - 0.1 * list(crosses).index(name)
+            axes.plot(*xy.T, marker, ms=size, mew=width, color=colour, ls="", label=name, zorder=order)
+            axes.lines[-1].set_path_effects(outline)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=len(labels),
+            facecolor="#777777",
+            labelcolor="white",
+            edgecolor="none",
+        )

@@ -1,0 +1,104 @@
+"""Picture of a layout: its windows and their numbers on a frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import FuncNorm
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.report.drawing import colour_bar, limits_of, new_figure, png, styled
+from faintspot.report.files import write_file
+from faintspot.sensor.layout import Layout
+
+Floats = NDArray[np.float64]
+
+_MOST_NUMBERED = 1500
+
+
+@styled
+def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
+    """Write a PNG picture of a frame with the sub-apertures' windows and numbers drawn on it.
+
+    The brightness follows asinh of the light above the sky, cut at the 99.5th percentile of the windows'
+    pixels, so hot pixels neither hide the spots nor set the scale.
+
+    Parameters
+    ----------
+    frame : (h, w) or (n, h, w) array
+        Several are averaged.
+    layout : Layout
+    path : str or Path
+        Replaced when it exists.
+
+    Raises
+    ------
+    InputError
+        When the frame is not of the layout's shape or the file cannot be written.
+    """
+    array = np.asarray(frame, dtype=np.float64)
+    if array.ndim == 3:
+        array = array.mean(axis=0)
+    inside = layout.images(array)
+    write_file(path, png(_layout_figure(array, inside, layout)))
+
+
+def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
+    n_rows, n_columns = array.shape
+    side = 12.0
+    figure = new_figure(side, min(max(0.9 * side * n_rows / n_columns, 3.0), 2 * side) + 0.9)
+    axes = figure.subplots()
+    image = axes.imshow(array, cmap="gray", norm=_stretch(array, inside), interpolation="nearest")
+    colour_bar(axes, image, "frame's units")
+    boxes = _window_outlines(layout)
+    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors="#E69F00", linewidths=0.9))
+    points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
+    font = min(points / 3.0, 13.0)
+    if font >= 4 and len(layout) <= _MOST_NUMBERED:
+        for number, (row, column) in enumerate(layout.corners):
+            axes.text(
+                column - 0.5 + 0.06 * layout.window[1],
+                row - 0.5 + 0.95 * layout.window[0],
+                str(number),
+                color="#E69F00",
+                fontsize=font,
+                va="top",
+                clip_on=True,
+                path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
+            )
+    axes.set_xlabel("column (px)")
+    axes.set_ylabel("row (px)")
+    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
+    plural = "" if len(layout) == 1 else "s"
+    axes.set_title(
+        f"{len(layout)} sub-aperture{plural} of {layout.window[0]} x {layout.window[1]} px, "
+        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
+    )
+    return figure
+
+
+def _stretch(array: Floats, inside: Floats) -> FuncNorm:
+    """Return an asinh stretch around the sky level, in units of its noise; blind to hot and bad pixels."""
+    good = array[np.isfinite(array)]
+    sky = float(np.median(good)) if good.size else 0.0
+    noise = 1.4826 * float(np.median(np.abs(good - sky))) if good.size else 0.0
+    low, high = limits_of(inside, percent=99.5)
+    low, high = min(low, sky - 2 * noise), max(high, sky + 5 * noise)
+    if not high > low:
+        low, high = low - 1.0, low + 1.0
+    # Linear over the noise, logarithmic over the spots; never linear in less than a twentieth of the range.
+    unit = max(3 * noise, 0.05 * (high - low))
+    return FuncNorm(
+        (lambda v: np.arcsinh((v - sky) / unit), lambda u: sky + unit * np.sinh(u)), vmin=low, vmax=high
+    )
+
+
+def _window_outlines(layout: Layout) -> list[Any]:
+    height, width = layout.window
+    ring = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    return list(layout.corners[:, None, ::-1] + ring)

@@ -1,0 +1,185 @@
+"""The maps and plots over all frames of a report: flux, validity, slopes, iterations, jitter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from faintspot.recorded.statistics import Jitter, MeasuredSlopes, SlopesSummary, median
+from faintspot.report.drawing import (
+    ARM_COLOURS,
+    GREY,
+    LIGHT_GREY,
+    WIDTH,
+    limits_of,
+    new_figure,
+    place_axes,
+    styled,
+    subaperture_map,
+    subaperture_shapes,
+)
+from faintspot.sensor.layout import Layout
+
+_PANEL_HEIGHT = 5.0
+_HISTOGRAM_BINS = 60
+_MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could not be seen
+
+
+@styled
+def flux_and_validity(
+    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> Figure:
+    """Draw median flux and fraction of valid frames, a row of maps for each arm."""
+    figure, axes = _panels(len(arms), 2, layout)
+    limits = limits_of(*(summary.flux_e for summary in summaries), low=0.0)
+    for row, arm, summary in zip(axes, arms, summaries, strict=True):
+        title = f"{arm.name}: median flux"
+        subaperture_map(row[0], layout, summary.flux_e, label="flux (e-)", limits=limits, title=title)
+        percent = 100.0 * summary.valid_frames / arm.n_frames
+        title = f"{arm.name}: valid frames"
+        subaperture_map(row[1], layout, percent, label="valid frames (%)", limits=(0, 100), title=title)
+    return figure
+
+
+@styled
+def slope_arrows(
+    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> Figure:
+    """Draw the mean slope of every sub-aperture, one panel per arm, all at one scale."""
+    figure, axes = _panels(1, len(arms), layout)
+    longest = _arrow_limit(summaries)
+    key = _round_length(longest)
+    pitch = layout.pitch_px or max(layout.window)
+    length, width = (0.6, 0.004) if len(layout) <= _MOST_SHORT_ARROWS else (2.0, 0.0015)
+    for panel, arm, summary, colour in zip(axes[0], arms, summaries, ARM_COLOURS, strict=False):
+        panel.add_collection(_outlines(layout))
+        place_axes(panel, layout)
+        known = np.isfinite(summary.x_px)
+        arrows = panel.quiver(
+            *layout.centres[known].T,
+            summary.x_px[known],
+            summary.y_px[known],
+            color=colour,
+            angles="xy",
+            scale_units="xy",
+            scale=longest / (length * pitch),
+            width=width,
+        )
+        panel.quiverkey(arrows, 0.8, 1.04, key, f"{key:g} px", labelpos="E", coordinates="axes")
+        panel.plot(*layout.centres[~known].T, "x", color=GREY, markersize=5)
+        panel.set_title(f"{arm.name}: mean slope", loc="left")
+    return figure
+
+
+@styled
+def iteration_counts(
+    arms: Sequence[MeasuredSlopes], summaries: Sequence[SlopesSummary], layout: Layout
+) -> Figure:
+    """Draw the mean iterations of every sub-aperture (first arm) and how often each number occurred."""
+    figure, axes = _panels(1, 2, layout)
+    limits = limits_of(summaries[0].iterations, low=0.0)
+    title = f"{arms[0].name}: mean iterations"
+    subaperture_map(
+        axes[0, 0], layout, summaries[0].iterations, label="iterations", limits=limits, title=title
+    )
+    panel = axes[0, 1]
+    most = max(int(arm.iterations.max()) for arm in arms)
+    step = max(1, -(-(most + 1) // _HISTOGRAM_BINS))
+    edges = np.arange(0, most + 1 + step, step) - 0.5
+    for arm, colour in zip(arms, ARM_COLOURS, strict=False):
+        counts = np.histogram(arm.iterations[arm.valid], edges)[0]
+        panel.stairs(100.0 * counts / max(1, counts.sum()), edges, fill=True, color=colour, label=arm.name)
+    panel.set_xlabel("iterations")
+    panel.set_yscale("log")
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.set_ylim(top=200)
+    panel.set_ylabel("valid measurements (%)")
+    panel.set_title("How many iterations it took")
+    if len(arms) > 1:
+        panel.legend(frameon=False)
+    return figure
+
+
+@styled
+def jitter_maps(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter], layout: Layout) -> Figure:
+    """Draw the jitter of every sub-aperture, one map per arm, on one scale."""
+    figure, axes = _panels(1, len(arms), layout)
+    limits = limits_of(*(item.px for item in jitters), low=0.0)
+    for panel, arm, item in zip(axes[0], arms, jitters, strict=True):
+        title = f"{arm.name}: median {median(item.px):.3f} px"
+        subaperture_map(panel, layout, item.px, label="jitter (px)", limits=limits, title=title)
+    return figure
+
+
+@styled
+def jitter_plot(arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> Figure:
+    """Draw the jitter of the sub-apertures in order, and one arm against another where there are two."""
+    pair = len(arms) == 2
+    figure = new_figure(WIDTH, _PANEL_HEIGHT)
+    axes = figure.subplots(1, 2 if pair else 1, squeeze=False)[0]
+    order = np.argsort(jitters[-1].px)
+    for arm, item, colour in zip(arms, jitters, ARM_COLOURS, strict=False):
+        order = order[item.measured[order]]
+        place = np.arange(1, len(order) + 1)
+        axes[0].plot(place, item.px[order], ".", color=colour, label=f"{arm.name}: standard deviation")
+        axes[0].plot(place, item.robust_px[order], "-", lw=1.3, color=colour, label=f"{arm.name}: robust")
+        axes[0].axhline(median(item.px), color=colour, lw=0.9, ls=":")
+    axes[0].set_xlabel(f"sub-apertures, in order of the jitter of {arms[-1].name!r}")
+    axes[0].set_ylabel("jitter, rms of x and y (px)")
+    axes[0].set_ylim(bottom=0)
+    axes[0].legend(frameon=False, loc="upper left")
+    if pair:
+        _scatter(axes[1], arms, jitters)
+    return figure
+
+
+def _scatter(axes: Axes, arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitter]) -> None:
+    """Draw the second arm's jitter along x against the first's along y."""
+    across, up = jitters[1].px, jitters[0].px
+    axes.plot(across, up, ".", color=ARM_COLOURS[1], markersize=7 if len(up) < 500 else 3)
+    _, stop = limits_of(across, up, low=0.0)
+    stop *= 1.08
+    axes.plot([0, stop], [0, stop], color=GREY, lw=1)
+    axes.annotate("equal", (0.93 * stop, 0.95 * stop), ha="right", color="#555555")
+    axes.plot(
+        median(across), median(up), "D", color=ARM_COLOURS[0], markersize=9, mec="black", label="medians"
+    )
+    axes.set_xlim(0, stop)
+    axes.set_ylim(0, stop)
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"jitter, {arms[1].name} (px)")
+    axes.set_ylabel(f"jitter, {arms[0].name} (px)")
+    axes.set_title("Below the line: the first arm is steadier", fontsize=12)
+    axes.legend(frameon=False, loc="lower right")
+
+
+def _panels(rows: int, columns: int, layout: Layout) -> tuple[Figure, Any]:
+    """Return a figure with panels for maps, as high as the sensor's shape asks for."""
+    width, height = np.ptp(subaperture_shapes(layout).reshape(-1, 2), axis=0)
+    panel = min(max(0.8 * WIDTH / max(columns, 2) * height / width, 2.5), 6.5) + 0.6
+    figure = new_figure(WIDTH if columns > 1 else 0.6 * WIDTH, rows * panel)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _outlines(layout: Layout) -> Any:
+    from matplotlib.collections import PolyCollection
+
+    return PolyCollection(list(subaperture_shapes(layout)), facecolors="#f6f6f6", edgecolors=LIGHT_GREY)
+
+
+def _arrow_limit(summaries: Sequence[SlopesSummary]) -> float:
+    """Return the length, px, that sets the scale of the arrows: nearly the longest of all arms."""
+    lengths = np.concatenate([np.hypot(summary.x_px, summary.y_px) for summary in summaries])
+    lengths = lengths[np.isfinite(lengths)]
+    longest = float(np.percentile(lengths, 98)) if lengths.size else 0.0
+    return longest if longest > 0 else 1.0
+
+
+def _round_length(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above a length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9)))

@@ -1,0 +1,203 @@
+"""Slopes of recorded frames: from files to a file, block by block, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import faintspot
+from faintspot import configuration
+from faintspot.errors import InputError
+from faintspot.flags import SubapertureFlag
+from faintspot.io.frames import FrameSource, open_frames, read_array
+from faintspot.io.locations import split_location
+from faintspot.io.slopes import create_writer
+from faintspot.io.slopes_format import VARIABLES
+from faintspot.pipeline import SlopePipeline
+from faintspot.settings import with_preset, without_denoising
+from faintspot.slopes import Slopes
+
+_BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished frames and of all frames."""
+
+
+@dataclass
+class Summary:
+    """What a run over recorded frames found."""
+
+    n_frames: int
+    n_subapertures: int
+    resumed_at: int = 0
+    flag_counts: dict[SubapertureFlag, int] = field(default_factory=dict)
+    """How many slopes of this call carry each flag."""
+    bad_frames: int = 0
+    """Frames of this call without a single valid slope."""
+    measured: int = 0
+    """Slopes made by this call."""
+
+    def add(self, slopes: Slopes) -> None:
+        """Count the flags of a block."""
+        self.measured += slopes.flags.size
+        self.bad_frames += int(np.count_nonzero(~slopes.valid.any(axis=-1)))
+        for flag in SubapertureFlag:
+            count = int(np.count_nonzero(slopes.flags & flag))
+            self.flag_counts[flag] = self.flag_counts.get(flag, 0) + count
+
+
+def measure_recorded(
+    frames: Sequence[str | Path],
+    configuration_file: str | Path,
+    output: str | Path,
+    *,
+    denoise: bool = True,
+    preset: str | None = None,
+    device: str = "cpu",
+    reference: NDArray[Any] | str | Path | None = None,
+    key: str | None = None,
+    threads: int | None = None,
+    block_frames: int | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Summary:
+    """Measure the slopes of all frames in some files and write them to a file.
+
+    Interrupted and called again with the same arguments, it goes on where it stopped.
+
+    Parameters
+    ----------
+    frames : sequence of path
+        FITS, .npy, .npz or Zarr; see `faintspot.io.open_frames`.
+    configuration_file : path
+        The TOML file with layout, settings and calibration.
+    output : path
+        .zarr, .fits, .npz or .csv.
+    denoise : bool
+        False switches the denoising off for all sub-apertures.
+    preset : str, optional
+        "accurate" or "fast", instead of that in the configuration.
+    device : str
+        "cpu" or "cuda", see `SlopePipeline`.
+    reference : array or path, optional
+        Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key".
+    key : str, optional
+        Which array of the files to read, where they hold several.
+    threads : int, optional
+        Most threads to use; default all processors.
+    block_frames : int, optional
+        Frames to work on at a time; default so many that a block takes 32 MB.
+    overwrite : bool
+        Replace an existing output of another run.
+    progress : callable, optional
+        Called with finished and all frames after every block.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read or written, or frames and configuration do not fit together.
+    """
+    layout, settings, calibration, psf, score = configuration.load_all(configuration_file)
+    if not denoise:
+        settings = without_denoising(settings, "denoise = False")
+    if preset is not None:
+        settings = with_preset(settings, preset)
+    positions = read_array(reference) if isinstance(reference, str | Path) else reference
+    try:
+        pipeline = SlopePipeline(
+            layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
+        )
+    except InputError as error:
+        if str(error).startswith("device"):
+            raise
+        about_reference = positions is not None and str(error).startswith("reference")
+        where = reference if about_reference and isinstance(reference, str | Path) else configuration_file
+        raise InputError(f"{where}: {error}") from None
+    with open_frames(frames, key=key) as source:
+        _check_output(output, frames)
+        if source.shape != layout.frame_shape:
+            raise InputError(
+                f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
+                f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
+            )
+        attributes = _attributes(pipeline, source, frames, configuration_file, key)
+        if positions is not None:
+            attributes["reference"] = np.asarray(positions).tolist()
+        summary = Summary(source.n_frames, len(layout))
+        size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
+        with create_writer(
+            output,
+            n_frames=source.n_frames,
+            n_subapertures=len(layout),
+            attributes=attributes,
+            coordinates={
+                "centre_x": layout.centres[:, 0],
+                "centre_y": layout.centres[:, 1],
+                "row": layout.cells[:, 0],
+                "column": layout.cells[:, 1],
+            },
+            overwrite=overwrite,
+        ) as writer:
+            summary.resumed_at = writer.finished()
+            for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
+                slopes = pipeline(block)
+                writer.append(start, slopes_as_variables(slopes))
+                summary.add(slopes)
+                if progress is not None:
+                    progress(start + len(block), source.n_frames)
+    return summary
+
+
+def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
+    """Refuse to replace the frames by their slopes."""
+    if Path(output).resolve() in [split_location(path)[0].resolve() for path in frames]:
+        raise InputError(f"{output}: expected a name for the slopes, got a file of the frames")
+
+
+def slopes_as_variables(slopes: Slopes) -> dict[str, NDArray[Any]]:
+    """Return the slopes of several frames as a file's variables."""
+    return {name: getattr(slopes, name) for name in VARIABLES}
+
+
+def _version(path: Path) -> str:
+    """What changes when somebody writes to a file of frames between two calls."""
+    status = path.stat()
+    return "" if path.is_dir() else f"{status.st_size} {status.st_mtime_ns}"
+
+
+def _attributes(
+    pipeline: SlopePipeline,
+    source: FrameSource,
+    frames: Sequence[str | Path],
+    configuration_file: str | Path,
+    key: str | None,
+) -> dict[str, Any]:
+    """What the output says about its origin; the fingerprint tells whether a run may be continued."""
+    text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
+    paths = [str(Path(path).resolve()) for path in frames]
+    state = hashlib.sha256()
+    for part in (
+        faintspot.__version__,
+        text,
+        str(key),
+        *paths,
+        *(_version(split_location(path)[0]) for path in frames),
+        str((source.n_frames, source.shape, source.dtype)),
+    ):
+        state.update(part.encode() + b"\0")
+    state.update(pipeline.fingerprint())
+    return {
+        "title": "Shack-Hartmann slopes",
+        "configuration": text,
+        "configuration_file": str(Path(configuration_file).resolve()),
+        "sources": paths,
+        "source_key": key or "",
+        "faintspot_version": faintspot.__version__,
+        "fingerprint": state.hexdigest(),
+    }

@@ -1,0 +1,126 @@
+"""The report page of a slopes run: one HTML text that needs nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between
+from faintspot.errors import InputError
+from faintspot.recorded.advice import warnings_in_words
+from faintspot.recorded.sections import all_sections, make_run
+from faintspot.recorded.statistics import MeasuredSlopes
+from faintspot.report.page import POSITIONS, Page, configuration_section, html_of
+from faintspot.sensor.layout import Layout
+from faintspot.slopes import Stages
+
+
+def slopes_report(
+    arms: Sequence[MeasuredSlopes],
+    *,
+    layout: Layout | None,
+    stages: Mapping[str, Stages] | None,
+    truth: ArrayLike | None = None,
+    title: str,
+    facts: Mapping[str, str],
+    configuration: str,
+    example_frame: int = 0,
+    warnings: Sequence[str] = (),
+    why_no_stages: str = "Not drawn: no frame was given.",
+) -> str:
+    """Return the report page of a slopes run as HTML: self-contained, without scripts.
+
+    Parameters
+    ----------
+    arms : sequence of MeasuredSlopes
+        The same frames, measured in one or several ways. Others are compared with the last one.
+    layout : Layout or None
+        None leaves the maps out, which the page says.
+    stages : mapping of Stages, or None
+        `SlopePipeline.explain` of frame `example_frame`, by name. The first one's images are shown; the
+        positions of all are marked, and must be measured without a reference.
+    truth : array (n_frames, n_subapertures, 2), optional
+        True x, y, px from each sub-aperture's centre.
+    title : str
+    facts : mapping of str
+        What was run, for the top of the page, as sources and settings in words.
+    configuration : str
+        TOML text; "" when not known.
+    example_frame : int
+    warnings : sequence of str
+        Shown before those found in the slopes.
+    why_no_stages : str
+        What the page says in place of the frame.
+
+    Raises
+    ------
+    InputError
+        When the parts do not fit together.
+    MissingExtraError
+        When matplotlib or jinja2 is not installed.
+    """
+    arms = list(arms)
+    _check_arms(arms, layout)
+    shape = arms[0].x.shape
+    number_between("example_frame", example_frame, 0, shape[0] - 1, integer=True)
+    true = None if truth is None else _checked_truth(truth, shape)
+    stages = _checked_stages(stages or {}, shape[1])
+    run = make_run(arms, layout, stages, true, int(example_frame), why_no_stages)
+    return html_of(
+        Page(
+            title=title,
+            facts={**facts, "Frames": str(shape[0]), "Sub-apertures": _sensor_in_words(shape[1], layout)},
+            sections=[*all_sections(run), configuration_section(configuration)],
+            warnings=[*warnings, *warnings_in_words(run.arms, run.summaries)],
+            remark=POSITIONS,
+        )
+    )
+
+
+def _check_arms(arms: Sequence[MeasuredSlopes], layout: Layout | None) -> None:
+    if not arms:
+        raise InputError("arms: expected at least one, got none")
+    names = [arm.name for arm in arms]
+    if len(set(names)) < len(names):
+        raise InputError(f"arms: expected a different name for each, got {', '.join(names)}")
+    for arm in arms[1:]:
+        if arm.x.shape != arms[0].x.shape:
+            raise InputError(
+                f"arms: expected the same frames and sub-apertures in all, got shape {arms[0].x.shape} in "
+                f"{arms[0].name!r} and {arm.x.shape} in {arm.name!r}"
+            )
+    if layout is not None and len(layout) != arms[0].n_subapertures:
+        raise InputError(
+            f"layout: expected {arms[0].n_subapertures} sub-apertures, as in the slopes, got {len(layout)}"
+        )
+
+
+def _checked_truth(truth: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = finite_array("truth", truth).astype(np.float64)
+    if array.shape != (*shape, 2):
+        raise InputError(f"truth: expected shape {(*shape, 2)}, got {array.shape}")
+    return array
+
+
+def _checked_stages(stages: Mapping[str, Stages], n: int) -> dict[str, Stages]:
+    """Return the stages of one frame each; `explain` of a stack of one frame is accepted too."""
+    for name, item in stages.items():
+        if item.raw.ndim != 3 or len(item.raw) != n:
+            raise InputError(
+                f"stages: {name}: expected images (n_subapertures, ny, nx) of one frame with {n} "
+                f"sub-apertures, got shape {item.raw.shape}"
+            )
+    return dict(stages)
+
+
+def _sensor_in_words(n: int, layout: Layout | None) -> str:
+    if layout is None:
+        return str(n)
+    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
+    height, width = layout.frame_shape
+    return (
+        f"{n} of {layout.window[0]} × {layout.window[1]} px, {layout.geometry}{pitch}, in frames of "
+        f"{height} × {width} px"
+    )

@@ -1,0 +1,321 @@
+"""The numbers of a report: what one or several arms of a slopes run did, over frames and sub-apertures.
+
+Everything is computed from valid measurements only (one measurement: one sub-aperture in one frame), and
+comparisons between arms from the measurements that are valid in every arm. In the per-sub-aperture arrays NaN
+stands for "no valid frame".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import finite_array
+from faintspot.errors import InputError
+from faintspot.flags import INVALID, SubapertureFlag
+
+Floats = NDArray[np.float64]
+
+GAUSSIAN_MAD = 1.4826
+"""Standard deviation of a Gaussian in units of its median absolute deviation."""
+
+_BLOCK_NUMBERS = 1 << 22  # numbers worked on at a time: bounds the memory of the double-precision copies
+
+
+@dataclass(frozen=True)
+class MeasuredSlopes:
+    """Slopes of all frames, measured in one way; every array has shape (n_frames, n_subapertures).
+
+    Parameters
+    ----------
+    name : str
+        For legends, as "TV" or "no TV".
+    x, y : array, px
+        Spot positions from the sub-aperture's centre.
+    flux : array, electrons
+    flags : array of uint8
+        Bits of `SubapertureFlag`.
+    iterations : array of int
+
+    Raises
+    ------
+    InputError
+        When the arrays are not two-dimensional, not of one shape or not finite.
+    """
+
+    name: str
+    x: NDArray[Any]
+    y: NDArray[Any]
+    flux: NDArray[Any]
+    flags: NDArray[Any]
+    iterations: NDArray[Any]
+
+    def __post_init__(self) -> None:
+        for field in fields(self)[1:]:
+            array = finite_array(f"{self.name}: {field.name}", getattr(self, field.name))
+            if array.ndim != 2 or array.shape != np.shape(self.x):
+                raise InputError(
+                    f"{self.name}: {field.name}: expected shape (n_frames, n_subapertures), as x of shape "
+                    f"{np.shape(self.x)}, got {array.shape}"
+                )
+            object.__setattr__(self, field.name, array)
+
+    @classmethod
+    def of(cls, name: str, slopes: Any) -> MeasuredSlopes:
+        """Make one of the `Slopes` of one frame or several."""
+        return cls(name, *(np.atleast_2d(getattr(slopes, field.name)) for field in fields(cls)[1:]))
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self.x)
+
+    @property
+    def n_subapertures(self) -> int:
+        """Number of sub-apertures."""
+        return int(self.x.shape[1])
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which measurements are valid."""
+        return (self.flags & int(INVALID)) == 0  # type: ignore[no-any-return]
+
+    @property
+    def is_denoised(self) -> bool:
+        """Whether the denoiser did anything."""
+        return bool(np.any(self.iterations) or self.flag_count(SubapertureFlag.INFEASIBLE_STRENGTH))
+
+    def flag_count(self, flag: SubapertureFlag) -> int:
+        """Return in how many measurements all bits of `flag` are set."""
+        return int(np.count_nonzero((self.flags & int(flag)) == int(flag)))
+
+
+Arm = MeasuredSlopes  # its name in `faintspot.report`
+
+
+@dataclass(frozen=True)
+class SlopesSummary:
+    """Slopes in numbers: of the whole run, and per sub-aperture, (n_subapertures,), over its valid frames."""
+
+    valid_fraction: float
+    median_flux_e: float
+    """Over all valid measurements; NaN when there is none."""
+    median_iterations: float
+    limit_fraction: float
+    """Fraction of the valid measurements that reached the iteration limit."""
+    valid_frames: NDArray[np.int64]
+    flux_e: Floats
+    """Median."""
+    x_px: Floats
+    """Mean."""
+    y_px: Floats
+    iterations: Floats
+    """Mean."""
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """Scatter of each sub-aperture's position over frames, px, (n_subapertures,); NaN below two frames."""
+
+    n_frames: NDArray[np.int64]
+    x_px: Floats
+    """Standard deviation (n - 1)."""
+    y_px: Floats
+    robust_px: Floats
+    """1.4826 times the median absolute deviation, rms of x and y: blind to rare outliers."""
+
+    @property
+    def px(self) -> Floats:
+        """Rms of x and y."""
+        combined: Floats = np.sqrt((self.x_px**2 + self.y_px**2) / 2)
+        return combined
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Where there were at least two frames."""
+        return self.n_frames >= 2
+
+
+@dataclass(frozen=True)
+class SlopeError:
+    """Distance of an arm's positions from the truth."""
+
+    mean_px: float
+    """R: mean of (|dx| + |dy|) / 2."""
+    standard_error_px: float
+    """NaN from a single measurement."""
+    gain: float
+    """Centroid gain: slope of the estimate on the truth, x and y pooled; NaN where the truth stands
+    still."""
+    n: int
+    """Number of measurements."""
+
+
+def summarise(arm: MeasuredSlopes) -> SlopesSummary:
+    """Return the numbers of one arm."""
+    valid = arm.valid
+    parts: dict[str, list[Any]] = {name: [] for name in ("flux", "x", "y", "iterations")}
+    for block in column_blocks(arm.n_frames, arm.n_subapertures):
+        kept = valid[:, block]
+        parts["flux"].append(median_over_valid(arm.flux[:, block], kept))
+        for name in ("x", "y", "iterations"):
+            parts[name].append(mean_over_valid(getattr(arm, name)[:, block], kept))
+    flux, x, y, iterations = (np.concatenate(part) for part in parts.values())
+    some = bool(valid.any())
+    limit = (arm.flags & int(SubapertureFlag.NOT_CONVERGED)) != 0
+    return SlopesSummary(
+        valid_fraction=float(valid.mean()),
+        median_flux_e=float(np.median(arm.flux[valid])) if some else np.nan,
+        median_iterations=float(np.median(arm.iterations[valid])) if some else np.nan,
+        limit_fraction=float(limit[valid].mean()) if some else np.nan,
+        valid_frames=valid.sum(axis=0),
+        flux_e=flux,
+        x_px=x,
+        y_px=y,
+        iterations=iterations,
+    )
+
+
+def valid_in_all(arms: Sequence[MeasuredSlopes]) -> NDArray[np.bool_]:
+    """Return which measurements are valid in every arm, (n_frames, n_subapertures)."""
+    valid: NDArray[np.bool_] = np.logical_and.reduce([arm.valid for arm in arms])
+    return valid
+
+
+def jitter(x: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> Jitter:
+    """Return the scatter over the valid frames of positions (n_frames, n_subapertures)."""
+    columns = []
+    for block in column_blocks(*x.shape):
+        kept = valid[:, block]
+        stds = [std_over_valid(axis[:, block], kept) for axis in (x, y)]
+        robust = [robust_std_over_valid(axis[:, block], kept) for axis in (x, y)]
+        columns.append((*stds, np.sqrt((robust[0] ** 2 + robust[1] ** 2) / 2)))
+    return Jitter(valid.sum(axis=0), *(np.concatenate(part) for part in zip(*columns, strict=True)))
+
+
+def rms(values: Floats) -> float:
+    """Return the root mean square of the values that are not NaN; NaN when there is none."""
+    kept = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(kept**2))) if kept.size else np.nan
+
+
+def median(values: Floats) -> float:
+    """Return the median of the values that are not NaN; NaN when there is none."""
+    kept = values[np.isfinite(values)]
+    return float(np.median(kept)) if kept.size else np.nan
+
+
+def slope_error(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> SlopeError:
+    """Return the slope error R of an arm against the truth (n_frames, n_subapertures, 2), px."""
+    n = int(np.count_nonzero(valid))
+    if n == 0:
+        return SlopeError(np.nan, np.nan, np.nan, 0)
+    errors = absolute_errors(arm, truth)
+    return SlopeError(
+        mean_px=float(errors[valid].mean()),
+        standard_error_px=standard_error(errors, valid),
+        gain=_gain(arm, truth, valid),
+        n=n,
+    )
+
+
+def error_ratio(
+    arm: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Return R of `reference` over R of `arm`, and the ratio's standard error, from paired measurements."""
+    own, other = absolute_errors(arm, truth), absolute_errors(reference, truth)
+    own_mean = own[valid].mean() if valid.any() else 0.0
+    if own_mean == 0:
+        return np.nan, np.nan
+    ratio = float(other[valid].mean() / own_mean)
+    return ratio, standard_error(other - ratio * own, valid) / float(own_mean)
+
+
+def flux_gain(ratio: float) -> tuple[float, float]:
+    """Return the range of the flux gain that a ratio of slope errors stands for.
+
+    R falls as 1 / flux where read noise rules and as 1 / sqrt(flux) where photon noise does, so the same R at
+    less light means a gain in flux between the ratio and its square.
+    """
+    return min(ratio, ratio**2), max(ratio, ratio**2)
+
+
+def absolute_errors(arm: MeasuredSlopes, truth: Floats) -> Floats:
+    """Return (|dx| + |dy|) / 2 of every measurement, px."""
+    errors: Floats = (np.abs(arm.x - truth[..., 0]) + np.abs(arm.y - truth[..., 1])) / 2
+    return errors
+
+
+def standard_error(values: Floats, valid: NDArray[np.bool_]) -> float:
+    """Return the standard error of the mean of the valid values; NaN from a single one.
+
+    Measurements of one frame, and of one sub-aperture, may have errors in common (a static bias): it is
+    computed with either as the independent unit, and the larger one returned.
+    """
+    n = np.count_nonzero(valid)
+    residual = np.where(valid, values - values[valid].mean(), 0.0)
+    errors = []
+    for axis in (0, 1):
+        groups = int(np.count_nonzero(valid.any(axis=axis)))
+        if groups > 1:
+            sums = residual.sum(axis=axis)
+            errors.append(np.sqrt(np.sum(sums**2) * groups / (groups - 1)) / n)
+    return float(max(errors, default=np.nan))
+
+
+def column_blocks(n_frames: int, n_subapertures: int) -> Iterator[slice]:
+    """Yield ranges of sub-apertures whose measurements of all frames are a bounded number."""
+    step = max(1, _BLOCK_NUMBERS // n_frames)
+    for start in range(0, n_subapertures, step):
+        yield slice(start, start + step)
+
+
+def mean_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+    """Return the mean of each column's valid values."""
+    sums: Floats = np.sum(values, axis=0, where=valid, dtype=np.float64)
+    return _divide(sums, valid.sum(axis=0))
+
+
+def std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+    """Return the standard deviation (n - 1) of each column's valid values; NaN below two of them."""
+    mean = mean_over_valid(values, valid)
+    squares: Floats = np.sum(np.square(values - np.nan_to_num(mean)), axis=0, where=valid)
+    return np.sqrt(_divide(squares, valid.sum(axis=0) - 1))
+
+
+def median_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+    """Return the median of each column's valid values."""
+    ordered: Floats = np.sort(np.where(valid, values.astype(np.float64), np.inf), axis=0)
+    count = valid.sum(axis=0)
+    columns = np.arange(ordered.shape[1])
+    upper = ordered[np.minimum(count // 2, len(ordered) - 1), columns]
+    lower = ordered[np.maximum(count - 1, 0) // 2, columns]
+    return _divide(np.where(count > 0, lower + upper, 0.0), 2 * (count > 0))
+
+
+def robust_std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Floats:
+    """Return 1.4826 times the median absolute deviation of each column's valid values; NaN below two."""
+    middle = np.nan_to_num(median_over_valid(values, valid))
+    spread = GAUSSIAN_MAD * median_over_valid(np.abs(values - middle), valid)
+    measured: Floats = np.where(valid.sum(axis=0) >= 2, spread, np.nan)
+    return measured
+
+
+def _divide(sums: Floats, counts: NDArray[np.int64]) -> Floats:
+    quotient: Floats = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    return quotient
+
+
+def _gain(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> float:
+    products, squares = 0.0, 0.0
+    for axis, values in enumerate((arm.x, arm.y)):
+        true = truth[..., axis][valid]
+        true = true - true.mean()
+        products += float(np.sum(true * values[valid]))
+        squares += float(np.sum(true**2))
+    # Below 1e-6 px the truth stands still, whatever its round-off.
+    return products / squares if squares > 1e-12 * np.count_nonzero(valid) else np.nan

@@ -1,0 +1,133 @@
+"""Windows around the lenslets that were found: how large they are, and where each begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from faintspot.errors import InputError
+from faintspot.sensor.layout import LARGEST_WINDOW, Layout, finite_or_masked, window_size
+from faintspot.sensor.lenslets import LensletGrid, find_lenslets
+
+# Windows may be spread this far from their spots to be a pixel larger: as far as rounding their corners to
+# whole pixels moves them anyway.
+_SPREAD_PX = 0.5
+_LARGEST_SHIFT = 0.35  # of a window's side, by which windows that may be moved are moved off their spots
+
+
+@dataclass(frozen=True)
+class FoundLayout:
+    """A layout found in a frame, and what was left out of it.
+
+    Parameters
+    ----------
+    layout : Layout
+        The lit sub-apertures whose windows lie within the frame.
+    lenslets : LensletGrid
+        All lit lenslets, those at the edge too.
+    cut : (n, 2) array
+        x, y of the lit lenslets that were left out because their window leaves the frame, px.
+    """
+
+    layout: Layout
+    lenslets: LensletGrid
+    cut: NDArray[np.float64]
+
+
+def find_layout(
+    frame: ArrayLike,
+    *,
+    pixels: int | tuple[int, int] | None = None,
+    move_windows: bool = False,
+    **options: Any,
+) -> FoundLayout:
+    """Find the sub-apertures of a frame, and say which were left out.
+
+    Parameters
+    ----------
+    frame : (h, w) or (n, h, w) array
+    pixels : int or (int, int), optional
+        Window, see `Layout.from_frame`.
+    move_windows : bool
+        Whether all windows may be moved off the spots to save those at the frame's edge.
+    **options
+        Passed on to `faintspot.sensor.lenslets.find_lenslets`.
+
+    Raises
+    ------
+    InputError
+        When no regular array of spots is found, or no window lies within the frame.
+    """
+    array = finite_or_masked("frame", frame)
+    window = None if pixels is None else window_size("pixels", pixels)
+    grid = find_lenslets(array, **options)
+    shape = (int(array.shape[-2]), int(array.shape[-1]))
+    middles = grid.centres[:, ::-1]
+    if window is None:
+        window = _largest_window(middles, grid.pitch_px)
+    middles = _spread(middles, window)
+    if move_windows:
+        moved = [_shift_inside(middles[:, i], window[i], shape[i]) for i in range(2)]
+        middles = np.stack(moved, axis=1)
+    corners = np.floor(middles - 0.5 * (np.array(window) - 1) + 0.5).astype(np.int64)
+    within = np.all((corners >= 0) & (corners + np.array(window) <= np.array(shape)), axis=1)
+    if not within.any():
+        raise InputError(
+            f"frame: the windows of all {len(corners)} lenslets found leave the frame; "
+            f"try pixels < {min(window)}"
+        )
+    layout = Layout(
+        shape,
+        window,
+        corners[within],
+        grid.centres[within],
+        grid.cells[within],
+        grid.geometry,
+        grid.pitch_px,
+        grid.angle_deg,
+    )
+    return FoundLayout(layout, grid, grid.centres[~within])
+
+
+def _largest_window(middles: NDArray[np.float64], pitch_px: float) -> tuple[int, int]:
+    """Return the largest square window in which neighbours do not overlap, spread by half a pixel at most."""
+    distances = np.asarray(cKDTree(middles).query(middles, k=2, p=np.inf)[0])[:, 1]
+    clear = float(np.min(distances[np.isfinite(distances)], initial=pitch_px))
+    side = int(np.rint(clear))
+    if (side / clear - 1) * _half_extent(middles) > _SPREAD_PX:
+        side = int(clear)
+    side = min(side, LARGEST_WINDOW)
+    return side, side
+
+
+def _half_extent(middles: NDArray[np.float64]) -> float:
+    return float(np.max(np.ptp(middles, axis=0))) / 2
+
+
+def _spread(middles: NDArray[np.float64], window: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the middles far enough apart for the window, if half a pixel is enough for that.
+
+    Middles that lie a window or more apart keep that distance when they are rounded to whole pixels.
+    """
+    pairs = cKDTree(middles).query_pairs(max(window), p=np.inf, output_type="ndarray")
+    apart = np.abs(middles[pairs[:, 0]] - middles[pairs[:, 1]]) / np.array(window)
+    closest = float(np.min(apart.max(axis=1), initial=1.0))
+    if closest >= 1 or (1 / closest - 1) * _half_extent(middles) > _SPREAD_PX:
+        return middles
+    middle = (middles.min(axis=0) + middles.max(axis=0)) / 2
+    return np.asarray(middle + (middles - middle) * ((1 + 1e-9) / closest))
+
+
+def _shift_inside(centres: NDArray[np.float64], side: int, length: int) -> NDArray[np.float64]:
+    """Move all windows alike along one axis, as little as saves the most at the edge."""
+    shifts = np.arange(-_LARGEST_SHIFT * side, _LARGEST_SHIFT * side + 0.25, 0.5)
+    starts = np.floor(centres + shifts[:, None] - 0.5 * (side - 1) + 0.5)
+    inside = np.count_nonzero((starts >= 0) & (starts + side <= length), axis=1)
+    unmoved = np.floor(centres - 0.5 * (side - 1) + 0.5)
+    if inside.max() <= np.count_nonzero((unmoved >= 0) & (unmoved + side <= length)):
+        return centres
+    return np.asarray(centres + shifts[np.lexsort((np.abs(shifts), -inside))[0]])

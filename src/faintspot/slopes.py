@@ -1,0 +1,57 @@
+"""What a pipeline gives: slopes, and the images after every step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.flags import INVALID
+
+RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures)."""
+
+    x: NDArray[np.float32]
+    """Position of the spot along columns, px from the reference; 0 where invalid."""
+    y: NDArray[np.float32]
+    """Position along rows."""
+    flux: NDArray[np.float32]
+    """Electrons left after the background subtraction."""
+    flags: NDArray[np.uint8]
+    """Bits of `SubapertureFlag`."""
+    iterations: NDArray[np.int32]
+    """Iterations that the denoising took."""
+    bad_pixels: NDArray[np.int32]
+    """Number of pixels that were masked, NaN or infinite."""
+    standard_error_x: NDArray[np.float32]
+    """Standard error of x, px; infinite where invalid, and where the read noise is not known."""
+    standard_error_y: NDArray[np.float32]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether the slope was measured."""
+        return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
+
+    @property
+    def vector(self) -> NDArray[np.float32]:
+        """All x, then all y, along the last axis: what a reconstructor multiplies."""
+        return np.concatenate([self.x, self.y], axis=-1)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes."""
+
+    raw: NDArray[Any]
+    """As in the frame, ADU."""
+    calibrated: NDArray[np.float32]
+    """Electrons, bad pixels filled."""
+    denoised: NDArray[np.float32]
+    background_subtracted: NDArray[np.float32]
+    slopes: Slopes

@@ -1,0 +1,155 @@
+"""The tables of a study's page: verdicts on the paper's claims, the cases behind them, baselines, gains."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.report.figure_data import csv_text
+from faintspot.report.page import Badge, Cell, Section, Table
+from faintspot.study.baselines import ARM_NAMES, against_tv
+from faintspot.study.cell_numbers import mode_in_words
+from faintspot.study.claims import fixed_mode
+from faintspot.study.gains import gains_by_mode
+from faintspot.study.verdicts import Finding, Outcome, Verdict
+
+if TYPE_CHECKING:
+    import xarray
+
+_MOST_CASES_SHOWN = 3  # in the verdict table; the page lists all of them below it
+_CASES = "cases"
+_COLOURS = {Outcome.HOLDS: "good", Outcome.IN_PART: "mixed", Outcome.FAILS: "bad"}
+
+
+def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
+    """Return the section of the verdicts; `fixed` names the mode of a fixed number of pixels."""
+    title = "Verdicts on the claims of Basden et al. 2015"
+    if not judged:
+        return Section("verdicts", title, missing="No verdicts: they need the arms “plain” and “tv”.")
+    text = (
+        f"{_summary(judged, fixed)}. Decided by the rules stated under each claim, from the numbers of this "
+        "study. “Best k”: each arm keeps its own best number of brightest pixels. "
+        f"“{fixed}”: both arms keep the same. A verdict holds when it does so in every case of both modes."
+    )
+    rows = [
+        [
+            Cell(f"{item.number}. {item.claim}", small=item.rule),
+            Cell(badge=_badge(item.outcome)),
+            _cell_of_mode(item.best),
+            _cell_of_mode(item.fixed),
+        ]
+        for item in judged
+    ]
+    header = ["Claim", "Both together", "Best k", fixed.capitalize()]
+    return Section("verdicts", title, [text], tables=[Table(header, rows, prose=True)])
+
+
+def cases_section(judged: list[Verdict]) -> Section:
+    """Return the section of all cases that the verdicts rest on."""
+    title = "All cases behind the verdicts"
+    found = [
+        (item, finding.mode, case)
+        for item in judged
+        for finding in (item.best, item.fixed)
+        for case in finding.cases
+    ]
+    if not found:
+        return Section(_CASES, title, missing="There are none.")
+    data = [
+        [item.number, item.claim, mode, case.where, case.finding, case.outcome.value]
+        for item, mode, case in found
+    ]
+    table = Table(
+        ["Claim", "mode", "where", "finding", "outcome"],
+        [
+            [str(item.number), mode_in_words(mode), case.where, case.finding, case.outcome.value]
+            for item, mode, case in found
+        ],
+        prose=True,
+        csv=("verdicts.csv", csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)),
+        folded=f"{len(found)} cases",
+    )
+    return Section(_CASES, title, tables=[table])
+
+
+def baselines_section(dataset: xarray.Dataset) -> Section:
+    """Return the section that compares TV with every other arm."""
+    title = "TV and the other methods"
+    modes = [mode for mode in ("best", fixed_mode(dataset)) if mode in dataset["mode"].values]
+    rows = [
+        [
+            ARM_NAMES[row.arm],
+            row.profile,
+            mode_in_words(mode),
+            str(row.cells),
+            str(row.smaller),
+            str(row.larger),
+            str(row.cells - row.smaller - row.larger),
+            str(row.smallest),
+            f"{row.mean_ratio:.3f}",
+        ]
+        for mode in modes
+        for row in against_tv(dataset, mode)
+    ]
+    if not rows:
+        why = "Nothing to compare: TV or all others are not in this study."
+        return Section("baselines", title, missing=why)
+    caption = (
+        "Cells in which a method’s R is smaller or larger than TV’s: paired differences, 5 % false alarms "
+        "for all cells together. “Smallest of all”: R below that of every other method, decided or not. Last "
+        "column: geometric mean over the cells, above 1 where TV is better."
+    )
+    header = ["Method", "spots", "mode", "cells", "smaller", "larger", "not decided", "smallest of all"]
+    return Section("baselines", title, tables=[Table([*header, "R / R of TV"], rows, caption)])
+
+
+def gains_section(dataset: xarray.Dataset) -> Section:
+    """Return the section of the flux gain, for every way to choose the number of pixels."""
+    title = "Flux gain of TV for every way to choose k"
+    modes = [str(mode) for mode in dataset["mode"].values]
+    rows = [
+        [
+            configuration.in_words(),
+            *("–" if (gain := gains.get(mode)) is None else gain.in_words() for mode in modes),
+        ]
+        for configuration, gains in gains_by_mode(dataset).items()
+    ]
+    if not rows:
+        why = "No configuration of this study has the error 0.15 px within its fluxes."
+        return Section("gains", title, missing=why)
+    caption = (
+        "By how many times less light TV reaches R = 0.15 px than no denoising, with its 95 % interval. "
+        "“Fixed”: both arms keep the same number of pixels. “–”: the error without denoising does not pass "
+        "that level within the study."
+    )
+    header = ["Configuration", *(mode_in_words(mode) for mode in modes)]
+    return Section("gains", title, tables=[Table(header, rows, caption)])
+
+
+def _summary(judged: list[Verdict], fixed: str) -> str:
+    def counted(outcomes: list[Outcome]) -> str:
+        counts = [(outcome.value, outcomes.count(outcome)) for outcome in Outcome]
+        return ", ".join(f"{outcome} {n}" for outcome, n in counts if n)
+
+    best, other, both = (
+        counted([getattr(item, name).outcome if name else item.outcome for item in judged])
+        for name in ("best", "fixed", "")
+    )
+    return f"Of {len(judged)} claims: best k: {best}; {fixed}: {other}; both together: {both}"
+
+
+def _badge(outcome: Outcome) -> Badge:
+    return Badge(outcome.value, _COLOURS.get(outcome, "grey"))
+
+
+def _cell_of_mode(finding: Finding) -> Cell:
+    """Return a mode's outcome and its first cases, of different outcomes where there are any."""
+    shown = list({case.outcome: case for case in reversed(finding.cases)}.values())[::-1]
+    shown += [case for case in finding.cases if case not in shown]
+    shown = sorted(shown[:_MOST_CASES_SHOWN], key=list(finding.cases).index)
+    more = len(finding.cases) - len(shown)
+    return Cell(
+        finding.in_words(),
+        _badge(finding.outcome),
+        items=[(f"{case.finding} – {case.outcome.value}", case.where) for case in shown],
+        link=(_CASES, f"and {more} more") if more else None,
+    )

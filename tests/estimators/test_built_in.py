@@ -1,0 +1,110 @@
+"""Every built-in estimator, and the example's own one, passes the tests that a plug-in can inherit."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+
+import faintspot as fs
+from faintspot.estimators import Estimator, estimator_named
+from faintspot.estimators.registry import estimators
+from faintspot.testing import FLUX_E, READ_NOISE_E, SIDE, EstimatorTests
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "own_estimator.py"
+
+
+class TestBrightest(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("brightest")(keep_brightest=20)
+
+
+class TestTotalVariation(EstimatorTests):
+    # What the denoising does to the noise is not in its standard errors.
+    error_ratio = (0.5, 2.0)
+
+    def make(self) -> Estimator:
+        return estimator_named("tv")(noise_std=2.0, keep_brightest=20)
+
+
+class TestSmoothed(EstimatorTests):
+    # Nor is what the smoothing does to it.
+    error_ratio = (0.5, 2.0)
+
+    def make(self) -> Estimator:
+        return estimator_named("smoothed")(keep_brightest=20)
+
+
+class TestCentroid(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("centroid")()
+
+
+class TestThresholded(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("thresholded")(threshold_e=5.0)
+
+
+class TestWeighted(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("weighted")()
+
+
+class TestMatched(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("matched")()
+
+
+class TestMaximumLikelihood(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("ml")()
+
+
+class TestMaximumAPosteriori(EstimatorTests):
+    def make(self) -> Estimator:
+        return estimator_named("map")(prior_std_px=0.5)
+
+
+@functools.cache
+def trained_score() -> fs.TrainedScore:
+    return fs.train_estimator(
+        flux_e=FLUX_E,
+        detector=fs.simulate.Detector(read_noise_e=READ_NOISE_E),
+        shape=(SIDE, SIDE),
+        profile="gaussian",
+        realisations=2000,
+        rng=np.random.default_rng(3),
+    )
+
+
+class TestTrained(EstimatorTests):
+    # Learnt from noisy spots: the centre is found to its training's noise.
+    centre_tolerance_px = 0.02
+
+    def make(self) -> Estimator:
+        return estimator_named("trained")()
+
+    def score(self) -> fs.TrainedScore:
+        return trained_score()
+
+
+@functools.cache
+def example_estimator() -> type[Estimator]:
+    spec = importlib.util.spec_from_file_location("own_estimator", EXAMPLE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.PowerCentroid  # type: ignore[no-any-return]
+
+
+class TestOwn(EstimatorTests):
+    def make(self) -> Estimator:
+        return example_estimator()()
+
+
+def test_every_built_in_estimator_is_tested() -> None:
+    tested = {kind().make().name for kind in EstimatorTests.__subclasses__()}
+    assert estimators().keys() <= tested

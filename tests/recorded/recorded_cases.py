@@ -1,0 +1,73 @@
+"""A small simulated sensor measured in two ways, and a reader of pages, for the tests of reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.pipeline import SlopePipeline
+from faintspot.recorded.statistics import MeasuredSlopes
+from faintspot.sensor.layout import Layout
+from faintspot.settings import Settings
+from faintspot.simulate import sensor_frames
+from faintspot.slopes import Stages
+
+SETTINGS = Settings(noise_std=0.3, keep_brightest=10)
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+def sensor(shape: tuple[int, int] = (3, 3)) -> Layout:
+    return Layout.grid(shape, pixels=8)
+
+
+def simulated(layout: Layout, n_frames: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    rng = np.random.default_rng(4)
+    return sensor_frames(layout.corners, layout.window, layout.frame_shape, n_frames, rng=rng)
+
+
+def two_arms(layout: Layout, frames: NDArray[Any]) -> tuple[list[MeasuredSlopes], dict[str, Stages]]:
+    arms, stages = [], {}
+    for name, settings in (("TV", SETTINGS), ("no TV", SETTINGS.replace(denoise=False))):
+        pipeline = SlopePipeline(layout, settings)
+        arms.append(MeasuredSlopes.of(name, pipeline(frames)))
+        stages[name] = pipeline.explain(frames[0])
+    return arms, stages
+
+
+@dataclass
+class Page(HTMLParser):
+    """What is in a page; fails where a tag is not closed or closed twice."""
+
+    html: str
+    tags: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
+    words: list[str] = field(default_factory=list)
+    opened: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__init__(convert_charrefs=True)
+        self.feed(self.html)
+        self.close()
+        assert self.opened == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.opened.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.opened
+        assert self.opened.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def values(self, attribute: str) -> list[str]:
+        return [value for _, found in self.tags if (value := found.get(attribute)) is not None]

@@ -1,0 +1,189 @@
+"""The report of slopes in files: rebuilt from what they say, and what is missing is said."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
+
+from faintspot import configuration
+from faintspot.errors import InputError
+from faintspot.io import create_writer
+from faintspot.pipeline import SlopePipeline
+from faintspot.recorded import measure_recorded, slopes_as_variables
+from faintspot.report import report_of_stored
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.settings import Settings
+
+pytestmark = pytest.mark.usefixtures("undrawn_pictures")
+PLAIN = SETTINGS.replace(denoise=False)
+
+
+def store(
+    path: Path,
+    layout: Layout,
+    settings: Settings = SETTINGS,
+    calibration: Calibration | None = None,
+    n_frames: int = 5,
+    errors: Mapping[str, Any] = MappingProxyType({}),
+    **changes: Any,
+) -> Path:
+    """Simulate frames beside the output, measure them and write the slopes; an attribute None is left out."""
+    calibration = calibration or Calibration()
+    frames = simulated(layout, n_frames)[0]
+    source = path.with_name("frames.npy")
+    np.save(source, frames)
+    slopes = SlopePipeline(layout, settings, calibration)(frames)
+    attributes: dict[str, Any] = {
+        "fingerprint": "test",
+        "configuration": configuration.to_text(layout, settings, calibration),
+        "sources": [str(source)],
+        "faintspot_version": "0.1.0",
+    } | changes
+    with create_writer(
+        path,
+        n_frames=n_frames,
+        n_subapertures=len(layout),
+        attributes={name: value for name, value in attributes.items() if value is not None},
+        coordinates={"centre_x": layout.centres[:, 0], "centre_y": layout.centres[:, 1]},
+    ) as writer:
+        writer.append(0, {**slopes_as_variables(slopes), **errors})
+    return path
+
+
+def test_one_store_gives_the_whole_page(tmp_path: Path) -> None:
+    page = Page(report_of_stored([store(tmp_path / "slopes.zarr", sensor())]))
+    assert len([tag for tag, _ in page.tags if tag == "img"]) == 7
+    assert "total-variation denoising of strength 0.3 e-" in page.text
+    assert "frames.npy" in page.text
+    assert "What to look at first" not in page.text
+    assert "Not drawn" not in page.text
+
+
+def test_two_stores_are_two_arms(tmp_path: Path) -> None:
+    first = store(tmp_path / "a.npz", sensor())
+    second = store(tmp_path / "b.npz", sensor(), PLAIN)
+    page = Page(report_of_stored([first, second]))
+    assert "Settings of 'TV'" in page.text
+    assert "Settings of 'no TV'" in page.text
+    assert "no denoising; 10 brightest of 64 pixels" in page.text
+
+
+def test_standard_errors_are_shown_where_they_are_known(tmp_path: Path) -> None:
+    x, y = np.full((2, 5, 9), np.inf)
+    unknown = store(tmp_path / "a.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
+    assert "Median standard error" not in Page(report_of_stored([unknown])).text
+    x[0], y[0] = 0.07, 0.01  # rms 0.05
+    x[1] = 0.2
+    known = store(tmp_path / "b.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
+    assert "Median standard error 0.05 px per axis" in Page(report_of_stored([known])).text
+    page = Page(report_of_stored([unknown, known]))
+    assert "Median standard error of 'b.npz' 0.05 px" in page.text
+    assert "Median standard error of 'a.npz'" not in page.text
+
+
+def test_two_stores_of_the_same_kind_are_named_by_their_files(tmp_path: Path) -> None:
+    paths = [store(tmp_path / name, sensor()) for name in ("a.npz", "b.npz")]
+    assert "Settings of 'b.npz'" in Page(report_of_stored(paths)).text
+    with pytest.raises(InputError, match="the same twice"):
+        report_of_stored([paths[0], paths[0]])
+
+
+def test_stores_of_different_sensors_are_refused_in_one_line(tmp_path: Path) -> None:
+    first = store(tmp_path / "a.npz", sensor())
+    smaller = store(tmp_path / "b.npz", sensor((2, 2)))
+    plain = sensor()
+    moved = Layout(plain.frame_shape, plain.window, plain.corners, plain.centres + 0.5)
+    other = store(tmp_path / "c.npz", moved)
+    for second, words in ((smaller, "9 sub-apertures"), (other, "the layout of")):
+        with pytest.raises(InputError, match=words) as error:
+            report_of_stored([first, second])
+        assert "\n" not in str(error.value)
+    for paths in ([], [first] * 3):
+        with pytest.raises(InputError, match="one file or two"):
+            report_of_stored(paths)
+
+
+def test_frames_counts_that_differ_are_said(tmp_path: Path) -> None:
+    first = store(tmp_path / "a.npz", sensor())
+    second = store(tmp_path / "b.npz", sensor(), PLAIN, n_frames=3)
+    assert "hold 5 and 3 frames: the first 3 are compared" in Page(report_of_stored([first, second])).text
+
+
+def test_csv_without_attributes_still_gives_numbers(tmp_path: Path) -> None:
+    text = Page(report_of_stored([store(tmp_path / "slopes.csv", sensor())])).text
+    assert "does not say with which configuration" in text
+    assert "median flux after background" in text
+    assert "the layout of the sub-apertures is not known" in text
+
+
+@pytest.mark.parametrize(
+    "text", ["not [ toml", "[settings]\nnoise_std = -1\n", "[layout]\nwindow = [8, 8]\n"]
+)
+def test_configuration_that_cannot_be_used_is_said(tmp_path: Path, text: str) -> None:
+    page = Page(report_of_stored([store(tmp_path / "s.npz", sensor(), configuration=text)]))
+    assert "The configuration stored in s.npz cannot be used" in page.text
+    assert "/configuration:" not in page.text
+
+
+def test_missing_frames_are_said_and_can_be_given(tmp_path: Path) -> None:
+    path = store(tmp_path / "s.npz", sensor(), sources=["gone.npy"])
+    text = Page(report_of_stored([path])).text
+    assert "Not drawn: gone.npy" in text
+    assert "Not drawn" not in Page(report_of_stored([path], frames=[tmp_path / "frames.npy"])).text
+    path = store(tmp_path / "t.npz", sensor(), sources=None)
+    assert "does not say where its frames came from" in Page(report_of_stored([path])).text
+
+
+def test_calibration_maps_come_from_the_original_configuration(tmp_path: Path) -> None:
+    layout = sensor()
+    slope = np.indices(layout.frame_shape).sum(axis=0) / 10.0
+    calibration = Calibration(dark=slope, gain_e_per_adu=2.0)
+    original = tmp_path / "faintspot.toml"
+    for item in (layout, SETTINGS, calibration):
+        item.save(original)
+    path = store(tmp_path / "s.npz", layout, calibration=calibration, configuration_file=str(original))
+    text = Page(report_of_stored([path])).text
+    assert "Not drawn" not in text
+    assert "What to look at first" not in text
+    Calibration(dark=-10 * slope, gain_e_per_adu=3.0).save(original)
+    text = Page(report_of_stored([path])).text
+    assert "has changed since" in text
+    assert "positions that differ from those stored" in text
+    original.unlink()
+    text = Page(report_of_stored([path])).text
+    assert "The calibration maps of s.npz are not found" in text
+    assert "settings or calibration of s.npz are not known" in text
+
+
+def test_frames_that_are_not_the_runs_are_noticed(tmp_path: Path) -> None:
+    path = store(tmp_path / "s.npz", sensor())
+    np.save(tmp_path / "frames.npy", simulated(sensor(), 5)[0][::-1] + np.eye(24, dtype=np.float32) * 50)
+    assert "positions that differ from those stored" in Page(report_of_stored([path])).text
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"gone\.zarr"):
+        report_of_stored([tmp_path / "gone.zarr"])
+
+
+def test_slopes_relative_to_a_reference_are_recognised(tmp_path: Path) -> None:
+    layout = sensor()
+    reference = np.full((len(layout), 2), 0.4)
+    frames = simulated(layout, 3)[0]
+    np.save(tmp_path / "frames.npy", frames)
+    configured = tmp_path / "faintspot.toml"
+    layout.save(configured)
+    SETTINGS.save(configured)
+    output = tmp_path / "slopes.npz"
+    measure_recorded([tmp_path / "frames.npy"], configured, output, reference=reference)
+    text = Page(report_of_stored([output])).text
+    assert "slopes are relative to stored reference positions" in text
+    assert "positions that differ" not in text
+    assert "Not drawn" not in text
