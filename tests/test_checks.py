@@ -28,6 +28,29 @@ class TestRealArray:
             with refused("value"):
                 checks.real_array("value", bad)
 
+    @pytest.mark.parametrize(
+        ("given", "used"),
+        [("u1", "f4"), ("i2", "f4"), ("u2", "f4"), ("i4", "f8"), ("f4", "f4"), ("f8", "f8"), ("?", "f4")],
+    )
+    def test_masked_values_are_nan(self, given: str, used: str) -> None:
+        masked = np.ma.MaskedArray(np.ones((2, 2), given), mask=[[False, True], [False, False]])
+        array = checks.real_array("value", masked)
+        assert array.dtype == np.dtype(used)
+        assert not isinstance(array, np.ma.MaskedArray)
+        np.testing.assert_array_equal(array, [[1, np.nan], [1, 1]])
+        with refused("value", "1 NaN or infinite of 4"):
+            checks.finite_array("value", masked)
+
+    def test_masked_array_without_masked_values(self) -> None:
+        array = checks.real_array("value", np.ma.MaskedArray(np.ones((2, 2), "u2"), mask=False))
+        assert array.dtype == np.uint16
+        assert not isinstance(array, np.ma.MaskedArray)
+
+    def test_masked_things_that_are_no_numbers(self) -> None:
+        for dtype in ("c8", "U3", "M8[s]", "O"):
+            with refused("value"):
+                checks.real_array("value", np.ma.MaskedArray(np.zeros(2, dtype), mask=[True, False]))
+
 
 class TestImageStack:
     @pytest.mark.parametrize(

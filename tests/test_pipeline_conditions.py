@@ -49,6 +49,17 @@ class TestBadFrames:
         assert np.all(slopes.flags == Flag.TOO_MANY_BAD_PIXELS)
         assert np.all(slopes.bad_pixels == 36)
 
+    @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+    def test_masked_pixels_are_bad(self, dtype: Any) -> None:
+        frame = np.random.default_rng(1).integers(0, 50, (30, 30)).astype(dtype)
+        mask = np.zeros((30, 30), bool)
+        mask[3, 3] = mask[10, 12] = True
+        slopes = self.measure(np.ma.MaskedArray(frame, mask))
+        expected = self.measure(np.where(mask, np.nan, frame))
+        assert slopes.bad_pixels[0] == 1
+        for name in ("x", "y", "flux", "flags", "bad_pixels"):
+            np.testing.assert_array_equal(getattr(slopes, name), getattr(expected, name))
+
     def test_beyond_float32(self) -> None:
         frame = np.random.default_rng(1).random((30, 30)) * 9
         frame[3, 3], frame[4, 4] = 1e300, -1e300

@@ -22,13 +22,15 @@ LARGEST_FLOAT64 = 1e290
 def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
     """Return `value` as a real numeric array (bool counts as integer); dtype is kept.
 
+    What a masked array (numpy.ma) masks becomes NaN, and integers with it floats.
+
     Raises
     ------
     InputError
         When it is not numeric, is complex, is empty or has too few dimensions.
     """
     try:
-        array = np.asarray(value)
+        array = _masked_as_nan(value) if np.ma.is_masked(value) else np.asarray(value)
     except (ValueError, TypeError) as error:
         raise InputError(
             f"{name}: expected an array of real numbers, got {type(value).__name__} ({error})"
@@ -44,6 +46,13 @@ def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray
     if array.size == 0:
         raise InputError(f"{name}: expected at least one value, got an empty array of shape {array.shape}")
     return array
+
+
+def _masked_as_nan(value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
+    """Return a masked array as floats that hold its values, float32 where that does, and NaN."""
+    dtype = np.result_type(value.dtype, np.float32)
+    filled: NDArray[Any] = np.ma.filled(value.astype(dtype), np.nan)
+    return filled
 
 
 def finite_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:

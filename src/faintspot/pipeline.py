@@ -16,6 +16,7 @@ from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
+from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source, light_of_groups
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
@@ -94,6 +95,7 @@ class SlopePipeline:
         self._parts = psf, score, layout.offsets + _reference_positions(reference, len(layout))
         self.preparation = self._prepared()
         """What was computed beforehand."""
+        self._light_kernels: dict[str, Direct] = {}
         self._identity = _identity(*self._parts)
         self.device = one_of("device", device, ("cpu", "cuda"))
         self.on_device = self._device_pipeline() if self.device == "cuda" else None
@@ -131,7 +133,7 @@ class SlopePipeline:
             For another width.
         """
         other = copy.copy(self)
-        other._lanes = lanes_for(np.float32, width)
+        other._lanes, other._light_kernels = lanes_for(np.float32, width), {}
         other._calibration = packed_calibration(self.layout, self.calibration, width)
         other.preparation = other._prepared()
         other.on_device = None if self.on_device is None else other._device_pipeline()
@@ -249,9 +251,10 @@ class SlopePipeline:
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, n)
         task = self.preparation.task(variants, predicted)
+        kernel = self.preparation.kernel(frames)
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
-            prepared.kernel(source, task, start, stop, scratch, results, stages)
+            kernel(source, task, start, stop, scratch, results, stages)
 
         n_groups = n_frames * -(-n // self._lanes.width)
         own_scratch = self.preparation.own_scratch
@@ -284,8 +287,10 @@ class SlopePipeline:
             return np.zeros(n_frames, np.int64)
         light = np.empty((n_frames, n), np.float32)
 
+        light_kernel = self._light_kernels.setdefault(source.frames.dtype.str, Direct(light_of_groups))
+
         def job(start: int, stop: int, scratch: Scratch) -> None:
-            light_of_groups(source, start, stop, scratch, light)
+            light_kernel(source, start, stop, scratch, light)
 
         n_groups = n_frames * -(-n // self._lanes.width)
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import groups
+from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import Task
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
@@ -88,6 +89,7 @@ class Preparation:
         self._fixed = self._fixed_table(each)
         self._levels: list[NDArray[np.float32]] = []
         self._variants: dict[int, int] = {}
+        self._kernels: dict[str, Direct] = {}
         self._lock = threading.RLock()
         self._made: tuple[NDArray[np.float32], Any, Any] | None = None
         if not self.needs_light:
@@ -107,6 +109,13 @@ class Preparation:
     def own_scratch(self) -> Any:
         """Function that makes the memory of the estimator's kernel."""
         return self._arguments()[2]
+
+    def kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that measures groups of frames of this dtype."""
+        name = frames.dtype.str
+        if name not in self._kernels:
+            self._kernels[name] = Direct(self.prepared.kernel)
+        return self._kernels[name]
 
     def task(self, variants: NDArray[np.int64], prior: NDArray[np.float32] | None = None) -> Task:
         """Return what the kernel is to do with frames.

@@ -99,6 +99,19 @@ def test_reference(folder: Path, run: Commands) -> None:
     run.refused("slopes", "a.npy", "-o", "t.npz", "--reference", "r.npz:other", naming=("(16, 2)", "(3, 2)"))
 
 
+@pytest.mark.parametrize("name", ["flat.zarr", "flat.npz", "flat.fits", "flat.csv"])
+def test_reference_from_slopes_of_its_own(folder: Path, run: Commands, name: str) -> None:
+    """Less their own mean, the slopes of the same frames have mean 0."""
+    np.save("a.npy", simulated())
+    run.ok("slopes", "a.npy", "-o", name)
+    run.ok("slopes", "a.npy", "-o", "s.npz", "--reference", name)
+    flat, found = read_slopes(folder / name).variables, read_slopes(folder / "s.npz").variables
+    assert flat["valid"].all()
+    assert np.abs(flat["x"].mean(axis=0)).max() > 0.01
+    for axis in ("x", "y"):
+        np.testing.assert_allclose(found[axis].mean(axis=0), 0, atol=1e-5)
+
+
 def test_threads_and_blocks_change_nothing(folder: Path, run: Commands) -> None:
     frames = simulated()
     np.save("a.npy", frames)

@@ -45,6 +45,28 @@ def test_sum_that_cancels_is_never_nan() -> None:
     assert np.array_equal(fs.centre_of_gravity(g), [0.0, 0.0])
 
 
+@every_dtype
+def test_however_faint(dtype: Any) -> None:
+    """Values of 1 to 100 smallest steps of the type, and the same image as it usually is."""
+    generator = np.random.default_rng(4)
+    stack = generator.integers(0, 100, (5, 6, 7)).astype(dtype)
+    expected = fs.centre_of_gravity(stack)
+    faintest = np.finfo(dtype).smallest_subnormal
+    for scale in (faintest, 2**10 * faintest, np.finfo(dtype).tiny, 2**15 * np.finfo(dtype).tiny):
+        mixed = np.concatenate([stack, stack * scale, np.zeros_like(stack)])
+        result = fs.centre_of_gravity(mixed)
+        assert np.array_equal(result[:5], expected)
+        assert np.array_equal(result[5:10], expected)
+        assert not result[10:].any()
+
+
+@every_dtype
+def test_sum_that_cancels_but_for_almost_nothing(dtype: Any) -> None:
+    g = np.array([[1.0, -1.0, np.finfo(dtype).smallest_subnormal], [0.0, 0.0, 0.0]], dtype)
+    for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
+        assert np.isfinite(fs.centre_of_gravity(g[:, order])).all()
+
+
 @pytest.mark.parametrize("leading", [(), (3,), (2, 3)])
 def test_leading_shapes(leading: tuple[int, ...]) -> None:
     g = np.random.default_rng(1).random((*leading, 6, 4))

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 
 fits = pytest.importorskip("astropy.io.fits")
+tifffile = pytest.importorskip("tifffile")
 zarr = pytest.importorskip("zarr")
 
 FORMATS = ["npy", "fortran.npy", "npz", "deflated.npz", "fits", "fits.gz", "fits.fz"]
-FORMATS += ["v2.zarr", "v3.zarr", "group.zarr"]
+FORMATS += ["v2.zarr", "v3.zarr", "group.zarr", "stack.tif", "pages.tif", "deflated.tif", "imagej.tif"]
 
 
 def cube(n: int = 11, height: int = 6, width: int = 8, dtype: str = "int16") -> NDArray[Any]:
@@ -38,6 +39,15 @@ def save(path: Path, frames: NDArray[Any]) -> Path:
         fits.CompImageHDU(frames, tile_shape=(1, *frames.shape[1:]), **lossless).writeto(path)
     elif "fits" in name:
         fits.PrimaryHDU(frames).writeto(path)
+    elif name.endswith("pages.tif"):
+        with tifffile.TiffWriter(path) as writer:
+            for page in frames.reshape(-1, *frames.shape[-2:]):
+                writer.write(page, contiguous=False, metadata=None)
+    elif name.endswith(".tif"):
+        options: dict[str, Any] = {"compression": "zlib"} if name.endswith("deflated.tif") else {}
+        if name.endswith("imagej.tif") and frames.dtype in (np.uint8, np.uint16, np.float32):
+            options = {"imagej": True}  # which knows no other types
+        tifffile.imwrite(path, frames, photometric="minisblack", **options)
     elif "group" in name:
         group = zarr.create_group(str(path))
         group.create_array("frames", data=frames, chunks=(4, *frames.shape[1:]))

@@ -36,7 +36,9 @@ def test_blocks_of_every_format_are_the_frames(tmp_path: Path, name: str, dtype:
         assert [start for start, _ in source.blocks(2, 11, 4)] == [2, 6, 10]
 
 
-@pytest.mark.parametrize("name", ["npy", "fortran.npy", "npz", "fits", "fits.gz"])
+@pytest.mark.parametrize(
+    "name", ["npy", "fortran.npy", "npz", "fits", "fits.gz", "stack.tif", "deflated.tif"]
+)
 def test_two_dimensions_are_one_frame(tmp_path: Path, name: str) -> None:
     frame = cube()[0]
     with open_frames([save(tmp_path / f"a.{name}", frame)]) as source:
@@ -233,7 +235,7 @@ class TestRefused:
             "missing.fits": "no such file",
             "missing.npz:frames": "no such file",
             "empty.fits": "empty",
-            "text.txt": "expected a FITS",
+            "text.txt": "expected a FITS, .npy, .npz or TIFF file or a Zarr store",
             "folder": "expected a Zarr store",
             "short.npy": "expected a NumPy array",
             "cut.npy": "truncated",
@@ -272,10 +274,13 @@ class TestRefused:
                     source.block(start, stop)
 
     def test_missing_extra(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        paths = {"astropy": save(tmp_path / "a.fits", cube()), "zarr": save(tmp_path / "v3.zarr", cube())}
-        monkeypatch.delitem(sys.modules, "faintspot.io.fits_files", raising=False)
-        monkeypatch.delitem(sys.modules, "faintspot.io.zarr_files", raising=False)
+        paths = {
+            "astropy": save(tmp_path / "a.fits", cube()),
+            "tifffile": save(tmp_path / "a.tif", cube()),
+            "zarr": save(tmp_path / "v3.zarr", cube()),
+        }
         monkeypatch.setitem(sys.modules, "astropy.io", None)
+        monkeypatch.setitem(sys.modules, "tifffile", None)
         monkeypatch.setitem(sys.modules, "zarr", None)
         for package, path in paths.items():
             with pytest.raises(MissingExtraError, match=rf"{package}.*faintspot\[io\]"):

@@ -42,7 +42,9 @@ class TestBoundedMemory:
                 )
                 assert source.block(100_000, 100_001).max() == value
 
-    @pytest.mark.parametrize("name", ["a.fits.gz", "a.deflated.npz", "a.npz", "a.fits.fz", "v3.zarr"])
+    @pytest.mark.parametrize(
+        "name", ["a.fits.gz", "a.deflated.npz", "a.npz", "a.fits.fz", "v3.zarr", "pages.tif", "deflated.tif"]
+    )
     def test_compressed_files(self, tmp_path: Path, name: str) -> None:
         frames = np.zeros((2000, 128, 128), np.int16)
         frames[:, 5, 6] = np.arange(2000)

@@ -23,12 +23,7 @@ from tests.io.slope_files import (
 )
 
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.io import (
-    open_frames,
-    read_slopes,
-    slopes_export,
-    slopes_zarr,
-)
+from faintspot.io import csv_files, open_frames, read_slopes, slopes_zarr
 from faintspot.io.slopes_format import VARIABLES
 
 ERRORS = ("standard_error_x", "standard_error_y")
@@ -87,10 +82,11 @@ def test_equal_slopes_give_equal_files(tmp_path: Path, name: str) -> None:
 
 
 def test_xarray_reads_the_store(tmp_path: Path) -> None:
+    """As the README says, without options; a warning is an error in these tests."""
     xarray = pytest.importorskip("xarray")
     whole = result()
     write(tmp_path / "slopes.zarr", whole)
-    with xarray.open_zarr(tmp_path / "slopes.zarr", consolidated=False) as dataset:
+    with xarray.open_zarr(tmp_path / "slopes.zarr") as dataset:
         assert dict(dataset.sizes) == {"frame": 50, "subaperture": 7}
         assert dataset["x"].dims == ("frame", "subaperture")
         assert set(dataset.coords) == {"centre_x", "centre_y"}
@@ -171,7 +167,7 @@ def test_slopes_are_read_as_frames_by_name(tmp_path: Path) -> None:
 
 
 def test_formats_without_extra_and_those_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("fits_files", "zarr_files", "slopes_zarr"):
+    for module in ("slopes_fits", "slopes_zarr"):
         monkeypatch.delitem(sys.modules, f"faintspot.io.{module}", raising=False)
     monkeypatch.setitem(sys.modules, "astropy.io", None)
     monkeypatch.setitem(sys.modules, "zarr", None)
@@ -335,7 +331,7 @@ class TestRefused:
 
 def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As texts the whole table of 30,000 lines takes more than 10 MB, a piece of 256 lines 0.2 MB."""
-    monkeypatch.setattr(slopes_export, "_CSV_LINES", 256)
+    monkeypatch.setattr(csv_files, "_LINES", 256)
     whole = result(300, 100)
     tracemalloc.start()
     try:

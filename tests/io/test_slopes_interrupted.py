@@ -15,7 +15,7 @@ from tests.io.slope_files import NAMES, assert_stored, part, result, write, writ
 
 import faintspot
 from faintspot.errors import InputError
-from faintspot.io import read_slopes, slopes_file, slopes_zarr
+from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_files
 
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")
@@ -23,8 +23,9 @@ pytest.importorskip("zarr")
 
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten frames of seven sub-apertures a chunk."""
+    """Ten frames of seven sub-apertures a chunk, and a mark after each."""
     monkeypatch.setattr(slopes_zarr, "_CHUNK_NUMBERS", 70)
+    monkeypatch.setattr(slopes_writer, "_MARK_SECONDS", 0.0)
 
 
 class TestDiskFull:
@@ -37,7 +38,7 @@ class TestDiskFull:
         self, tmp_path: Path, name: str, writes_before: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         whole = result()
-        module = slopes_zarr if name.endswith(".zarr") else slopes_file
+        module = zarr_files if name.endswith(".zarr") else slopes_folder
         original = module.replace_file
         calls = 0
 
@@ -97,7 +98,7 @@ class TestDiskFull:
         original = LocalStore.set
 
         async def full(self: Any, key: str, value: Any, *rest: Any) -> None:
-            if key.startswith("iterations/c/2"):
+            if key.startswith("iterations/c.2"):
                 raise OSError(errno.ENOSPC, "No space left on device")
             await original(self, key, value, *rest)
 
@@ -149,3 +150,4 @@ def test_killed_again_and_again(tmp_path: Path, name: str) -> None:
     assert seen == sorted(seen)
     write(path, whole, 100)
     assert_stored(path, whole)
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]

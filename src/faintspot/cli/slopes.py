@@ -38,7 +38,11 @@ from faintspot.recorded import Summary, measure_recorded
 @click.option(
     "--device", default="cpu", show_default=True, help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`)."
 )
-@click.option("--reference", metavar="FILE", help="Reference positions, (n, 2) px, as FILE or FILE:ARRAY.")
+@click.option(
+    "--reference",
+    metavar="FILE",
+    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE or FILE:ARRAY.",
+)
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option("--threads", type=click.IntRange(1), help="Most threads to use. Default: all processors.")
 @click.option(
@@ -60,9 +64,9 @@ def command(
 ) -> None:
     """Turn recorded frames into slopes.
 
-    FRAMES are FITS files (plain, .gz, .fz; images or cubes), .npy, .npz or Zarr, in the order given. They are
-    read block by block, so that their size does not matter. Interrupted and started again, the command goes
-    on where it stopped.
+    FRAMES are FITS files (plain, .gz, .fz; images or cubes), TIFF, .npy, .npz or Zarr, in the order given.
+    They are read block by block, so that their size does not matter. Interrupted and started again, the
+    command goes on where it stopped.
 
     The output holds x, y (px from the sub-aperture's centre, 0 where not valid), flux (e-), valid, flags,
     iterations and bad_pixels of every frame and sub-aperture. A .zarr store opens with xarray.open_zarr.

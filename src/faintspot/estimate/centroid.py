@@ -25,7 +25,8 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     -------
     (..., 2) array
         x (along columns) and y (along rows) in pixels from the image's centre: pixel i of n is at
-        ``i - (n - 1) / 2``. An image whose sum is not positive gives (0, 0), never NaN.
+        ``i - (n - 1) / 2``. An image whose sum is not positive, or so small beside its values that no
+        position can be told, gives (0, 0), never NaN.
 
     Raises
     ------
@@ -34,7 +35,7 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     """
     stack = image_stack("images", images)
     ny, nx = stack.shape[-2:]
-    flat = stack.reshape(-1, ny * nx)
+    flat = _scaled_up(stack.reshape(-1, ny * nx))
     positions = np.empty((len(flat), 2), stack.dtype)
     lanes = lanes_for(flat.dtype)
 
@@ -42,4 +43,22 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
         centroid_stack(lanes, flat, ny, nx, start, stop, scratch, positions)
 
     run_groups(job, -(-len(flat) // lanes.width), lanes, (ny, nx))
+    positions[~np.isfinite(positions).all(axis=1)] = 0.0
     return positions.reshape(*stack.shape[:-2], 2)
+
+
+def _scaled_up(flat: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Return images (n, pixels) with those whose values are tiny multiplied by a power of two.
+
+    The kernel multiplies by the reciprocal of a sum, which overflows where the sum is not a normal number.
+    """
+    limits = np.finfo(flat.dtype)
+    largest = np.abs(flat).max(axis=1)
+    tiny = (largest > 0) & (largest < limits.tiny / limits.eps)
+    if not tiny.any():
+        return flat
+    # Of a number that is not normal, all digits are kept.
+    power = -int(np.log2(limits.tiny)) // 2 + int(limits.nmant)
+    scaled = flat.copy()
+    scaled[tiny] *= flat.dtype.type(2.0) ** power
+    return scaled

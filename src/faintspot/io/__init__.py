@@ -1,4 +1,4 @@
-"""Frames in, slopes and telemetry out: FITS, NumPy, Zarr, CSV, AOT."""
+"""Frames in, slopes and telemetry out: FITS, TIFF, NumPy, Zarr, CSV, AOT."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Images and cubes in FITS files: plain, gzip-compressed (.gz) or tile-compressed (.fz).
+"""FITS files: frames, plain, gzip-compressed (.gz) or tile-compressed (.fz); slopes, plain or .gz.
 
 The headers are read by astropy; the numbers of uncompressed images are read here, block by block, which
 works the same on a plain file and on a gzip stream. Values follow the FITS standard 4.0, section 4.4.2:
@@ -7,30 +7,79 @@ physical = BZERO + BSCALE * stored, and BLANK marks integers without a value, wh
 
 from __future__ import annotations
 
+import gzip
 import math
 import warnings
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
-from faintspot.io.raw import RawArray, is_gzip, open_plain_or_gzip
-
-try:
-    from astropy.io import fits
-except ImportError:
-    raise MissingExtraError("astropy", "io", "Reading or writing a FITS file") from None
-
-__all__ = ["find_fits", "fits"]
+from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
+from faintspot.io.slopes_format import REQUIRED, StoredSlopes
 
 _BLOCK_BYTES = 2880
 _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+
+
+def load_fits() -> Any:
+    """Return the package astropy.io.fits; MissingExtraError when it is not installed."""
+    try:
+        from astropy.io import fits
+    except ImportError:
+        raise MissingExtraError("astropy", "io", "Reading or writing a FITS file") from None
+    return fits
+
+
+class Fits(FileFormat):
+    """Frames in an image; slopes with every quantity in an image extension of its name, with checksums."""
+
+    name = "FITS"
+    signatures: tuple[bytes, ...] = (b"SIMPLE", GZIP_SIGNATURE)
+    endings: tuple[str, ...] = (".fits",)
+
+    def find(self, path: Path, key: str | None) -> StoredArray:
+        """Return an image of a file: the first, or the one whose EXTNAME or number is `key`."""
+        return _find_fits(path, key)
+
+    def require(self) -> None:
+        """Raise MissingExtraError when astropy is absent."""
+        load_fits()
+
+    def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
+        """Write an image extension for every variable and coordinate, and one for the attributes."""
+        from faintspot.io.slopes_fits import write_fits
+
+        write_fits(stream, slopes)
+
+    def read(self, path: Path) -> StoredSlopes:
+        """Read a file of slopes, and verify its checksums."""
+        from faintspot.io.slopes_fits import read_fits
+
+        return read_fits(path)
+
+    def has_slopes(self, path: Path) -> bool:
+        """Tell by the names of the extensions."""
+        return {name.upper() for name in (*REQUIRED, "attributes")} <= {unit.name for unit in _units(path)}
+
+
+class FitsGz(Fits):
+    """Slopes in a gzip-compressed file."""
+
+    signatures = ()  # its frames are those of `Fits`
+    endings = (".fits.gz",)
+
+    def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
+        """Write without a time stamp, so that equal slopes give equal files."""
+        with gzip.GzipFile(filename="", mode="wb", compresslevel=1, fileobj=stream, mtime=0) as compressed:
+            super().write(cast(IO[bytes], compressed), slopes)
 
 
 @dataclass(frozen=True)
@@ -62,7 +111,7 @@ class _Unit:
         return cls(index, name, header, compressed, shape, data_start, data_bytes)
 
 
-def find_fits(path: Path, key: str | None) -> StoredArray:
+def _find_fits(path: Path, key: str | None) -> StoredArray:
     """Return an image of a FITS file: the first, or the one whose EXTNAME or number is `key`.
 
     Raises
@@ -151,7 +200,7 @@ class _TileCompressedImage:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 if self._file is None:
-                    self._file = fits.open(self._path)
+                    self._file = load_fits().open(self._path)
                 values = np.asarray(self._file[self._index].section[start:stop])
         except Exception as error:  # the decompressors raise whatever they like
             self.close()
@@ -208,6 +257,7 @@ def _units(path: Path) -> Iterator[_Unit]:
 
 def _read_header(path: Path, stream: IO[bytes], index: int) -> Any:
     """Return the header at the stream's position, or None at its end."""
+    fits = load_fits()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

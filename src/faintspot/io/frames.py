@@ -1,4 +1,4 @@
-"""Frames in: one long sequence from FITS, NumPy and Zarr files, read in blocks of bounded memory."""
+"""Frames in: one long sequence from FITS, TIFF, NumPy and Zarr files, read in blocks of bounded memory."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.io.formats import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
-
-_SIGNATURES = {b"SIMPLE": "fits", b"\x1f\x8b": "fits", b"\x93NUMPY": "npy", b"PK\x03\x04": "npz"}
 
 
 class FrameSource:
@@ -97,14 +96,15 @@ class FrameSource:
 def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> FrameSource:
     """Open files of frames, concatenated in the order given.
 
-    FITS (plain, .gz, .fz), .npy, .npz and Zarr stores are told apart by content. Each holds a cube
+    FITS (plain, .gz, .fz), TIFF, .npy, .npz and Zarr stores are told apart by content. Each holds a cube
     (n, height, width) or a single frame (height, width).
 
     Parameters
     ----------
     paths : sequence of str or Path
-        Files; "file.npz:key", "file.fits:EXTNAME" or "store.zarr:path" choose one of several arrays. Without,
-        it is the first image of a FITS file, or the array named "frames", or the only 2-D or 3-D one.
+        Files; "file.npz:key", "file.fits:EXTNAME", "file.tif:NUMBER" (of a series of pages) or
+        "store.zarr:path" choose one of several arrays. Without, it is the first image of a FITS file, all
+        pages of a TIFF file, or the array named "frames", or the only 2-D or 3-D one.
     key : str, optional
         The array to choose in every file whose name does not say.
 
@@ -133,7 +133,7 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
 
 
 def read_array(location: str | Path) -> NDArray[Any]:
-    """Read one array whole (a dark, a flat, a bad-pixel map) from a FITS, .npy, .npz file or Zarr store.
+    """Read one array whole (dark, flat, bad-pixel map) from a FITS, TIFF, .npy or .npz file or a Zarr store.
 
     Parameters
     ----------
@@ -164,39 +164,16 @@ def read_array(location: str | Path) -> NDArray[Any]:
 
 
 def _find_array(location: str | Path, key: str | None) -> StoredArray:
-    """Find the array in a file of any format; the modules for one format are imported when it is met."""
+    """Find the array in a file of any format."""
     path, own_key = split_location(location)
     key = own_key if own_key is not None else key
     try:
-        kind = _kind(path)
-        if kind == "zarr":
-            from faintspot.io.zarr_files import find_zarr as find
-        elif kind == "fits":
-            from faintspot.io.fits_files import find_fits as find
-        elif kind == "npy":
-            from faintspot.io.numpy_files import find_npy as find
-        else:
-            from faintspot.io.numpy_files import find_npz as find
-        array = find(path, key)
+        array = frame_format(path).find(path, key)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or one_line(error)})") from None
     if not array.shape:
         raise InputError(f"{array.name}: expected an array, got a single number")
     return array
-
-
-def _kind(path: Path) -> str:
-    """Tell the format by the first bytes."""
-    if path.is_dir():
-        return "zarr"
-    with path.open("rb") as stream:
-        start = stream.read(8)
-    if not start:
-        raise InputError(f"{path}: expected frames, the file is empty")
-    for signature, kind in _SIGNATURES.items():
-        if start.startswith(signature):
-            return kind
-    raise InputError(f"{path}: expected a FITS, .npy or .npz file or a Zarr store, it is none of them")
 
 
 def _check_frames(array: StoredArray) -> None:

@@ -1,7 +1,8 @@
-"""Arrays in NumPy's .npy and .npz files, never unpickled and never read whole."""
+"""NumPy's .npy and .npz files: frames, never unpickled and never read whole; slopes in .npz."""
 
 from __future__ import annotations
 
+import json
 import math
 import zipfile
 from dataclasses import dataclass
@@ -11,8 +12,10 @@ from typing import IO, Any
 import numpy as np
 
 from faintspot.errors import InputError
+from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
-from faintspot.io.raw import DAMAGE, MappedArray, RawArray
+from faintspot.io.raw import DAMAGE, MappedArray, RawArray, pieces
+from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, with_absent
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,62 @@ class _Header:
         return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
 
-def find_npy(path: Path, key: str | None) -> StoredArray:
+class Npy(FileFormat):
+    """Frames in a .npy file."""
+
+    name = ".npy"
+    signatures = (b"\x93NUMPY",)
+
+    def find(self, path: Path, key: str | None) -> StoredArray:
+        """Return the array of the file."""
+        return _find_npy(path, key)
+
+
+class Npz(FileFormat):
+    """Frames in an array of a .npz file; slopes with every quantity in an array of its name."""
+
+    name = ".npz"
+    signatures = (b"PK\x03\x04",)
+    endings = (".npz",)
+
+    def find(self, path: Path, key: str | None) -> StoredArray:
+        """Return an array of the file, streamed from its zip member."""
+        return _find_npz(path, key)
+
+    def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
+        """Write every variable and coordinate, and the attributes as a JSON text named `attributes`."""
+        arrays = {**slopes.variables, **slopes.coordinates}
+        arrays["attributes"] = np.array(json.dumps(dict(slopes.attributes)))
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    header = {
+                        "descr": np.lib.format.dtype_to_descr(array.dtype),
+                        "fortran_order": False,
+                        "shape": array.shape,
+                    }
+                    np.lib.format.write_array_header_1_0(member, header)
+                    for piece in pieces(array):
+                        member.write(piece.tobytes())
+
+    def read(self, path: Path) -> StoredSlopes:
+        """Read a file of slopes; zip verifies the checksum of each array."""
+        # numpy.load leaves a file that it opened itself open when the archive is damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
+        attributes = json.loads(str(arrays.pop("attributes")))
+        return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
+
+    def has_slopes(self, path: Path) -> bool:
+        """Tell by the names of the arrays."""
+        if not zipfile.is_zipfile(path):
+            return False
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in (*REQUIRED, "attributes")} <= set(archive.namelist())
+
+
+def _find_npy(path: Path, key: str | None) -> StoredArray:
     """Return the array of a .npy file.
 
     Raises
@@ -52,7 +110,7 @@ def find_npy(path: Path, key: str | None) -> StoredArray:
     )
 
 
-def find_npz(path: Path, key: str | None) -> StoredArray:
+def _find_npz(path: Path, key: str | None) -> StoredArray:
     """Return one array of a .npz file, streamed from its zip member.
 
     Raises

@@ -7,7 +7,7 @@ import lzma
 import math
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.io.locations import one_line
 
+GZIP_SIGNATURE = b"\x1f\x8b"
 _PIECE_BYTES = 1 << 20
+_PIECE_NUMBERS = 1 << 18
 DAMAGE = (
     OSError,
     EOFError,
@@ -37,7 +39,17 @@ def open_plain_or_gzip(path: Path) -> IO[bytes]:
 def is_gzip(path: Path) -> bool:
     """Tell by its first bytes whether a file is gzip-compressed."""
     with path.open("rb") as stream:
-        return stream.read(2) == b"\x1f\x8b"
+        return stream.read(2) == GZIP_SIGNATURE
+
+
+def pieces(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield a C-ordered array in pieces of bounded size along its first axis, to be written one by one."""
+    if array.ndim == 0:
+        yield array
+        return
+    step = max(1, _PIECE_NUMBERS // max(1, math.prod(array.shape[1:])))
+    for start in range(0, len(array), step):
+        yield array[start : start + step]
 
 
 class RawArray:

@@ -2,48 +2,33 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Any
-from zipfile import BadZipFile
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import finite_array, number_between
-from faintspot.errors import InputError
+from faintspot.errors import InputError, MissingExtraError
 from faintspot.files import output_errors
-from faintspot.io import slopes_export as export
+from faintspot.io.file_format import FileFormat
+from faintspot.io.formats import slope_format
 from faintspot.io.locations import one_line
-from faintspot.io.slopes_file import (
-    FileWriter,
-    FinishedWriter,
-    is_partial,
-    partial_folder,
-    prepare_partial,
-    read_partial,
-    remove_leftovers,
-)
+from faintspot.io.output_lock import OutputLock
+from faintspot.io.slopes_folder import is_partial, partial_folder, read_partial
 from faintspot.io.slopes_format import (
     RESERVED_ATTRIBUTES,
     VARIABLES,
     Run,
     SlopeWriter,
     StoredSlopes,
-    belongs_to_another_run,
-    exists_already,
     json_values,
 )
+from faintspot.io.slopes_writer import BlockWriter, FinishedWriter
+from faintspot.io.zarr_files import Zarr
 
-_Export = Callable[[IO[bytes], StoredSlopes], None]
-_Import = Callable[[Path], StoredSlopes]
-_FORMATS: Mapping[str, tuple[_Export, _Import]] = {
-    ".npz": (export.write_npz, export.read_npz),
-    ".csv": (export.write_csv, export.read_csv),
-    ".fits.gz": (export.write_fits_gz, export.read_fits),
-    ".fits": (export.write_fits, export.read_fits),
-}
+_What = TypeVar("_What")
 
 
 def create_writer(
@@ -92,18 +77,25 @@ def create_writer(
     with output_errors(path):
         if not path.parent.is_dir():
             raise InputError(f"{path}: the folder {path.parent} does not exist: create it or choose another")
-        if path.name.lower().endswith(".zarr"):
-            from faintspot.io.slopes_zarr import ZarrWriter, prepare_store
-
-            prepare_store(path, run, resume=resume, overwrite=overwrite)
-            return ZarrWriter(path, run)
-        write, read = _FORMATS[_ending(path)]
-        if write in (export.write_fits, export.write_fits_gz):
-            import faintspot.io.fits_files  # noqa: F401  says that astropy is missing before the work, not after
-        if path.exists() and not overwrite:
-            return _completed(path, run, read, resume=resume)
-        prepare_partial(path, run, resume=resume, overwrite=overwrite)
-        return FileWriter(path, run, write)
+        form = slope_format(path)
+        form.require()
+        if not overwrite and _is_finished(path, form, run, resume=resume):
+            _remove_leftovers(path, form, run)
+            return FinishedWriter(run.n_frames)
+        lock = OutputLock(path)
+        try:
+            storage = form.storage(path, run)
+            begun = storage.begun()
+            how = {"resume": resume, "overwrite": overwrite}
+            if begun is not None and not begun.may_be_continued(storage.place, run, **how):
+                storage.remove()
+                begun = None
+            if begun is None:
+                storage.create()
+            return BlockWriter(path, run, storage, lock)
+        except BaseException:
+            lock.release()
+            raise
 
 
 def read_slopes(path: str | Path) -> StoredSlopes:
@@ -121,27 +113,19 @@ def read_slopes(path: str | Path) -> StoredSlopes:
         partial = partial_folder(path)
         hint = f"; an unfinished run has left {partial}" if is_partial(partial) else ""
         raise InputError(f"{path}: no such file{hint}")
-    read: _Import
     if is_partial(path):
-        read = read_partial
-    elif path.is_dir():
-        from faintspot.io.slopes_zarr import read_store as read
-    else:
-        read = _FORMATS[_ending(path)][1]
+        return _read(path, read_partial)
+    form = Zarr() if path.is_dir() else slope_format(path)
+    return _read(path, form.read)
+
+
+def _read(path: Path, read: Callable[[Path], _What]) -> _What:
+    """Read something of slopes, with errors in one line."""
     try:
         return read(path)
-    except (
-        KeyError,
-        ValueError,
-        OSError,
-        EOFError,
-        TypeError,
-        AttributeError,
-        BadZipFile,
-        zlib.error,
-    ) as error:
-        if isinstance(error, InputError):
-            raise
+    except (InputError, MissingExtraError):
+        raise
+    except Exception as error:  # something else than slopes, or damaged: each package raises its own
         raise InputError(f"{path}: expected slopes written by faintspot ({one_line(error)})") from None
 
 
@@ -166,20 +150,20 @@ def _checked_run(
     return Run(frames, subapertures, json_values("attributes", attributes), values)
 
 
-def _ending(path: Path) -> str:
-    for ending in _FORMATS:
-        if path.name.lower().endswith(ending):
-            return ending
-    raise InputError(f"{path}: expected a name that ends with .zarr, .fits, .fits.gz, .npz or .csv")
+def _is_finished(path: Path, form: FileFormat, run: Run, *, resume: bool) -> bool:
+    """Tell whether this very run has completed the output before; refuse when another has."""
+    begun = _read(path, form.finished)
+    return begun is not None and begun.may_be_continued(path, run, resume=resume, overwrite=False)
 
 
-def _completed(path: Path, run: Run, read: _Import, *, resume: bool) -> SlopeWriter:
-    """Return the writer of a file that this very run has completed before; refuse any other."""
-    if read is export.read_csv or not resume or not path.is_file():
-        raise exists_already(path)
-    stored = read_slopes(path)
-    sizes = stored.variables["x"].shape
-    if stored.attributes.get("fingerprint") != run.fingerprint or sizes != run.sizes:
-        raise belongs_to_another_run(path)
-    remove_leftovers(path, run)
-    return FinishedWriter(run.n_frames)
+def _remove_leftovers(path: Path, form: FileFormat, run: Run) -> None:
+    """Remove what this run has left when it ended between making the file and tidying up."""
+    if form.leftovers(path):
+        lock = OutputLock(path)
+        try:
+            storage = form.storage(path, run)
+            begun = storage.begun()
+            if begun is not None and (begun.fingerprint, begun.sizes) == (run.fingerprint, run.sizes):
+                storage.remove()
+        finally:
+            lock.release()

@@ -1,185 +1,183 @@
-"""Slopes to a Zarr store (format 3) that xarray reads, also while it is being written.
+"""Slopes in a Zarr store (format 3) that xarray reads, also while it is being written.
 
-A chunk holds a number of frames and is written once, whole; then the counter `finished_frames` in the
-group's attributes is replaced. However the program ends, the store is valid and the counter includes only
-what is whole.
+A chunk holds a number of frames and is written once, whole and with a checksum (crc32c). When chunks are on
+the disk, the mark `finished_frames` in the group's attributes is replaced. However the program ends, the
+store is valid and the mark includes only what is whole.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import output_errors, replace_file
+from faintspot.files import sync_file, sync_folder
 from faintspot.io.locations import one_line
-from faintspot.io.slopes_format import (
-    COORDINATE_UNITS,
-    VARIABLES,
-    Run,
-    StoredSlopes,
-    belongs_to_another_run,
-    checked_block,
-    exists_already,
-    with_absent,
-)
-from faintspot.io.zarr_files import is_store, zarr
+from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, with_absent
+from faintspot.io.slopes_writer import Begun
+from faintspot.io.zarr_files import is_store, load_zarr, replace_attributes
 
-_COUNTER = "finished_frames"
+zarr = load_zarr()
+_MARK = "finished_frames"
 _COMPLETE = "complete"
 _COORDINATES = "coordinates"
+_AT_ONCE = 16
 _CHUNK_NUMBERS = 1 << 16
+# As "c.12.0", not a folder for each: folders have to be synchronised, too.
+_CHUNK_NAMES: dict[str, Any] = {"name": "default", "separator": "."}
 
 
-class ZarrWriter:
-    """Writes slopes to a Zarr store, resuming the one that is there (see `prepare_store`).
+class StoreStorage:
+    """Keeps slopes in the Zarr store that is the output itself.
 
-    Frames of a chunk that is not full wait in memory until it is, or until `close`.
+    Parameters
+    ----------
+    path : Path
+        The store.
+    run : Run
+        What it will contain.
     """
 
     def __init__(self, path: Path, run: Run) -> None:
-        self._path = path
+        self.place = path
+        self.chunk = 1
         self._run = run
-        with output_errors(path):
-            if not path.exists():
-                _create_store(path, run)
-        group: Any = zarr.open_group(str(path), mode="r+")
+        self._arrays: dict[str, Any] = {}
+        self._not_synchronised: set[Path] = set()
+
+    def begun(self) -> Begun | None:
+        """Return what is there, or None."""
+        return describe_store(self.place)
+
+    def remove(self) -> None:
+        """Move the store away in one step, then delete it."""
+        aside = self.place.with_name(f".{self.place.name}.old")
+        shutil.rmtree(aside, ignore_errors=True)
+        self.place.rename(aside)
+        shutil.rmtree(aside)
+
+    def create(self) -> None:
+        """Create the store under a hidden name and rename it."""
+        hidden = self.place.with_name(f".{self.place.name}.new")
+        shutil.rmtree(hidden, ignore_errors=True)
+        hidden.mkdir()
+        _create_arrays(hidden, self._run)
+        with warnings.catch_warnings():
+            # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are absent.
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(hidden))
+        for file in (*hidden.rglob("*"), hidden):
+            (sync_folder if file.is_dir() else sync_file)(file)
+        hidden.rename(self.place)
+        sync_folder(self.place.parent)
+
+    def open(self) -> None:
+        """Open the arrays, and remove what an interrupted replacement of the mark has left."""
+        for leftover in self.place.glob(".*.new"):
+            leftover.unlink()
+        group: Any = zarr.open_group(str(self.place), mode="r+", use_consolidated=False)
         try:
-            self._arrays: dict[str, Any] = {name: group[name] for name in VARIABLES}
+            # A chunk of zeros is written like any other: one that is not there has been lost.
+            self._arrays = {name: group[name].with_config({"write_empty_chunks": True}) for name in VARIABLES}
         except (KeyError, ValueError) as error:
             raise InputError(
-                f"{path}: damaged, it cannot be resumed: delete it ({one_line(error)})"
+                f"{self.place}: damaged, it cannot be resumed: delete it ({one_line(error)})"
             ) from None
-        self._chunk = int(self._arrays["x"].chunks[0])
-        self._stored = int(group.attrs[_COUNTER])
-        self._waiting: list[dict[str, NDArray[Any]]] = []
-        if self._stored < run.n_frames and self._stored % self._chunk:
-            self._take_back_last_chunk()
+        self.chunk = int(self._arrays["x"].chunks[0])
 
-    def finished(self) -> int:
-        """Return how many frames it has, stored or waiting: the next block starts there."""
-        return self._stored + sum(len(block["x"]) for block in self._waiting)
+    def marked(self) -> tuple[str, int]:
+        """Return fingerprint and number of whole frames."""
+        attributes = _stored_attributes(self.place)
+        return attributes["fingerprint"], attributes[_MARK]
 
-    def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
-        """Add a block of frames; whole chunks go to the disk."""
-        arrays = checked_block(self._run, self.finished(), start, block)
-        self._waiting.append({name: array.copy() for name, array in arrays.items()})
-        waiting = self.finished() - self._stored
-        if waiting >= self._chunk:
-            self._store(waiting - waiting % self._chunk)
-        if self.finished() == self._run.n_frames:
-            self.close()
+    def mark(self, finished: int) -> None:
+        """Wait for the disk, then say how many frames are whole."""
+        with ThreadPoolExecutor(_AT_ONCE) as threads:  # one after the other takes several times as long
+            list(threads.map(sync_file, self._not_synchronised))
+        for folder in {file.parent for file in self._not_synchronised}:
+            sync_folder(folder)
+        self._not_synchronised.clear()
+        replace_attributes(self.place, {_MARK: finished, _COMPLETE: finished == self._run.n_frames})
 
-    def close(self) -> None:
-        """Store what waits, and mark the store complete when it has all frames."""
-        waiting = self.finished() - self._stored
-        if waiting:
-            self._store(waiting)
+    def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Return frames that are stored."""
+        return {name: _read(self.place, array, start, stop) for name, array in self._arrays.items()}
 
-    def __enter__(self) -> Self:
-        return self
+    def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Store whole chunks."""
+        for name, values in arrays.items():
+            array = self._arrays[name]
+            array[start : start + len(values)] = values
+            self._not_synchronised.update(_chunk_files(self.place, array, start, start + len(values)))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _store(self, count: int) -> None:
-        """Write the first `count` waiting frames, then the counter."""
-        joined = {name: np.concatenate([block[name] for block in self._waiting]) for name in VARIABLES}
-        finished = self._stored + count
-        with output_errors(self._path):
-            for name, array in self._arrays.items():
-                array[self._stored : finished] = joined[name][:count]
-            self._write_counter(finished)
-        self._stored = finished
-        rest = {name: array[count:] for name, array in joined.items()}
-        self._waiting = [rest] if len(rest["x"]) else []
-
-    def _take_back_last_chunk(self) -> None:
-        """Take frames of a chunk that is not full back into memory, so that it is written again whole."""
-        start = self._stored - self._stored % self._chunk
-        self._waiting = [{name: array[start : self._stored] for name, array in self._arrays.items()}]
-        with output_errors(self._path):
-            self._write_counter(start)
-        self._stored = start
-
-    def _write_counter(self, finished: int) -> None:
-        counters = {_COUNTER: finished, _COMPLETE: finished == self._run.n_frames}
-        _replace_attributes(self._path, counters)
+    def finish(self) -> None:
+        """The mark says it all."""
 
 
-def prepare_store(path: Path, run: Run, *, resume: bool, overwrite: bool) -> None:
-    """Keep a store at `path` when it is this run's; move it away or refuse when it is not.
-
-    With `overwrite` a finished store, or one of another run, is deleted at once, before the new one is begun.
+def describe_store(path: Path) -> Begun | None:
+    """Return what the store of slopes says of itself; None when nothing is there.
 
     Raises
     ------
     InputError
-        When the path is taken by something else than slopes, or by slopes that must not be touched.
+        When something else is there.
     """
     if not path.exists():
-        return
+        return None
     try:
         attributes = _stored_attributes(path)
     except (OSError, ValueError, KeyError):
         raise InputError(f"{path}: exists and holds no slopes of faintspot: choose another name") from None
     sizes = (attributes["n_frames"], attributes["n_subapertures"])
-    equal = attributes["fingerprint"] == run.fingerprint and sizes == run.sizes
-    if equal and resume and not (overwrite and attributes[_COMPLETE]):
-        return
-    if not overwrite:
-        raise exists_already(path) if equal else belongs_to_another_run(path)
-    with output_errors(path):
-        aside = path.with_name(f".{path.name}.old")
-        shutil.rmtree(aside, ignore_errors=True)
-        path.rename(aside)
-        shutil.rmtree(aside)
+    return Begun(attributes["fingerprint"], sizes, attributes[_COMPLETE])
 
 
 def read_store(path: Path) -> StoredSlopes:
-    """Read the finished frames of a Zarr store of slopes."""
+    """Read the finished frames of a Zarr store of slopes.
+
+    Raises
+    ------
+    InputError
+        When it is no such store, or a chunk is damaged or lost.
+    """
     if not is_store(path):
         raise InputError(f"{path}: expected slopes, this directory is not a Zarr store")
     attributes = _stored_attributes(path)
-    finished, complete = int(attributes.pop(_COUNTER)), bool(attributes.pop(_COMPLETE))
+    finished, complete = int(attributes.pop(_MARK)), bool(attributes.pop(_COMPLETE))
     coordinates = attributes.pop(_COORDINATES, "").split()
     for size in ("n_frames", "n_subapertures"):
         del attributes[size]
-    group: Any = zarr.open_group(str(path), mode="r")
+    group: Any = zarr.open_group(str(path), mode="r", use_consolidated=False)
     return StoredSlopes(
         variables=with_absent(
-            {name: np.asarray(group[name][:finished]) for name in VARIABLES if name in group}
+            {name: _read(path, group[name], 0, finished) for name in VARIABLES if name in group}
         ),
-        coordinates={name: np.asarray(group[name][:]) for name in coordinates},
+        coordinates={name: _read(path, group[name], 0, group[name].shape[0]) for name in coordinates},
         attributes=attributes,
         complete=complete,
         n_finished=finished,
     )
 
 
-def _create_store(path: Path, run: Run) -> None:
-    """Create the store under a hidden name and rename it, so that it is never seen half made."""
-    hidden = path.with_name(f".{path.name}.new")
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir()
+def _create_arrays(path: Path, run: Run) -> None:
     attributes = {
         **run.attributes,
         "n_frames": run.n_frames,
         "n_subapertures": run.n_subapertures,
-        _COUNTER: 0,
+        _MARK: 0,
         _COMPLETE: False,
         _COORDINATES: " ".join(run.coordinates),
     }
-    group = zarr.create_group(str(hidden), zarr_format=3, attributes=attributes)
+    group = zarr.create_group(str(path), zarr_format=3, attributes=attributes)
+    codecs = (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())
     chunk = min(run.n_frames, max(1, _CHUNK_NUMBERS // run.n_subapertures))
     for name, variable in VARIABLES.items():
         group.create_array(
@@ -187,29 +185,56 @@ def _create_store(path: Path, run: Run) -> None:
             shape=(run.n_frames, run.n_subapertures),
             chunks=(chunk, run.n_subapertures),
             dtype=variable.dtype,
+            compressors=codecs,
+            chunk_key_encoding=_CHUNK_NAMES,
             fill_value=np.nan if variable.dtype == "float32" else 0,
             dimension_names=("frame", "subaperture"),
             attributes={"units": variable.units, "long_name": variable.long_name},
         )
     for name, values in run.coordinates.items():
-        units: dict[str, Any] = {"units": COORDINATE_UNITS[name]} if name in COORDINATE_UNITS else {}
         array = group.create_array(
-            name, shape=values.shape, dtype=values.dtype, dimension_names=("subaperture",), attributes=units
+            name,
+            shape=values.shape,
+            dtype=values.dtype,
+            compressors=codecs,
+            chunk_key_encoding=_CHUNK_NAMES,
+            dimension_names=("subaperture",),
+            attributes={"units": COORDINATE_UNITS[name]} if name in COORDINATE_UNITS else {},
+            config={"write_empty_chunks": True},
         )
         array[:] = values
-    hidden.rename(path)
 
 
 def _stored_attributes(path: Path) -> dict[str, Any]:
     """Return the attributes of a store of slopes; KeyError when it is something else."""
     attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
-    for name in (_COUNTER, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
+    for name in (_MARK, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
         attributes[name]
     return attributes
 
 
-def _replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
-    """Change attributes of the group in one step, which the store's own setter does not promise."""
-    metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    metadata["attributes"].update(changed)
-    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
+def _read(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
+    """Return items of an array, or say that some are lost: to Zarr, a lost chunk is its fill value."""
+    # Versions without checksums wrote no chunk that is all fill value; NaN, that of floats, no slope ever is.
+    has_all_chunks = any(isinstance(codec, zarr.codecs.Crc32cCodec) for codec in array.compressors)
+    if has_all_chunks or array.dtype.kind == "f":
+        for number, file in enumerate(_chunk_files(path, array, start, stop), start // array.chunks[0]):
+            if not file.is_file():
+                raise InputError(
+                    f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
+                    "(counted from 0) and later is lost"
+                )
+    try:
+        return np.asarray(array[start:stop])
+    except Exception as error:  # a broken chunk makes each codec raise its own kind
+        raise InputError(
+            f"{path}: the store is damaged: {array.basename} cannot be read ({one_line(error)})"
+        ) from None
+
+
+def _chunk_files(path: Path, array: Any, start: int, stop: int) -> list[Path]:
+    """Return the files of the chunks that hold items `start` to `stop`; a chunk spans all later axes."""
+    length = array.chunks[0]
+    rest = (0,) * (array.ndim - 1)
+    numbers = range(start // length, -(-stop // length))
+    return [path / array.basename / array.metadata.encode_chunk_key((number, *rest)) for number in numbers]

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import output_errors, replace_file
+from faintspot.files import output_errors
 from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.io.zarr_files import is_store, zarr
+from faintspot.io.zarr_files import is_store, load_zarr, replace_attributes
 
+zarr = load_zarr()
 FORMAT = "faintspot telemetry"
 _FRAMES, _IMAGES = "finished_frames", "finished_images"
 _CHUNK_NUMBERS, _CHUNK_BYTES = 1 << 16, 1 << 22
@@ -172,7 +173,7 @@ class TelemetryStore:
                 array[start:] = values
             frames, images_there = self.frames + len(records), self.images + len(images)
             counters = {_FRAMES: frames, _IMAGES: images_there}
-            _replace_attributes(self.path, {**attributes, **counters})
+            replace_attributes(self.path, {**attributes, **counters})
         self.frames, self.images = frames, images_there
 
 
@@ -255,10 +256,3 @@ def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
 def _dimensions(name: str, count: int) -> tuple[str, ...]:
     """Names of an array's dimensions."""
     return _DIMENSIONS.get(name, ("frame", "subaperture")[:count])
-
-
-def _replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
-    """Change attributes of the group in one step, which the store's own setter does not promise."""
-    metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
-    metadata["attributes"].update(changed)
-    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))

@@ -1,7 +1,9 @@
-"""Arrays in Zarr stores (directories, format 2 or 3)."""
+"""Zarr stores (directories): frames in format 2 or 3, slopes in format 3."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import replace_file
+from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, choose_name, one_line
-
-try:
-    import zarr
-except ImportError:
-    raise MissingExtraError("zarr", "io", "Reading or writing a Zarr store") from None
-
-__all__ = ["find_zarr", "is_store", "zarr"]
+from faintspot.io.slopes_format import Run, StoredSlopes
+from faintspot.io.slopes_writer import Begun, Storage
 
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
 
@@ -26,31 +25,88 @@ def is_store(path: Path) -> bool:
     return any((path / mark).is_file() for mark in _MARKS)
 
 
-def find_zarr(path: Path, key: str | None) -> StoredArray:
-    """Return one array of a Zarr store: the store itself, the one at path `key`, `frames` or the only one.
-
-    Chunks that are absent from a store are its fill value by Zarr's definition, not an error.
-
-    Raises
-    ------
-    InputError
-        When the directory is no Zarr store, or there is no such array, or several and no key is given.
-    MissingExtraError
-        When zarr is not installed.
-    """
-    if not is_store(path):
-        raise InputError(f"{path}: expected a Zarr store or a file of frames, this directory is neither")
+def load_zarr() -> Any:
+    """Return the package zarr; MissingExtraError when it is not installed."""
     try:
-        node: Any = zarr.open(str(path), mode="r", path=key or "")
-        if isinstance(node, zarr.Group):
-            arrays = dict(node.arrays())
-            node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
-    except InputError:
-        raise
-    except Exception as error:  # broken metadata makes zarr raise many things
-        where = f"{path}:{key}" if key else str(path)
-        raise InputError(f"{where}: cannot be opened as a Zarr array ({one_line(error)})") from None
-    return _ZarrArray(f"{path}:{node.path}" if node.path else str(path), node)
+        import zarr
+    except ImportError:
+        raise MissingExtraError("zarr", "io", "Reading or writing a Zarr store") from None
+    return zarr
+
+
+def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
+    """Change attributes of a group in one step, which the store's own setter does not promise."""
+    metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    metadata["attributes"].update(changed)
+    replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
+
+
+class Zarr(FileFormat):
+    """Frames in an array of a store; slopes in a store that can be read while it is written."""
+
+    name = "Zarr"
+    endings = (".zarr",)
+
+    def has_frames(self, path: Path, start: bytes) -> bool:
+        """Tell whether it is a folder."""
+        return not start
+
+    def find(self, path: Path, key: str | None) -> StoredArray:
+        """Return the store itself when it is an array, or that at path `key`, `frames` or the only one.
+
+        Chunks that are absent from a store are its fill value by Zarr's definition, not an error.
+        """
+        if not is_store(path):
+            raise InputError(f"{path}: expected a Zarr store or a file of frames, this directory is neither")
+        zarr = load_zarr()
+        try:
+            node: Any = zarr.open(str(path), mode="r", path=key or "")
+            if isinstance(node, zarr.Group):
+                arrays = dict(node.arrays())
+                node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
+        except InputError:
+            raise
+        except Exception as error:  # broken metadata makes zarr raise many things
+            where = f"{path}:{key}" if key else str(path)
+            raise InputError(f"{where}: cannot be opened as a Zarr array ({one_line(error)})") from None
+        return _ZarrArray(f"{path}:{node.path}" if node.path else str(path), node)
+
+    def require(self) -> None:
+        """Raise MissingExtraError when zarr is absent."""
+        load_zarr()
+
+    def read(self, path: Path) -> StoredSlopes:
+        """Read the finished frames of a store."""
+        load_zarr()
+        from faintspot.io.slopes_zarr import read_store
+
+        return read_store(path)
+
+    def has_slopes(self, path: Path) -> bool:
+        """Tell by the attributes of the store."""
+        from faintspot.io.slopes_zarr import describe_store
+
+        try:
+            return describe_store(path) is not None
+        except InputError:
+            return False
+
+    def finished(self, path: Path) -> Begun | None:
+        """Return what a complete store says of itself."""
+        from faintspot.io.slopes_zarr import describe_store
+
+        begun = describe_store(path)
+        return begun if begun is not None and begun.complete else None
+
+    def leftovers(self, path: Path) -> bool:
+        """Tell that nothing lies beside a store."""
+        return False
+
+    def storage(self, path: Path, run: Run) -> Storage:
+        """Return the store itself, which grows."""
+        from faintspot.io.slopes_zarr import StoreStorage
+
+        return StoreStorage(path, run)
 
 
 class _ZarrArray:

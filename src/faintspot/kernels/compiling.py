@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
+from numba.core import types
 
 
 @cache
@@ -68,8 +69,9 @@ def _dispatcher(function: Callable[..., Any], others: tuple[Path, ...] = (), **o
 class Direct:
     """A kernel for arguments that always have the same types, which are found out once.
 
-    Finding them out takes as long as a small frame's measurement. Nothing is checked afterwards: other types
-    would be read as if they were those.
+    Finding them out takes longer than a small frame's measurement. Nothing is checked afterwards: other types
+    would be read as if they were those. Only whether an array may be written to makes no difference, so that
+    nothing is compiled once more for arrays that are read-only.
     """
 
     def __init__(self, kernel: Any) -> None:
@@ -78,9 +80,19 @@ class Direct:
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the kernel."""
-        if self._entry is not None:
-            return self._entry(*arguments)
-        result = self._kernel(*arguments)
-        types = tuple(self._kernel.typeof_pyval(argument) for argument in arguments)
-        self._entry = self._kernel.overloads[types].entry_point
-        return result
+        if self._entry is None:
+            signature = tuple(_writable(self._kernel.typeof_pyval(argument)) for argument in arguments)
+            self._kernel.compile(signature)
+            self._entry = self._kernel.overloads[signature].entry_point
+        return self._entry(*arguments)
+
+
+def _writable(kind: types.Type) -> types.Type:
+    """Return the type of arrays that may be written to, also within tuples."""
+    if isinstance(kind, types.Array):
+        return kind.copy(readonly=False)
+    if isinstance(kind, types.BaseNamedTuple):
+        return types.NamedTuple([_writable(each) for each in kind], kind.instance_class)
+    if isinstance(kind, types.BaseTuple):
+        return types.BaseTuple.from_types([_writable(each) for each in kind])
+    return kind

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from faintspot.estimators.centroid import CentreOfGravity
 from faintspot.estimators.gravity import GravityPrepared
 from faintspot.kernels import gravity
+from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import lanes_for
 from faintspot.pipeline import SlopePipeline
@@ -48,10 +49,11 @@ class BuiltIn:
         task = pipeline.preparation.task(np.zeros(1, np.int64))
         self.gravity = isinstance(prepared, GravityPrepared)
         self.denoises = False
-        self._kernel = prepared.kernel
+        kernel = prepared.kernel
         if isinstance(prepared, GravityPrepared):
             self.denoises = denoise and prepared.before != gravity.NOTHING
-            self._kernel, task = prepared.part(task, denoise=denoise, background=background)
+            kernel, task = prepared.part(task, denoise=denoise, background=background)
+        self._kernel = Direct(kernel)
         self._task, self._pipeline = task, pipeline
         self.settings: NDArray[np.float32] = task.settings[0]
         """Rows as in `faintspot.kernels.groups`, and those of the estimator's kernel."""
@@ -68,8 +70,6 @@ class BuiltIn:
     def __call__(self, images: NDArray[Any], saturation: float = float("nan")) -> NDArray[np.float32]:
         """Measure a frame or images; return the images after every step: (STAGE_ROWS, n, ny, nx)."""
         frames = np.ascontiguousarray(images).reshape(1, *self._pipeline.layout.frame_shape)
-        if not frames.flags.writeable:  # for which all would be compiled once more
-            frames = frames.copy()
         source = self._pipeline.source(frames, frames.dtype)._replace(saturation=saturation)
         self._kernel(source, self._task, 0, self._groups, self._scratch, self._results, self._stages)
         return self._images

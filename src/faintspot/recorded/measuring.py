@@ -15,8 +15,9 @@ import faintspot
 from faintspot import configuration
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
-from faintspot.io.frames import FrameSource, open_frames, read_array
+from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.locations import split_location
+from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import VARIABLES
 from faintspot.pipeline import SlopePipeline
@@ -74,7 +75,7 @@ def measure_recorded(
     Parameters
     ----------
     frames : sequence of path
-        FITS, .npy, .npz or Zarr; see `faintspot.io.open_frames`.
+        FITS, TIFF, .npy, .npz or Zarr; see `faintspot.io.open_frames`.
     configuration_file : path
         The TOML file with layout, settings and calibration.
     output : path
@@ -86,7 +87,8 @@ def measure_recorded(
     device : str
         "cpu" or "cuda", see `SlopePipeline`.
     reference : array or path, optional
-        Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key".
+        Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
+        slopes of which they are the mean; see `faintspot.io.references.read_reference`.
     key : str, optional
         Which array of the files to read, where they hold several.
     threads : int, optional
@@ -108,7 +110,7 @@ def measure_recorded(
         settings = without_denoising(settings, "denoise = False")
     if preset is not None:
         settings = with_preset(settings, preset)
-    positions = read_array(reference) if isinstance(reference, str | Path) else reference
+    positions = read_reference(reference) if isinstance(reference, str | Path) else reference
     try:
         pipeline = SlopePipeline(
             layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device

@@ -1,0 +1,57 @@
+"""Slopes in .csv files: a line for each frame and sub-aperture, without coordinates and attributes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from faintspot.io.file_format import FileFormat
+from faintspot.io.slopes_format import VARIABLES, StoredSlopes, with_absent
+from faintspot.io.slopes_writer import Begun
+
+_LINES = 1 << 12
+_INDEX = ("frame", "subaperture")
+
+
+class Csv(FileFormat):
+    """A table with the quantities of `VARIABLES` as columns, which anything reads."""
+
+    name = "CSV"
+    endings = (".csv",)
+
+    def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
+        """Write floats with the fewest digits that give them back."""
+        names = [*_INDEX, *(variable.csv_name for variable in VARIABLES.values())]
+        stream.write((",".join(names) + "\n").encode())
+        count, width = slopes.variables["x"].shape
+        step = max(1, _LINES // width)
+        for start in range(0, count, step):
+            stop = min(start + step, count)
+            frames, subapertures = np.divmod(np.arange(start * width, stop * width), width)
+            columns = [frames, subapertures]
+            for name in VARIABLES:
+                piece = np.asarray(slopes.variables[name][start:stop]).reshape(-1)
+                columns.append(piece.view(np.uint8) if piece.dtype == np.bool_ else piece)
+            lines = zip(*(column.astype(str).tolist() for column in columns), strict=True)
+            stream.write("".join(",".join(line) + "\n" for line in lines).encode())
+
+    def finished(self, path: Path) -> Begun | None:
+        """Say that it is there: a table does not tell of which run."""
+        return Begun(None, (0, 0), complete=True) if path.exists() else None
+
+    def read(self, path: Path) -> StoredSlopes:
+        """Read the whole table."""
+        with path.open(encoding="utf-8") as stream:
+            names = stream.readline().strip().split(",")
+        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        width = int(table[:, names.index("subaperture")].max()) + 1
+        variables = with_absent(
+            {
+                name: table[:, names.index(variable.csv_name)].reshape(-1, width).astype(variable.dtype)
+                for name, variable in VARIABLES.items()
+                if variable.csv_name in names
+            }
+        )
+        return StoredSlopes(variables, {}, {}, True, len(variables["x"]))

@@ -1,0 +1,62 @@
+"""The file formats; a new one is added here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from faintspot.errors import InputError
+from faintspot.io.csv_files import Csv
+from faintspot.io.file_format import FileFormat
+from faintspot.io.fits_files import Fits, FitsGz
+from faintspot.io.numpy_files import Npy, Npz
+from faintspot.io.tiff_files import Tiff
+from faintspot.io.zarr_files import Zarr
+
+FORMATS: tuple[FileFormat, ...] = (Zarr(), Fits(), FitsGz(), Npy(), Npz(), Tiff(), Csv())
+_SIGNATURE_BYTES = 8
+
+
+def frame_format(path: Path) -> FileFormat:
+    """Return the format of a file of frames, by its content.
+
+    Raises
+    ------
+    InputError
+        When it is of none.
+    OSError
+        When it cannot be read.
+    """
+    start = b""
+    if not path.is_dir():
+        with path.open("rb") as stream:
+            start = stream.read(_SIGNATURE_BYTES)
+        if not start:
+            raise InputError(f"{path}: expected frames, the file is empty")
+    for item in FORMATS:
+        if item.has_frames(path, start):
+            return item
+    known = [item.name for item in FORMATS if item.signatures]
+    raise InputError(f"{path}: expected a {_listed(known)} file or a Zarr store, it is none of them")
+
+
+def slope_format(path: Path) -> FileFormat:
+    """Return the format of a file of slopes, by the ending of its name.
+
+    Raises
+    ------
+    InputError
+        When it is of none.
+    """
+    for item in FORMATS:
+        if path.name.lower().endswith(item.endings):
+            return item
+    raise InputError(f"{path}: expected a name that ends with {_listed(slope_endings())}")
+
+
+def slope_endings() -> list[str]:
+    """Return all endings of files of slopes."""
+    return [ending for item in FORMATS for ending in item.endings]
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"

@@ -1,0 +1,165 @@
+"""Slopes of an unfinished run in a hidden folder beside the file that is made of them at the end.
+
+The folder ".NAME.partial" holds a flat binary file for each variable and a mark: how many frames are whole,
+and of which run. The file itself appears by renaming, complete. Until then its data exist twice on the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.files import replace_file, sync_file, sync_folder
+from faintspot.io.slopes_format import VARIABLES, Run, StoredSlopes, with_absent
+from faintspot.io.slopes_writer import Begun
+
+_RUN = "run.json"
+_MARK = "finished"
+
+
+class FolderStorage:
+    """Collects slopes in a folder and makes the file of them when all are there.
+
+    Parameters
+    ----------
+    path : Path
+        The file to be made.
+    run : Run
+        What it will contain.
+    export : callable
+        Writes the file: export(stream, slopes).
+    """
+
+    chunk = 1
+
+    def __init__(self, path: Path, run: Run, export: Callable[[IO[bytes], StoredSlopes], None]) -> None:
+        self.place = partial_folder(path)
+        self._path = path
+        self._run = run
+        self._export = export
+
+    def begun(self) -> Begun | None:
+        """Return what is there, or None."""
+        if not is_partial(self.place):
+            return None
+        description = _read_description(self.place)
+        sizes = (description["n_frames"], description["n_subapertures"])
+        return Begun(description["attributes"]["fingerprint"], sizes, complete=False)
+
+    def remove(self) -> None:
+        """Delete the folder."""
+        shutil.rmtree(self.place)
+
+    def create(self) -> None:
+        """Create the folder; run.json comes last and marks that it is usable."""
+        shutil.rmtree(self.place, ignore_errors=True)
+        self.place.mkdir()
+        for name in VARIABLES:
+            (self.place / name).touch()
+        self.mark(0)
+        description = {
+            "n_frames": self._run.n_frames,
+            "n_subapertures": self._run.n_subapertures,
+            "attributes": self._run.attributes,
+            "coordinates": {name: values.tolist() for name, values in self._run.coordinates.items()},
+        }
+        replace_file(self.place / _RUN, json.dumps(description))
+
+    def open(self) -> None:
+        """Give the mark of an earlier version the name of its run."""
+        fingerprint, finished = _read_mark(self.place)
+        if not fingerprint:
+            self.mark(finished)
+
+    def marked(self) -> tuple[str, int]:
+        """Return fingerprint and number of whole frames."""
+        return _read_mark(self.place)
+
+    def mark(self, finished: int) -> None:
+        """Wait for the disk, then say how many frames are whole."""
+        for name in VARIABLES:
+            sync_file(self.place / name)
+        replace_file(self.place / _MARK, f"{finished}\n{self._run.fingerprint}")
+
+    def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Return frames that are stored."""
+        stored = read_partial(self.place).variables
+        return {name: np.array(array[start:stop]) for name, array in stored.items()}
+
+    def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Store frames from `start` on."""
+        for name, array in arrays.items():
+            with (self.place / name).open("r+b") as stream:
+                stream.seek(start * self._run.n_subapertures * array.itemsize)
+                stream.write(np.ascontiguousarray(array).data)
+
+    def finish(self) -> None:
+        """Make the file and remove the folder."""
+        temporary = self.place / "output"  # goes with the folder when this is interrupted
+        with temporary.open("wb") as stream:
+            self._export(stream, read_partial(self.place))
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(self._path)
+        sync_folder(self._path.parent)
+        shutil.rmtree(self.place)
+
+
+def partial_folder(path: Path) -> Path:
+    """Return the hidden folder beside `path` where an unfinished run keeps its slopes."""
+    return path.with_name(f".{path.name}.partial")
+
+
+def is_partial(folder: Path) -> bool:
+    """Tell whether a folder is an unfinished run's."""
+    return (folder / _RUN).is_file()
+
+
+def read_partial(folder: Path) -> StoredSlopes:
+    """Return what an unfinished run has stored so far, mapped from the disk."""
+    description = _read_description(folder)
+    finished = _read_mark(folder)[1]
+    shape = (finished, description["n_subapertures"])
+    variables: dict[str, NDArray[Any]] = {}
+    for name, variable in VARIABLES.items():
+        empty = np.empty(shape, variable.dtype)
+        if (folder / name).exists():
+            variables[name] = (
+                np.memmap(folder / name, variable.dtype, "r", shape=shape) if finished else empty
+            )
+    return StoredSlopes(
+        variables=with_absent(variables),
+        coordinates={name: np.asarray(values) for name, values in description["coordinates"].items()},
+        attributes=description["attributes"],
+        complete=False,
+        n_finished=finished,
+    )
+
+
+def _read_description(folder: Path) -> dict[str, Any]:
+    try:
+        description: dict[str, Any] = json.loads((folder / _RUN).read_text(encoding="utf-8"))
+    except ValueError:
+        raise _damaged(folder) from None
+    return description
+
+
+def _read_mark(folder: Path) -> tuple[str, int]:
+    """Return fingerprint ("" where an earlier version has not written it) and number of whole frames."""
+    try:
+        finished, _, fingerprint = (folder / _MARK).read_text(encoding="utf-8").partition("\n")
+        return fingerprint, int(finished)
+    except (OSError, ValueError):
+        raise _damaged(folder) from None
+
+
+def _damaged(folder: Path) -> InputError:
+    return InputError(f"{folder}: damaged, it cannot be resumed: delete it")

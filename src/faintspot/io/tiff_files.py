@@ -1,0 +1,156 @@
+"""Frames in TIFF files: single pages and stacks, as cameras and ImageJ write them."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.io.file_format import FileFormat
+from faintspot.io.locations import StoredArray, one_line
+from faintspot.io.raw import RawArray
+
+
+class Tiff(FileFormat):
+    """Frames as pages, or as one stack behind the first page; BigTIFF, too."""
+
+    name = "TIFF"
+    signatures = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+    def find(self, path: Path, key: str | None) -> StoredArray:
+        """Return the pages of a file, or those of the series whose number is `key`.
+
+        tifffile calls a series what was written together. Raises InputError when pages are not alike.
+        """
+        complaints = _Complaints()
+        try:
+            with complaints, _load_tifffile().TiffFile(path) as file:
+                chosen = _choose(path, list(file.series), key)
+                name = f"{path}:{key}" if key is not None else str(path)
+                array = _array(name, path, [file.series[number] for number in chosen], chosen)
+        except (InputError, OSError, MissingExtraError):
+            raise
+        except Exception as error:  # a broken file makes tifffile raise many things
+            raise InputError(f"{path}: expected a whole TIFF file ({one_line(error)})") from None
+        if complaints.first:
+            raise InputError(f"{path}: expected a whole TIFF file ({complaints.first})")
+        return array
+
+
+class _Complaints(logging.Handler):
+    """Notes the first error that tifffile logs, where it goes on with fewer pages; a context."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.first = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep its message in one line."""
+        self.first = self.first or " ".join(record.getMessage().split())
+
+    def __enter__(self) -> None:
+        self._logger = logging.getLogger("tifffile")
+        self._propagate, self._logger.propagate = self._logger.propagate, False
+        self._logger.addHandler(self)
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.removeHandler(self)
+        self._logger.propagate = self._propagate
+
+
+def _load_tifffile() -> Any:
+    try:
+        import tifffile
+    except ImportError:
+        raise MissingExtraError("tifffile", "io", "Reading a TIFF file") from None
+    return tifffile
+
+
+def _choose(path: Path, series: list[Any], key: str | None) -> list[int]:
+    """Return the numbers of the series to read: that which is named, or all when they are alike."""
+    everything = list(range(len(series)))
+    if key is None and len({(item.keyframe.shape, item.dtype) for item in series}) == 1:
+        return everything
+    listed = ", ".join(
+        f"{i}: {' x '.join(map(str, item.shape))} {item.dtype}" for i, item in enumerate(series)
+    )
+    if key is None:
+        raise InputError(
+            f"{path}: expected pages of one size and type; it contains {listed}; "
+            f"choose some with {path.name}:NUMBER"
+        )
+    if not key.isdecimal() or int(key) not in everything:
+        raise InputError(f"{path}: no pages {key!r}; it contains {listed}")
+    return [int(key)]
+
+
+def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> StoredArray:
+    """Return the pages of series as one array: as plain bytes where they lie in a row, else page by page."""
+    series = chosen[0]
+    size = tuple(series.keyframe.shape)
+    if series.keyframe.samplesperpixel != 1 or len(size) != 2:
+        raise InputError(f"{name}: expected grey frames, got pages of shape {size}")
+    count = sum(item.size for item in chosen) // (size[0] * size[1])
+    shape = (count, *size) if count > 1 else size
+    dtype = np.dtype(series.dtype)
+    if len(chosen) == 1 and series.dataoffset is not None:
+        needed = series.dataoffset + int(np.prod(shape)) * dtype.itemsize
+        if path.stat().st_size < needed:
+            raise InputError(
+                f"{name}: truncated: it promises data up to byte {needed}, "
+                f"the file has {path.stat().st_size} bytes"
+            )
+        return RawArray(
+            name,
+            lambda: path.open("rb"),
+            offset=series.dataoffset,
+            dtype=dtype.newbyteorder(series.parent.byteorder),
+            shape=shape,
+            forward_only=False,
+        )
+    return _Pages(name, path, numbers, shape, dtype)
+
+
+class _Pages:
+    """Pages that are decompressed one by one."""
+
+    def __init__(
+        self, name: str, path: Path, numbers: list[int], shape: tuple[int, ...], dtype: np.dtype[Any]
+    ) -> None:
+        self.name = name
+        self.shape = shape
+        self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
+        self._path = path
+        self._numbers = numbers
+        self._file: Any = None
+        self._pages: list[Any] = []
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return pages `start` to `stop`, in native byte order; of a single page all rows."""
+        if len(self.shape) == 2:
+            return self._page(0)[start:stop]
+        return np.stack([self._page(number) for number in range(start, stop)])
+
+    def close(self) -> None:
+        """Close the file; a later `read` opens it again."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+            self._pages = []
+
+    def _page(self, number: int) -> NDArray[Any]:
+        try:
+            if self._file is None:
+                self._file = _load_tifffile().TiffFile(self._path)
+                self._pages = [page for i in self._numbers for page in self._file.series[i].pages]
+            values = np.asarray(self._pages[number].asarray())
+        except Exception as error:  # the decompressors raise whatever they like
+            self.close()
+            raise InputError(
+                f"{self.name}: frame {number} (counted from 0) cannot be read ({one_line(error)})"
+            ) from None
+        return values.astype(self.dtype, copy=False)

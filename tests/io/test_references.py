@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.io.slope_files import ATTRIBUTES, NAMES, part, result, write, writer_for
+
+from faintspot.errors import InputError
+from faintspot.io.references import read_reference
+
+fits = pytest.importorskip("astropy.io.fits")
+zarr = pytest.importorskip("zarr")
+
+
+def means() -> NDArray[np.float64]:
+    """Mean of the valid slopes of each sub-aperture, one by one."""
+    slopes = result()
+    return np.array(
+        [
+            [slopes[name][slopes["valid"][:, i], i].astype(np.float64).mean() for name in ("x", "y")]
+            for i in range(7)
+        ]
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mean_of_valid_slopes(tmp_path: Path, name: str) -> None:
+    write(tmp_path / name, result())
+    np.testing.assert_allclose(read_reference(tmp_path / name), means(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(7, 2), (14,)])
+def test_on_top_of_their_own_reference(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    own = np.arange(14.0).reshape(7, 2) / 10
+    stored = own if shape == (7, 2) else own.T.reshape(14)
+    write(tmp_path / "a.npz", result(), attributes={**ATTRIBUTES, "reference": stored.tolist()})
+    np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), means() + own, rtol=1e-12)
+
+
+def test_where_nothing_is_valid(tmp_path: Path) -> None:
+    slopes = result()
+    slopes["valid"][:, 3] = False
+    write(tmp_path / "a.npz", slopes)
+    expected = means()
+    expected[3] = 0.0
+    np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), expected, rtol=1e-12)
+    slopes["valid"][:] = False
+    write(tmp_path / "b.npz", slopes)
+    with pytest.raises(InputError, match=r"b\.npz: expected slopes to take as reference, found none"):
+        read_reference(tmp_path / "b.npz")
+
+
+def test_unfinished_store(tmp_path: Path) -> None:
+    with writer_for(tmp_path / "a.zarr") as writer:
+        writer.append(0, part(result(), 0, 20))
+    slopes = part(result(), 0, 20)
+    mean = slopes["x"][slopes["valid"][:, 0], 0].mean(dtype=np.float64)
+    assert read_reference(tmp_path / "a.zarr")[0, 0] == pytest.approx(mean, rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(7, 2), (14,)])
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.npz:one", "a.fits", "a.fits.gz", "a.zarr"])
+def test_arrays(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
+    array = np.random.default_rng(2).normal(size=shape)
+    path = tmp_path / name.partition(":")[0]
+    if ".fits" in name:
+        fits.PrimaryHDU(array).writeto(path)
+    elif "zarr" in name:
+        zarr.create_array(str(path), data=array)
+    elif "npz" in name:
+        np.savez(path, one=array, frames=array)
+    else:
+        np.save(path, array)
+    np.testing.assert_array_equal(read_reference(tmp_path / name), array)
+
+
+def test_slopes_that_are_damaged(tmp_path: Path) -> None:
+    write(tmp_path / "a.zarr", result())
+    (tmp_path / "a.zarr" / "x" / "c.0.0").write_bytes(b"")
+    with pytest.raises(InputError, match=r"a\.zarr: the store is damaged: x "):
+        read_reference(tmp_path / "a.zarr")
+    with pytest.raises(InputError, match="no such file"):
+        read_reference(tmp_path / "b.zarr")
