@@ -83,8 +83,8 @@ def run(
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.interleaving import Interleaving
-    from faintspot.realtime.live import parse_subapertures
     from faintspot.realtime.scheduling import real_time
+    from faintspot.realtime.written_changes import parse_subapertures
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     processors = parse_subapertures(cpus) if cpus else None
