@@ -28,7 +28,7 @@ from benchmarks.rivals import problem
 from benchmarks.scale import settings, settings_in_words
 from faintspot.kernels.parallel import available_cpus
 from faintspot.realtime.frame_path import FramePath, Progress
-from faintspot.realtime.manners import real_time
+from faintspot.realtime.scheduling import real_time
 from faintspot.realtime.workers import Workers
 
 FRAMES = {36: 40_000, 1208: 5_000}

@@ -56,7 +56,7 @@ def _own_us(iterations: int) -> dict[str, float]:
             settings,
             images_every=0,
         )
-        path = engine.programmes.of(engine.live.pipeline).paths(ring)[0]
+        path = engine.live.running.paths(ring)[0]
         with engine._streams.held():
             for index in range(FRAMES):
                 ring.publish(frame)

@@ -61,7 +61,7 @@ class Bench:
         self.until(lambda: self.engine._waiting)
 
     def detached(self) -> None:
-        self.until(lambda: self.engine.programmes.ring is None)
+        self.until(lambda: self.engine.preparer.ring is None)
 
     def send(self, ring: PixelRing, number: int, frame: NDArray[Any], rows: int = 5) -> None:
         """Send a frame row by row, and wait until it has been measured."""

@@ -130,3 +130,20 @@ def test_a_refused_module_changes_nothing(bench: Bench, tmp_path: Path) -> None:
         bench.engine.modules.load(bad)
     assert bench.engine.modules.modules() == {}
     assert bench.engine.live.change_number == 0
+
+
+def test_any_failure_takes_back_what_was_loaded(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not only refusals: settings can be changed afterwards, and nothing is loaded."""
+
+    def fail(*arguments: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.engine.preparer, "of_arms", fail)
+        with pytest.raises(MemoryError):
+            bench.engine.modules.load(module(tmp_path, HALVED))
+    assert bench.engine.modules.modules() == {}
+    bench.engine.live.propose({"noise_std": 2.0})
+    assert bench.engine.live.waiting() == 1

@@ -14,8 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from tests.realtime.module_cases import LAYOUT, SETTINGS, frames, pipeline, write
 
+from faintspot.errors import InputError
+from faintspot.realtime.commands import commands_of
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.handlers import handlers_of
 from faintspot.realtime.modular import ModularPipeline
 from faintspot.realtime.module_loading import load_module
 from faintspot.realtime.pixel_ring import PixelRing
@@ -31,7 +32,7 @@ class Bench:
     def __init__(self) -> None:
         name = f"fs_test_{uuid4().hex[:12]}"
         self.engine = Engine(name, pipeline, SETTINGS, deadline_s=DEADLINE_S)
-        self.ask = handlers_of(self.engine)
+        self.ask = commands_of(self.engine)
         self._thread = threading.Thread(target=self.engine.run)
         self._stream = pyshmem.open(f"{name}_slopes")
         self._ring = PixelRing.create(name, LAYOUT.frame_shape, np.float32)
@@ -118,3 +119,11 @@ def test_a_module_that_never_returns_is_taken_out(bench: Bench, tmp_path: Path) 
     assert "module module (denoise): did not return" in bench.ask["modules"]({})["fault"]
     frame[20, 20] = 100
     assert np.array_equal(bench.slopes_of(frame), pipeline()(frame).vector)
+
+
+def test_a_module_that_crashes_in_its_trial_is_never_loaded(bench: Bench, tmp_path: Path) -> None:
+    path = write(tmp_path, "denoise", "import ctypes\nctypes.string_at(0)")
+    with pytest.raises(InputError, match="crashed in its trial"):
+        bench.ask["load"]({"source": str(path)})
+    assert bench.engine.modules.modules() == {}
+    assert bench.ask["set"]({"changes": {"keep_brightest": 5}})["frame"] is not None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import subprocess
+import time
 
-from faintspot.realtime.processes import process_lives, process_start
+from faintspot.realtime.processes import process_age_s, process_lives, process_start
 
 
 def test_which_processes_live() -> None:
@@ -16,3 +17,14 @@ def test_which_processes_live() -> None:
     ended.wait()
     assert process_start(ended.pid) == -1
     assert not process_lives(ended.pid, -1)
+
+
+def test_how_old_a_process_is() -> None:
+    """To the clock tick, 10 ms, in which starts are counted."""
+    with subprocess.Popen(["sleep", "60"]) as process:
+        begin = time.monotonic()
+        time.sleep(0.1)
+        age = process_age_s(process.pid)
+        assert 0.09 - 0.01 <= age <= time.monotonic() - begin + 1.0
+        process.kill()
+    assert process_age_s(process.pid) == -1.0

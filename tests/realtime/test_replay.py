@@ -24,10 +24,10 @@ from faintspot.cli.realtime_sources import replay
 from faintspot.errors import InputError
 from faintspot.io import FrameSource, open_frames
 from faintspot.realtime import replay as replay_module
-from faintspot.realtime.manners import quick_switching
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.replay import Replay, ring_type
+from faintspot.realtime.scheduling import quick_switching
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
 SHAPE = (6, 5)

@@ -10,12 +10,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import click
-import numpy as np
-
-from faintspot.realtime.camera import Camera, SpotMotion, readout_type
-from faintspot.realtime.pixel_ring import PixelRing
-from faintspot.sensor.layout import Layout
-from faintspot.simulate import Detector
 
 
 @click.command("camera", short_help="Simulate a camera that publishes frames row by row.")
@@ -69,6 +63,13 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
     Example:
       faintspot realtime camera --config faintspot.toml --rate 1000 --flux-e 50 --read-noise-e 0.5
     """
+    import numpy as np
+
+    from faintspot.realtime.camera import Camera, SpotMotion, readout_type
+    from faintspot.realtime.pixel_ring import PixelRing
+    from faintspot.sensor.layout import Layout
+    from faintspot.simulate import Detector
+
     layout = Layout.load(config)
     detector = Detector(
         options["read_noise_e"],

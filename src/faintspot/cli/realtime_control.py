@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.realtime.control import request
+from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.private_socket import socket_path
 
 _NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
@@ -28,7 +28,10 @@ def status(name: str, as_json: bool) -> None:
 @_NAME
 @click.argument("settings", nargs=-1)
 def get(name: str, settings: tuple[str, ...]) -> None:
-    """Show settings of a running engine: all, or those named."""
+    """Show settings of a running engine: all, or those named.
+
+    Defaults are filled in; null is what is not used, or found from the PSF or each frame.
+    """
     for key, value in _asked(name, "get", names=list(settings) or None)["settings"].items():
         click.echo(f"{key} = {json.dumps(value)}")
 
@@ -40,14 +43,18 @@ def get(name: str, settings: tuple[str, ...]) -> None:
 def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) -> None:
     """Change settings of a running engine between two frames, all at once or not at all.
 
+    The answer comes when they are in effect. Kernels that this machine has not used yet are compiled first,
+    which takes up to half a minute, once; frames are measured as before meanwhile, and status says so.
+
     \b
     Example:
       faintspot realtime set noise_std=2.5 keep_brightest=20 --subapertures 4,5,10-20
     """
-    from faintspot.realtime.live import parse_changes, parse_subapertures
+    from faintspot.realtime.written_changes import parse_changes, parse_subapertures
 
     where = None if subapertures is None else parse_subapertures(subapertures)
-    reply = _asked(name, "set", changes=parse_changes(changes), where=where)
+    wanted = {"changes": parse_changes(changes), "where": where}
+    reply = request(socket_path(name), "set", timeout_s=LENGTHY_TIMEOUT_S, **wanted)
     frame = reply["frame"]
     click.echo("taken at the next frame" if frame is None else f"in effect from frame {frame}")
 
@@ -85,6 +92,8 @@ def _table(name: str) -> Any:
             grid.add_row(words.replace("_", " "), f"[bold red]{reply[words]}")
     if len(reply["arms"]) > 1:
         grid.add_row("arms in turn", ", ".join(reply["arms"]))
+    if reply["preparing"]:
+        grid.add_row("preparing", _preparing(reply["preparing"]))
     for stage, module in reply["modules"].items():
         grid.add_row(f"{stage} by module", module)
     grid.add_section()
@@ -105,14 +114,20 @@ def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
     return request(socket_path(name), what, **fields)
 
 
+def _preparing(change: dict[str, Any]) -> str:
+    return f"{', '.join(change['changes'])} (for {change['seconds']:.0f} s)"
+
+
 def summary(reply: dict[str, Any]) -> str:
-    """Say in two lines how an engine is doing."""
+    """Say in a few lines how an engine is doing."""
     counters, latency = reply["counters"], reply["latency"]
     lost = counters["dropped"] + counters["skipped"]
     lines = f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"
     for words in ("source_refused", "module_fault"):
         if reply[words]:
             lines += f"\n  {words.replace('_', ' ')}: {reply[words]}"
+    if reply["preparing"]:
+        lines += f"\n  preparing: {_preparing(reply['preparing'])}"
     if latency["count"]:
         lines += (
             f"\n  from the last row to the slopes: p50 {latency['p50_us']:.0f} us, "

@@ -8,10 +8,9 @@ from typing import Any
 
 import click
 
-from faintspot.realtime.control import request
+from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.private_socket import socket_path
 
-_TIMEOUT_S = 180.0  # the module is imported, made and tried, and may compile
 _NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
 
 
@@ -22,8 +21,8 @@ def load(name: str, module: str) -> None:
     """Put a module in place of a stage of a running engine.
 
     A module is a Python file, or one that is installed under that name, which replaces one of the stages
-    calibrate, denoise, background and centroid. It is made and tried beside the running engine, and refused
-    where it fails, does not return what it must, or takes too long. It runs with all rights of the engine.
+    calibrate, denoise, background and centroid. It is tried in a process of its own, and refused where it
+    fails, crashes, does not return what it must, or takes too long. It runs with all rights of the engine.
 
     \b
     Example:
@@ -81,7 +80,7 @@ def _source(name_or_path: str) -> str:
 
 
 def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
-    return request(socket_path(name), what, timeout_s=_TIMEOUT_S, **fields)
+    return request(socket_path(name), what, timeout_s=LENGTHY_TIMEOUT_S, **fields)
 
 
 def _show(reply: dict[str, Any]) -> None:

@@ -79,20 +79,18 @@ def run(
       faintspot realtime run --interleave none,tv --every 50
     """
     from faintspot import configuration
-    from faintspot.pipeline import SlopePipeline
+    from faintspot.realtime.commands import LENGTHY, commands_of
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
-    from faintspot.realtime.handlers import LENGTHY, handlers_of
     from faintspot.realtime.interleaving import Interleaving
-    from faintspot.realtime.live import parse_subapertures
-    from faintspot.realtime.manners import real_time
-    from faintspot.realtime.module_loading import load_module
+    from faintspot.realtime.scheduling import real_time
+    from faintspot.realtime.written_changes import parse_subapertures
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     processors = parse_subapertures(cpus) if cpus else None
     engine = Engine(
         name,
-        lambda chosen: SlopePipeline(layout, chosen, calibration, psf=psf, score=score),
+        partial(_pipeline, layout, calibration, psf, score),
         settings,
         threads=threads,
         cpus=processors,
@@ -102,8 +100,8 @@ def run(
         images_every=images_every,
     )
     for source in modules:
-        engine.modules.load(load_module(source))
-    server = ControlServer(socket_path(name), handlers_of(engine), lengthy=LENGTHY)
+        engine.modules.load(engine.modules.admit(source))
+    server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
     with server, real_time(processors, priority) as refused:
         engine.refused = refused
         for line in refused:
@@ -116,6 +114,13 @@ def run(
             threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
             engine.run(frames)
     click.echo(summary(engine.status()))
+
+
+def _pipeline(layout: Any, calibration: Any, psf: Any, score: Any, settings: Any) -> Any:
+    """The pipeline of the configuration with other settings; a function that other processes can be given."""
+    from faintspot.pipeline import SlopePipeline
+
+    return SlopePipeline(layout, settings, calibration, psf=psf, score=score)
 
 
 def _followed(stream: str, name: str) -> Any:

@@ -52,9 +52,9 @@ def replay(
       faintspot realtime replay cube.npy --rate 1000 --rows-per-block 4 --first 500 --frames 1000 --repeat
     """
     from faintspot.io import open_frames
-    from faintspot.realtime.manners import quick_switching
     from faintspot.realtime.pixel_ring import PixelRing
     from faintspot.realtime.replay import Replay, ring_type
+    from faintspot.realtime.scheduling import quick_switching
 
     with (
         stop_on_signal() as stop,

@@ -42,7 +42,7 @@ _DIMENSIONS = {
 _NOT_STORED = "sequence"  # of the rings, which a store has no use for
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Telemetry:
     """What was recorded of a running engine: (n_frames,) or (n_frames, n_subapertures), as it came.
 
@@ -84,6 +84,13 @@ class Telemetry:
     """Plain values: layout (``Layout(**attributes["layout"])``), settings to begin with (TOML text), arms
     (names of the interleaved settings), dropped_records, dropped_images, dropped_changes, complete,
     ended_because."""
+
+    def __repr__(self) -> str:
+        """Say how much there is."""
+        return (
+            f"Telemetry({len(self.frame)} frames, {self.x.shape[-1]} sub-apertures, "
+            f"{len(self.image_frame)} images, {len(self.changes)} changes of settings)"
+        )
 
     @property
     def slopes(self) -> NDArray[np.float32]:

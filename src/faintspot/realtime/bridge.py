@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from faintspot.checks import number_between
-from faintspot.errors import MissingExtraError
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.replay import ring_type
+from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
 SPIN_S = 0.02
 """For so long after a frame the next one is waited for without a pause."""
@@ -87,11 +87,7 @@ class StreamBridge:
         slots: int = 4,
         spins: bool | None = None,
     ) -> None:
-        try:
-            import pyshmem
-        except ImportError:
-            raise MissingExtraError("pyshmem", "realtime", "reading a stream in shared memory") from None
-        self._pyshmem: Any = pyshmem
+        self._pyshmem: Any = pyshmem_module("reading a stream in shared memory")
         self.stream, self.name, self._slots = stream, name, slots
         self._say = say or (lambda _: None)
         self.counters = BridgeCounters()
@@ -108,7 +104,8 @@ class StreamBridge:
         Raises
         ------
         InputError
-            When somebody else writes into the ring, or shared memory is short.
+            When somebody else writes into the ring, shared memory is short, or the folder of pyshmem's locks
+            is not private.
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
         counters = self.counters
@@ -197,6 +194,7 @@ class StreamBridge:
 
     def _open(self) -> str:
         """Open the stream and make the ring for it; return what stands in the way, "" for nothing."""
+        lock_file(self.stream)  # refuses a place that is not private, in which pyshmem makes one
         try:
             # Not read-only: pyshmem leaves it to readers to mark what a writer that died has left half
             # written, and without that its successor's frames cannot be told from torn ones.

@@ -109,6 +109,8 @@ class Readout(ABC):
     ----------
     ring : PixelRing
         Created by this process.
+    shape, dtype
+        Of the frames.
     frame_rate_hz : float
         Frames a second, up to 100,000.
     readout_fraction : float
@@ -121,18 +123,24 @@ class Readout(ABC):
     Raises
     ------
     InputError
-        When a value is out of its range.
+        When a value is out of its range, or the ring is not for such frames.
     """
 
     def __init__(
         self,
         ring: PixelRing,
+        shape: tuple[int, int],
+        dtype: np.dtype[Any],
         *,
         frame_rate_hz: float,
         readout_fraction: float = 0.8,
         rows_per_block: int = 4,
         first_number: int = 0,
     ) -> None:
+        if (ring.shape, ring.dtype) != (shape, dtype):
+            raise InputError(
+                f"ring: expected frames of {shape} and {dtype}, got {ring.shape} and {ring.dtype}"
+            )
         rate = number_between("frame_rate_hz", frame_rate_hz, 0, 1e5, low_open=True)
         fraction = number_between("readout_fraction", readout_fraction, 0, 1)
         rows = ring.shape[0]
@@ -260,13 +268,10 @@ class Camera(Readout):
         rng: np.random.Generator | None = None,
     ) -> None:
         camera = Detector(read_noise_e=1.0) if detector is None else detector
-        if ring.shape != layout.frame_shape or ring.dtype != readout_type(camera):
-            raise InputError(
-                f"ring: expected frames of {layout.frame_shape} and {readout_type(camera)}, "
-                f"got {ring.shape} and {ring.dtype}"
-            )
         super().__init__(
             ring,
+            layout.frame_shape,
+            readout_type(camera),
             frame_rate_hz=frame_rate_hz,
             readout_fraction=readout_fraction,
             rows_per_block=rows_per_block,

@@ -27,6 +27,8 @@ Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
 """What a command does: takes the request without its command, returns what the reply says."""
 
 LARGEST_REQUEST = 64 * 1024
+LENGTHY_TIMEOUT_S = 180.0
+"""For a client to wait for a command that makes something anew, which may compile."""
 _LARGEST_REPLY = 16 * 1024 * 1024
 _MOST_CONNECTIONS = 64
 _IDLE_S = 30.0  # a connection without a request, or that does not read its reply, for so long is closed
@@ -149,26 +151,28 @@ class ControlServer:
             os.close(self._lock_file)
 
     async def _serve(self) -> None:
-        accepting = asyncio.create_task(self._accept())
-        await self._closing.wait()
-        for task in (accepting, *self._connections):
-            task.cancel()
+        self._listen()
+        await self._closing.wait()  # afterwards the runner cancels the connections
 
-    async def _accept(self) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, _ = await loop.sock_accept(self._listener)
-            except OSError:  # no file descriptor left, mostly
-                self._make_room()
-                await asyncio.sleep(_PAUSE_S)
-                continue
-            if len(self._connections) >= _MOST_CONNECTIONS:
-                self._make_room()
-            connection.setblocking(False)
-            task = loop.create_task(self._converse(connection))
-            self._connections[task] = None
-            task.add_done_callback(partial(self._end, connection))
+    def _listen(self) -> None:
+        self._loop.add_reader(self._listener, self._accept)
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except BlockingIOError:
+            return
+        except OSError:  # no file descriptor left, mostly
+            self._make_room()
+            self._loop.remove_reader(self._listener)
+            self._loop.call_later(_PAUSE_S, self._listen)
+            return
+        if len(self._connections) >= _MOST_CONNECTIONS:
+            self._make_room()
+        connection.setblocking(False)
+        task = self._loop.create_task(self._converse(connection))
+        self._connections[task] = None
+        task.add_done_callback(partial(self._end, connection))
 
     def _make_room(self) -> None:
         """End the connection that was idle longest."""

@@ -15,9 +15,9 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.live import LiveSettings
-from faintspot.realtime.outputs import SlopeStreams
 from faintspot.realtime.pixel_ring import PixelRing
-from faintspot.realtime.programme import Path, Programmes
+from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
+from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
 from faintspot.realtime.workers import Workers
@@ -89,18 +89,18 @@ class Engine:
         self.interleaving = Interleaving() if interleaving is None else interleaving
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
-        """What of the real-time manners was not permitted."""
+        """What of the real-time scheduling was not permitted."""
         self._source, self._unfit = source, ""
-        self._path: Path | None = None
+        self._path: MeasuringPath | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the frame that was measured last
         self._measured = [0 for _ in self.interleaving.arms]
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
-        self.programmes = Programmes(make_pipeline, self.interleaving, self._workers, deadline_s)
-        self.live = LiveSettings(self.programmes.make, settings)
-        self.modules = EngineModules(self.live, self.programmes)
-        layout = self.live.pipeline.layout
+        self.preparer = SettingsPreparer(make_pipeline, self.interleaving, self._workers, deadline_s)
+        self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
+        self.modules = EngineModules(self.live, self.preparer)
+        layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
         self._streams = SlopeStreams(name, len(layout))
         try:
@@ -119,15 +119,16 @@ class Engine:
 
     def status(self) -> dict[str, Any]:
         """Return counters and latencies as plain values."""
-        ring = self.programmes.ring
+        ring = self.preparer.ring
         return {
             "name": self.name,
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
             "source_refused": self._unfit or None,
+            "preparing": self.live.preparing,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator.name,
-            "subapertures": len(self.live.pipeline.layout),
+            "subapertures": len(self.live.running.layout),
             "arms": self.interleaving.labels,
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
@@ -147,9 +148,9 @@ class Engine:
                     if ring is None:
                         self._await_ring()
                         continue
-                    self.programmes.ring = ring
+                    self.preparer.ring = ring
                     self._follow(ring, n_frames)
-                    self.programmes.ring = None
+                    self.preparer.ring = None
         finally:
             self._stopping.set()
             watcher.join()
@@ -179,7 +180,7 @@ class Engine:
             return None
         if ring.stale or ring.closed:
             return None
-        shape, wanted = ring.shape, self.live.pipeline.layout.frame_shape
+        shape, wanted = ring.shape, self.live.running.layout.frame_shape
         fits = shape == wanted and ring.dtype in (np.uint16, np.float32)
         self._unfit = ""
         if not fits:
@@ -227,14 +228,14 @@ class Engine:
         self._end_frame(ring, path, arm, arrival, number if whole else -1, explain)
         return True
 
-    def _take(self, ring: PixelRing) -> tuple[Path, int]:
-        """Return the way of the next frame, and whose turn it is; changes of settings take effect here."""
-        pipeline = self.live.take(self._number + 1)
+    def _take(self, ring: PixelRing) -> tuple[MeasuringPath, int]:
+        """Return the path of the next frame, and whose turn it is; changes of settings take effect here."""
+        prepared = self.live.take(self._number + 1)
         arm = self.interleaving.arm_of(self.counters.processed)
-        return self.programmes.of(pipeline).paths(ring)[arm], arm
+        return prepared.paths(ring)[arm], arm
 
     def _end_frame(
-        self, ring: PixelRing, path: Path, arm: int, arrival: int, number: int, explained: bool
+        self, ring: PixelRing, path: MeasuringPath, arm: int, arrival: int, number: int, explained: bool
     ) -> None:
         """Publish what was measured, unless it was not that frame; first of all the slopes."""
         counters, slopes = self.counters, path.slopes
@@ -297,7 +298,7 @@ class Engine:
         while True:
             stopping = self._stopping.wait(_WATCH_S)
             looks += 1
-            ring, path = self.programmes.ring, self._path
+            ring, path = self.preparer.ring, self._path
             if ring is not None and path is not None and self._waiting:
                 gone = ring.closed or (looks % _LOOKS_BETWEEN_STALE == 0 and ring.stale)
                 if stopping or gone:
@@ -306,6 +307,7 @@ class Engine:
                 self.counters.worker_restarts += self._workers.replace_dead()
             if path is not None:
                 self.modules.take_out(path)
+            self.live.let_go()
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
                 self._telemetry.write_change(*change)

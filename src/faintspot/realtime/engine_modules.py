@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+from collections import deque
 from collections.abc import Mapping
 
 from faintspot.errors import InputError
 from faintspot.realtime.live import LiveSettings
-from faintspot.realtime.module_loading import Module
-from faintspot.realtime.programme import Path, Programmes
+from faintspot.realtime.module_loading import Module, load_module
+from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
+from faintspot.realtime.trial_process import Trial
 
 _EFFECT_TIMEOUT_S = 0.5
+_MOST_BEFORE = 8
+"""So many former sets of modules are kept, to go back to."""
 
 
 class EngineModules:
@@ -19,23 +24,38 @@ class EngineModules:
     Parameters
     ----------
     live : LiveSettings
-    programmes : Programmes
+    preparer : SettingsPreparer
     """
 
-    def __init__(self, live: LiveSettings, programmes: Programmes) -> None:
-        self._live, self._programmes = live, programmes
+    def __init__(self, live: LiveSettings[PreparedSettings], preparer: SettingsPreparer) -> None:
+        self._live, self._preparer = live, preparer
         self._lock = threading.Lock()
-        self._before: list[Mapping[str, Module]] = []
+        self._before: deque[Mapping[str, Module]] = deque(maxlen=_MOST_BEFORE)
         self._fault: str | None = None
-        self._given_up: Path | None = None
+        self._given_up: MeasuringPath | None = None
 
     def modules(self) -> Mapping[str, Module]:
         """Return the modules that are in use, by stage."""
-        return self._programmes.modules
+        return self._preparer.modules
 
     def module_fault(self) -> str | None:
         """Return why modules were taken out last, None where they never were."""
         return self._fault
+
+    def admit(self, name_or_path: str) -> Module:
+        """Try a module in a process of its own, and load it into this one when it has passed.
+
+        Raises
+        ------
+        InputError
+            When it is refused; then this process has not run any of it.
+        """
+        settings = self._preparer.of_arms(self._live.settings)
+        digest = Trial(name_or_path, self._preparer.make_pipeline, settings).elsewhere()
+        module = load_module(name_or_path)
+        if module.digest != digest:
+            raise InputError(f"module {name_or_path}: was changed while it was tried; load it again")
+        return module
 
     def load(self, module: Module) -> int | None:
         """Put a module in its stage, in place of what is there; return the first frame, None while it waits.
@@ -46,7 +66,7 @@ class EngineModules:
             When it is refused; then nothing changes.
         """
         with self._lock:
-            before = self._programmes.modules
+            before = self._preparer.modules
             frame = self._changed({**before, module.stage: module})
             self._before.append(before)
             return frame
@@ -55,9 +75,9 @@ class EngineModules:
         """Put the built-in stage back; return the first frame, None while it waits."""
         with self._lock:
             self._before.clear()
-            return self._changed({s: m for s, m in self._programmes.modules.items() if s != stage})
+            return self._changed({s: m for s, m in self._preparer.modules.items() if s != stage})
 
-    def take_out(self, path: Path) -> None:
+    def take_out(self, path: MeasuringPath) -> None:
         """Go back to the modules before, or to none, where those of the path that runs have failed.
 
         In a thread of its own, once: those before are made and tried anew.
@@ -71,17 +91,21 @@ class EngineModules:
         with self._lock:
             try:
                 self._changed(self._before.pop() if self._before else {})
-            except InputError:  # those before fail as well
+            except Exception:  # those before fail as well
                 self._before.clear()
                 self._changed({})
 
     def _changed(self, modules: Mapping[str, Module]) -> int | None:
-        before = self._programmes.modules
-        self._programmes.modules = modules
+        before = self._preparer.modules
+        self._preparer.modules = modules
         try:
             names = {stage: module.name for stage, module in modules.items()}
             change = self._live.renew({"modules": names})
-        except InputError:
-            self._programmes.modules = before
+        except BaseException:
+            self._preparer.modules = before
             raise
-        return self._live.wait(change, _EFFECT_TIMEOUT_S)
+        frame = self._live.wait(change, _EFFECT_TIMEOUT_S)
+        # The names of a module's file and its functions refer to each other, and in a running engine nobody
+        # else collects what such cycles hold.
+        gc.collect()
+        return frame

@@ -8,7 +8,8 @@ from typing import Any
 from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.estimators.registry import estimators
-from faintspot.realtime.live import parse_changes
+from faintspot.realtime.live import check_names
+from faintspot.realtime.written_changes import parse_changes
 from faintspot.settings import Settings, without_denoising
 
 _SET, _NONE = "set", "none"
@@ -85,6 +86,8 @@ def _parsed_arm(text: str) -> Arm:
     if text in estimators():
         return Arm(text, {"estimator": text})
     if "=" in text:
-        return Arm(text, parse_changes(text.split("+")))
+        changes = parse_changes(text.split("+"))
+        check_names(list(changes))
+        return Arm(text, changes)
     known = ", ".join([_SET, _NONE, *estimators()])
     raise InputError(f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several")

@@ -10,21 +10,37 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
+from faintspot.estimators.stepping import Stepping
 from faintspot.options import PerSubaperture
-from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings, check_option, option_names
 from faintspot.toml_files import check_known
 
-HISTORY_LENGTH = 10_000
-_MOST_SUBAPERTURES = 1_000_000
+HISTORY_LENGTH = 1000
 _POLL_S = 0.001
-_WORDS = {"none": None, "true": True, "false": False}
+
+
+class HasSettings(Protocol):
+    """What is made from settings: a `SlopePipeline`, or an engine's `PreparedSettings`."""
+
+    @property
+    def settings(self) -> Settings:
+        """From which it was made."""
+        ...
+
+    @property
+    def layout(self) -> Layout:
+        """Of the sensor that it is for."""
+        ...
+
+
+Prepared = TypeVar("Prepared", bound=HasSettings)
 
 
 @dataclass(slots=True, eq=False)
@@ -42,24 +58,24 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Version:
-    """A complete pipeline and the last change that is in it."""
+class _Version(Generic[Prepared]):
+    """What was prepared from settings, and the last change that is in it."""
 
-    pipeline: SlopePipeline
+    prepared: Prepared
     change: Change
 
 
-class LiveSettings:
-    """The pipeline that an engine runs, and the changes that wait for the next frame.
+class LiveSettings(Generic[Prepared]):
+    """The settings that an engine runs, and the changes that wait for the next frame.
 
-    Any thread proposes changes; the pipeline is checked and built there. The engine's thread takes the
-    newest complete one between two frames: it reads one attribute and waits for nobody. No change is lost:
-    each builds on all before it, whether they are running already or not.
+    Any thread proposes changes; they are checked and prepared there. The engine's thread takes what was
+    prepared last between two frames: it reads one attribute and waits for nobody. No change is lost: each
+    builds on all before it, whether they are running already or not.
 
     Parameters
     ----------
-    make_pipeline : function
-        Makes the complete pipeline, ready for its first frame, from settings; raises InputError for
+    prepare : function
+        Makes from settings all that measures frames, ready for the first one; raises InputError for
         settings that do not fit. Called by one thread at a time.
     settings : Settings
         To begin with.
@@ -74,48 +90,57 @@ class LiveSettings:
 
     def __init__(
         self,
-        make_pipeline: Callable[[Settings], SlopePipeline],
+        prepare: Callable[[Settings], Prepared],
         settings: Settings,
         history_length: int = HISTORY_LENGTH,
     ) -> None:
-        self._make_pipeline = make_pipeline
-        self._lock = threading.Lock()  # among those who propose or read the history; never taken by `take`
-        first = _Version(make_pipeline(settings), Change(0, {}, None, frame_number=-1))
+        self._prepare = prepare
+        # Neither is ever taken by `take`.
+        self._proposing = threading.Lock()  # held while settings are prepared, which may take seconds
+        self._lock = threading.Lock()  # of the history
+        self._under_way: tuple[dict[str, Any], float] | None = None
+        first = _Version(prepare(settings), Change(0, {}, None, frame_number=-1))
         # Written by those who propose, one at a time; read by the engine.
         self._newest = first
         # Written by the engine alone.
         self._running = first
+        self._replaced: deque[_Version[Prepared]] = deque()
         self._record: deque[Change] = deque(
             maxlen=int(number_between("history_length", history_length, 1, integer=True))
         )
 
     # The engine's thread ----------------------------------------------------------------------------
 
-    def take(self, frame_number: int) -> SlopePipeline:
-        """Return the newest complete pipeline, with which frame `frame_number` is to be measured.
+    def take(self, frame_number: int) -> Prepared:
+        """Return what was prepared last, with which frame `frame_number` is to be measured.
 
         To be called by one thread, between two frames. Changes that it takes are stamped with that number.
         """
         newest = self._newest  # read once: a later one waits for the next frame
         if newest is not self._running:
             newest.change.frame_number = frame_number
+            self._replaced.append(self._running)  # whose memory others give back
             self._running = newest
-        return newest.pipeline
+        return newest.prepared
 
     # Any thread -------------------------------------------------------------------------------------
 
     @property
-    def pipeline(self) -> SlopePipeline:
-        """The pipeline that runs."""
-        return self._running.pipeline
+    def running(self) -> Prepared:
+        """What measures frames now."""
+        return self._running.prepared
 
     @property
     def settings(self) -> Settings:
         """The settings that run."""
-        return self._running.pipeline.settings
+        return self._running.prepared.settings
+
+    def let_go(self) -> None:
+        """Give back the memory of what was replaced, which takes time; by any thread but the engine's."""
+        self._replaced.clear()
 
     def propose(self, changes: Mapping[str, Any], where: Sequence[int] | None = None) -> Change:
-        """Check a change as a whole and build its pipeline, for the engine to take before its next frame.
+        """Check a change as a whole and prepare it, for the engine to take before its next frame.
 
         Parameters
         ----------
@@ -139,31 +164,47 @@ class LiveSettings:
                 f"settings: expected new values by name, such as search_range_px, got {changes!r:.40}"
             )
         check_names(list(changes))
-        with self._lock:
-            layout = self._newest.pipeline.layout
+        with self._proposing:
+            newest = self._newest.prepared
+            layout = newest.layout
             places = None if where is None else _checked_places(where, len(layout))
-            settings = self._newest.pipeline.settings.replace(where=places, **changes)
+            settings = newest.settings.replace(where=places, **changes)
             for name in settings.declared():  # also what the estimator does not use as it is set
                 settings.values(name, len(layout), layout.pixels)
             return self._offered(settings, copy.deepcopy(dict(changes)), places)
 
     def renew(self, changes: Mapping[str, Any]) -> Change:
-        """Make the pipeline anew with the same settings, because something else has changed, which is named.
+        """Prepare the same settings anew, because something else has changed, which is named.
 
         Raises
         ------
         InputError
-            When it cannot be made; then nothing changes.
+            When they cannot be prepared; then nothing changes.
         """
-        with self._lock:
-            return self._offered(self._newest.pipeline.settings, dict(changes), None)
+        with self._proposing:
+            return self._offered(self._newest.prepared.settings, dict(changes), None)
+
+    @property
+    def preparing(self) -> dict[str, Any] | None:
+        """What is being prepared, as plain values: new values by name, and for how many seconds."""
+        under_way = self._under_way
+        if under_way is None:
+            return None
+        changes, begin = under_way
+        return {"changes": copy.deepcopy(changes), "seconds": time.monotonic() - begin}
 
     def _offered(self, settings: Settings, changes: dict[str, Any], places: list[int] | None) -> Change:
-        """Make a pipeline and let the engine take it; by the thread that holds the lock."""
-        pipeline = self._make_pipeline(settings)
+        """Prepare settings and let the engine take them; by the one thread that proposes."""
+        self._under_way = changes, time.monotonic()
+        try:
+            prepared = self._prepare(settings)
+        finally:
+            self._under_way = None
         change = Change(self._newest.change.number + 1, changes, places)
-        self._record.append(change)
-        self._newest = _Version(pipeline, change)
+        with self._lock:
+            self._record.append(change)
+        self._newest = _Version(prepared, change)
+        self.let_go()
         return change
 
     def frame_of(self, change: Change) -> int | None:
@@ -209,7 +250,7 @@ class LiveSettings:
 
     @property
     def change_number(self) -> int:
-        """Number of the last change that is in the pipeline that runs; 0 before the first."""
+        """Number of the last change that is running; 0 before the first."""
         return self._running.change.number
 
     def waiting(self) -> int:
@@ -219,17 +260,18 @@ class LiveSettings:
     def get(self, names: Sequence[str] | None = None) -> dict[str, Any]:
         """Return values that run, by name (default: all), as plain numbers, texts and lists.
 
-        A setting that differs between sub-apertures is a list with one value for each; what is not set
-        is None.
+        Defaults are filled in. A setting that differs between sub-apertures is a list with one value for
+        each; None is what is not used, or not a number: found from the PSF or each frame's light, or without
+        a limit.
 
         Raises
         ------
         InputError
             For an unknown name.
         """
-        pipeline = self.pipeline
-        n, pixels = len(pipeline.layout), pipeline.layout.pixels
-        settings = pipeline.settings
+        running = self.running
+        n, pixels = len(running.layout), running.layout.pixels
+        settings = running.settings
         check_names(names)
         for name in names or ():
             if name != "estimator":
@@ -265,72 +307,6 @@ def check_shared_or_own(name: str, settings: Settings) -> None:
         check_option(name, type(settings.estimator))
 
 
-def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
-    """Return new values by name from texts such as "noise_std=2.5" and "keep_brightest=20".
-
-    Values are numbers, true, false, none, texts, or several of them between commas: one for each
-    sub-aperture.
-
-    Raises
-    ------
-    InputError
-        For a text that is not NAME=VALUE, an unknown or repeated name, an empty value.
-    """
-    changes: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if not equals:
-            raise InputError(f"{text!r}: expected NAME=VALUE, such as search_range_px=2.5")
-        check_names([name])
-        if name in changes:
-            raise InputError(f"{name}: expected one new value, got two")
-        items = [item.strip() for item in value.split(",")]
-        if "" in items:
-            raise InputError(f"{text!r}: expected a value after '=', or several between commas")
-        parsed = [_parsed_value(item) for item in items]
-        changes[name] = parsed[0] if len(parsed) == 1 else parsed
-    if not changes:
-        raise InputError("settings: expected at least one NAME=VALUE, such as search_range_px=2.5, got none")
-    return changes
-
-
-def parse_subapertures(text: str) -> list[int]:
-    """Return sub-apertures' numbers from a text such as "4,5,10-20"; both ends of a range belong to it.
-
-    In the order given, each once.
-
-    Raises
-    ------
-    InputError
-        For anything else.
-    """
-    numbers: dict[int, None] = {}
-    for part in text.split(","):
-        ends = [end.strip() for end in part.split("-")]
-        if len(ends) > 2 or not all(end.isascii() and end.isdecimal() and len(end) < 10 for end in ends):
-            raise InputError(
-                f"sub-apertures {text!r}: expected numbers and ranges such as 4,5,10-20, got {part.strip()!r}"
-            )
-        first, last = int(ends[0]), int(ends[-1])
-        if last < first:
-            raise InputError(f"sub-apertures {text!r}: expected a range upwards, got {part.strip()!r}")
-        if last >= _MOST_SUBAPERTURES:
-            raise InputError(f"sub-apertures {text!r}: expected numbers below {_MOST_SUBAPERTURES}")
-        numbers.update(dict.fromkeys(range(first, last + 1)))
-    return list(numbers)
-
-
-def _parsed_value(text: str) -> Any:
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
-    for number in (int, float):
-        try:
-            return number(text)
-        except ValueError:
-            continue
-    return text
-
-
 def _checked_places(where: Sequence[int], n: int) -> list[int]:
     """Sub-apertures' numbers as plain ints, all of them among the n that exist."""
     array = numbers_between("where", where, 0, integer=True)
@@ -342,9 +318,13 @@ def _checked_places(where: Sequence[int], n: int) -> list[int]:
 
 
 def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
-    """A setting as plain values."""
+    """A setting as plain values, with its default filled in."""
     value = settings.estimator.name if name == "estimator" else getattr(settings, name)
-    if not isinstance(value, PerSubaperture | np.ndarray):
+    if name == "steps" and isinstance(settings.estimator, Stepping):
+        return settings.estimator.step_count
+    differs = isinstance(value, PerSubaperture | np.ndarray)
+    if value is not None and not differs:
         return value
-    each = settings.values(name, n, pixels).tolist()
-    return [None if isinstance(item, float) and math.isnan(item) else item for item in each]
+    items = settings.values(name, n, pixels).tolist()
+    each = [None if isinstance(item, float) and math.isnan(item) else item for item in items]
+    return each if differs else each[0]

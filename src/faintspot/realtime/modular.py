@@ -19,9 +19,9 @@ from faintspot.kernels import gravity, groups
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.built_in import BuiltIn
 from faintspot.realtime.frame_path import check_real_time
-from faintspot.realtime.module_loading import STAGES, Module, StageFunction, one_line
+from faintspot.realtime.module_loading import STAGES, Module, StageFunction
 from faintspot.realtime.module_trial import trial_frames, typical_frame
-from faintspot.realtime.time_limit import call_within
+from faintspot.realtime.time_limit import call_within, one_line
 from faintspot.slopes import Slopes
 
 TRIAL_LIMIT_S = 60.0  # a module may compile
@@ -208,7 +208,7 @@ class ModularPipeline:
         try:
             with np.errstate(all="ignore"):
                 result = self._functions[stage](images)
-        except Exception as error:
+        except BaseException as error:  # also what would end the process
             raise InputError(f"{title}: {one_line(error)}") from None
         self.called_s, self.took_s[stage] = math.inf, time.perf_counter() - begin
         shape = (len(images), 2) if stage == "centroid" else (len(images), *self.pipeline.layout.window)
@@ -285,7 +285,7 @@ def _made(module: Module, pipeline: SlopePipeline) -> StageFunction:
     """The function of a module."""
     try:
         function = module.make(pipeline.layout, pipeline.settings)
-    except (Exception, SystemExit) as error:
+    except BaseException as error:  # also what would end the process
         raise InputError(f"{title_of(module)}: make: {one_line(error)}") from None
     if not callable(function):
         raise InputError(

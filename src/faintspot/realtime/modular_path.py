@@ -18,9 +18,8 @@ from faintspot.errors import InputError
 from faintspot.kernels import streaming
 from faintspot.realtime.frame_path import STOP_CELL, FramePath, Progress
 from faintspot.realtime.modular import TRIAL_LIMIT_S, ModularPipeline, title_of
-from faintspot.realtime.module_loading import one_line
 from faintspot.realtime.module_trial import typical_frame
-from faintspot.realtime.time_limit import call_is_under_way, end_thread
+from faintspot.realtime.time_limit import call_is_under_way, end_thread, one_line
 from faintspot.slopes import Slopes
 
 BUDGET_S = 1e-3
@@ -205,5 +204,5 @@ def _serve(
             replies.put(modular.finish(explain=explain))
         except InputError as error:
             replies.put(str(error))
-        except (Exception, SystemExit) as error:  # the latter also from `end_thread`
+        except BaseException as error:  # SystemExit also from `end_thread`
             replies.put(one_line(error))

@@ -18,6 +18,7 @@ import importlib
 import importlib.metadata
 import sys
 import types
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.realtime.time_limit import call_within
+from faintspot.realtime.time_limit import call_within, one_line
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 
@@ -81,11 +82,6 @@ def installed_modules() -> dict[str, str]:
     return {point.name: point.value for point in sorted(points, key=lambda each: each.name)}
 
 
-def one_line(error: BaseException) -> str:
-    """Return an error's name and text in one line of bounded length."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}".removesuffix(": ")
-
-
 def _from_file(path: Path) -> Module:
     try:
         text = path.read_bytes()
@@ -104,15 +100,29 @@ def _from_file(path: Path) -> Module:
     before = sys.modules.get(module.__name__)
     sys.modules[module.__name__] = module  # dataclasses and pickle look there
     try:
-        call_within(LOAD_LIMIT_S, f"module {path}", exec, code, module.__dict__)
-        return _checked(path.stem, module, str(path), digest)
-    except BaseException as error:
+        call_within(LOAD_LIMIT_S, f"module {path}", _execute, code, module, path)
+        loaded = _checked(path.stem, module, str(path), digest)
+    except BaseException:
         sys.modules.pop(module.__name__)
         if before is not None:
             sys.modules[module.__name__] = before
-        if isinstance(error, InputError | KeyboardInterrupt):
-            raise
+        raise
+    # What nobody uses any more is forgotten: an engine may load thousands of versions.
+    weakref.finalize(loaded, _forget, module).atexit = False
+    return loaded
+
+
+def _execute(code: types.CodeType, module: types.ModuleType, path: Path) -> None:
+    """Run a module's file; whatever it raises, also to end the process, is an error of the module."""
+    try:
+        exec(code, module.__dict__)
+    except BaseException as error:
         raise InputError(f"module {path}{_line_of(error, str(path))}: {one_line(error)}") from None
+
+
+def _forget(module: types.ModuleType) -> None:
+    if sys.modules.get(module.__name__) is module:
+        del sys.modules[module.__name__]
 
 
 def _from_entry_point(name: str) -> Module:
@@ -126,13 +136,16 @@ def _from_entry_point(name: str) -> Module:
         values = ", ".join(sorted(point.value for point in points))
         raise InputError(f"module {name!r}: expected one installed module of this name, got {values}")
     point = points[0]
-    try:
-        found = call_within(LOAD_LIMIT_S, f"module {name!r}", point.load)
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise InputError(f"module {name!r} ({point.value}): {one_line(error)}") from None
+    found = call_within(LOAD_LIMIT_S, f"module {name!r}", _imported, point)
     return _checked(name, found, point.value, _digest_of(point.module))
+
+
+def _imported(point: importlib.metadata.EntryPoint) -> Any:
+    """Import an installed module; whatever it raises, also to end the process, is an error of the module."""
+    try:
+        return point.load()
+    except BaseException as error:
+        raise InputError(f"module {point.name!r} ({point.value}): {one_line(error)}") from None
 
 
 def _digest_of(module: str) -> str:

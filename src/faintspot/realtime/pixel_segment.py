@@ -214,9 +214,9 @@ def _remove_dead(path: Path) -> None:
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror or error})") from None
     try:
+        header = _checked_header(path, descriptor)  # first: another user's could be locked for good
         # Of several that find it dead, one removes it; the others then see that the name leads elsewhere.
         fcntl.flock(descriptor, fcntl.LOCK_EX)
-        header = _checked_header(path, descriptor)
         if process_lives(header.pid, header.start):
             raise InputError(f"{path}: process {header.pid} writes into this pixel ring already")
         with suppress(FileNotFoundError):

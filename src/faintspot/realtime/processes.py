@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 
@@ -23,3 +25,9 @@ def process_start(pid: int) -> int:
 def process_lives(pid: int, start: int) -> bool:
     """Whether the process with that number and start is alive."""
     return start >= 0 and process_start(pid) == start
+
+
+def process_age_s(pid: int) -> float:
+    """Return how long ago a process started, s; -1 when there is none or it is dead."""
+    start = process_start(pid)
+    return -1.0 if start < 0 else time.clock_gettime(time.CLOCK_BOOTTIME) - start / os.sysconf("SC_CLK_TCK")

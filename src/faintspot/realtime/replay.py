@@ -81,14 +81,13 @@ class Replay(Readout):
         repeat: bool = False,
         rows_per_block: int | None = None,
     ) -> None:
-        expected = source.shape, ring_type(source.dtype)
-        if (ring.shape, ring.dtype) != expected:
-            raise InputError(f"ring: expected frames of {expected}, got {ring.shape} and {ring.dtype}")
         begin = int(number_between("first", first, 0, source.n_frames - 1, integer=True))
         left = source.n_frames - begin
         count = left if n_frames is None else int(number_between("n_frames", n_frames, 1, left, integer=True))
         super().__init__(
             ring,
+            source.shape,
+            ring_type(source.dtype),
             frame_rate_hz=frame_rate_hz,
             readout_fraction=0.0 if rows_per_block is None else 0.8,
             rows_per_block=ring.shape[0] if rows_per_block is None else rows_per_block,

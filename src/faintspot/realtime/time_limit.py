@@ -27,7 +27,8 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
     Raises
     ------
     InputError
-        When the time is over. What the function raises is raised here.
+        When the time is over, or the function raises what would end the process or the calling thread, such
+        as SystemExit. Other exceptions are raised here as they are.
     """
     replies: SimpleQueue[tuple[Result | None, BaseException | None]] = SimpleQueue()
 
@@ -44,9 +45,16 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
     except Empty:
         end_thread(thread)
         raise InputError(f"{what}: did not return within {limit_s:g} s") from None
-    if error is not None:
+    if isinstance(error, Exception):
         raise error
+    if error is not None:
+        raise InputError(f"{what}: {one_line(error)}")
     return result  # type: ignore[return-value]
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's name and text in one line of bounded length."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}".removesuffix(": ")
 
 
 def call_is_under_way() -> bool:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from faintspot.checks import one_of
 from faintspot.errors import InputError
 from faintspot.realtime.control import Handler
-from faintspot.realtime.module_loading import STAGES, Module, installed_modules, load_module
+from faintspot.realtime.module_loading import STAGES, Module, installed_modules
 
 
 class ModuleHost(Protocol):
@@ -19,6 +19,15 @@ class ModuleHost(Protocol):
 
     def module_fault(self) -> str | None:
         """Return why modules were taken out last, None where they never were."""
+
+    def admit(self, name_or_path: str) -> Module:
+        """Try a module where it can do no harm, and load it when it has passed.
+
+        Raises
+        ------
+        InputError
+            When it is refused.
+        """
 
     def load(self, module: Module) -> int | None:
         """Put a module in its stage, in place of what is there; return the first frame, None while it waits.
@@ -33,7 +42,7 @@ class ModuleHost(Protocol):
         """Put the built-in stage back; return the first frame, None while it waits."""
 
 
-def module_handlers(host: ModuleHost) -> dict[str, Handler]:
+def module_commands(host: ModuleHost) -> dict[str, Handler]:
     """Return the commands: load, swap (both {"source"}), unload ({"stage"}: a stage or a name), modules."""
 
     def load(fields: dict[str, Any]) -> Mapping[str, Any]:
@@ -43,7 +52,7 @@ def module_handlers(host: ModuleHost) -> dict[str, Handler]:
         return loaded(fields, replace=True)
 
     def loaded(fields: dict[str, Any], replace: bool) -> Mapping[str, Any]:
-        module = load_module(_text(fields, "source"))
+        module = host.admit(_text(fields, "source"))
         there = host.modules().get(module.stage)
         if there is not None and not replace:
             raise InputError(f"{module.stage}: module {there.name} is loaded there; swap takes its place")

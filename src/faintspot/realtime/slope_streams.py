@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.telemetry_rows import fill_telemetry_rows
+from faintspot.realtime.shared_streams import LOCK_LIMIT_S, create_stream, lock_file
 from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -37,13 +37,17 @@ class SlopeStreams:
     MissingExtraError
         Without pyshmem.
     InputError
-        When a living process publishes under that name.
+        When a living process publishes under that name, another user has taken it, or shared memory is short.
     """
 
     def __init__(self, name: str, n: int) -> None:
-        self._slopes = _created(f"{name}_slopes", (2 * n,))
-        self._details = _created(f"{name}_details", (len(DETAILS), n))
-        self._marks = _created(f"{name}_marks", (len(MARKS),), np.int64)
+        with ExitStack() as undo:
+            self._slopes = create_stream(f"{name}_slopes", (2 * n,))
+            undo.callback(self._slopes.unlink)
+            self._details = create_stream(f"{name}_details", (len(DETAILS), n))
+            undo.callback(self._details.unlink)
+            self._marks = create_stream(f"{name}_marks", (len(MARKS),), np.int64)
+            undo.pop_all()
         self._n = n
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
@@ -53,8 +57,19 @@ class SlopeStreams:
         """Keep the streams' locks, which only writers need, while publishing: readers do not wait for them.
 
         Taking a lock for every frame would take three times as long as publishing itself.
+
+        Raises
+        ------
+        InputError
+            When somebody else holds one.
         """
-        with self._slopes.locked(), self._details.locked(), self._marks.locked():
+        with ExitStack() as stack:
+            for stream in (self._slopes, self._details, self._marks):
+                try:
+                    stack.enter_context(stream.locked(timeout=LOCK_LIMIT_S))
+                except TimeoutError:
+                    held = lock_file(stream.name)
+                    raise InputError(f"{stream.name}: another process holds {held}; end it") from None
             yield
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
@@ -94,24 +109,3 @@ class SlopeStreams:
         """Remove all streams."""
         for stream in (self._slopes, self._details, self._marks):
             stream.unlink()
-
-
-def _created(name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> Any:
-    """Create a stream; one whose writer has died is replaced."""
-    try:
-        import pyshmem
-    except ImportError:
-        raise MissingExtraError("pyshmem", "realtime", "publishing slopes in shared memory") from None
-    # A living writer holds the stream's lock for good, which making one anew would wait for: so look first.
-    try:
-        old = pyshmem.open(name)
-    except FileNotFoundError:
-        return pyshmem.create(name, shape=shape, dtype=dtype)
-    alive = old.producer_alive()
-    old.close()
-    if alive:
-        raise InputError(
-            f"{name}: a living process publishes under this name; stop it or choose another --name"
-        )
-    pyshmem.unlink(name)
-    return pyshmem.create(name, shape=shape, dtype=dtype)

@@ -8,14 +8,14 @@ from typing import Any
 from faintspot.errors import InputError
 from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.modules import module_handlers
+from faintspot.realtime.module_commands import module_commands
 
 LENGTHY = ("set", "load", "swap", "unload")
 """Commands that make something anew, which may compile: other commands are answered meanwhile."""
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
-def handlers_of(engine: Engine) -> dict[str, Handler]:
+def commands_of(engine: Engine) -> dict[str, Handler]:
     """Return the commands: status, get, set, stop, and those for modules."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
@@ -40,4 +40,4 @@ def handlers_of(engine: Engine) -> dict[str, Handler]:
         return {}
 
     own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
-    return own | module_handlers(engine.modules)
+    return own | module_commands(engine.modules)

@@ -1,10 +1,9 @@
-"""What an engine does with the frames of one ring, in one state of the settings."""
+"""Settings made ready for their first frame: pipelines, modules, and the paths of frames through them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,8 @@ from faintspot.settings import Settings
 from faintspot.slopes import Slopes
 
 
-class Path(Protocol):
-    """The way of a frame: `FramePath`, or one with modules in it."""
+class MeasuringPath(Protocol):
+    """What measures frames: a `FramePath`, or one with modules in it."""
 
     slopes: Slopes
     fault: str | None
@@ -55,13 +54,15 @@ class Path(Protocol):
         ...
 
 
-class Programme:
-    """What is done to frames in one state of the settings: a pipeline for every arm, and their ways.
+class PreparedSettings:
+    """Settings with all that is made from them: for every arm a pipeline, and a path for a ring's frames.
 
     Parameters
     ----------
     pipelines : sequence of SlopePipeline
         One for every arm.
+    settings : Settings
+        Those that the arms' own changes are added to.
     modules : mapping of str to Module
         In place of built-in stages, by stage.
     workers : Workers, optional
@@ -77,41 +78,45 @@ class Programme:
     def __init__(
         self,
         pipelines: Sequence[SlopePipeline],
+        settings: Settings,
         modules: Mapping[str, Module],
         workers: Workers | None,
         budget_s: float,
     ) -> None:
+        self.settings, self.layout = settings, pipelines[0].layout
         self._pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
         self._modular = [
             ModularPipeline(pipeline, modules, budget_s=budget_s) if modules else None
             for pipeline in self._pipelines
         ]
         self._ring: PixelRing | None = None
-        self._paths: tuple[Path, ...] = ()
+        self._paths: tuple[MeasuringPath, ...] = ()
 
-    def paths(self, ring: PixelRing) -> tuple[Path, ...]:
-        """Return the ways of a ring's frames, one for every arm, complete and warm."""
+    def paths(self, ring: PixelRing) -> tuple[MeasuringPath, ...]:
+        """Return the paths of a ring's frames, one for every arm, complete and warm."""
         if ring is not self._ring:
             made = zip(self._pipelines, self._modular, strict=True)
             self._paths = tuple(self._new_path(pipeline, modular, ring) for pipeline, modular in made)
             self._ring = ring
         return self._paths
 
-    def _new_path(self, pipeline: SlopePipeline, modular: ModularPipeline | None, ring: PixelRing) -> Path:
+    def _new_path(
+        self, pipeline: SlopePipeline, modular: ModularPipeline | None, ring: PixelRing
+    ) -> MeasuringPath:
         cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
         columns = ring.cells.shape[1]
         # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
         progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
         built_in = FramePath(pipeline, pixels, progress, workers=self._workers)
-        path: Path = built_in
+        path: MeasuringPath = built_in
         if modular is not None:
             path = ModularPath(modular, pixels, progress, built_in, budget_s=self._budget_s)
         path.warm_up()
         return path
 
 
-class Programmes:
-    """Makes programmes beside the running system, and remembers those that may still be taken.
+class SettingsPreparer:
+    """Prepares settings beside the running system.
 
     Parameters
     ----------
@@ -130,39 +135,42 @@ class Programmes:
         workers: Workers | None,
         budget_s: float,
     ) -> None:
-        self._make_pipeline, self._interleaving = make_pipeline, interleaving
+        self.make_pipeline, self._interleaving = make_pipeline, interleaving
         self._workers, self._budget_s = workers, budget_s
-        self._made: WeakKeyDictionary[SlopePipeline, Programme] = WeakKeyDictionary()
         self.ring: PixelRing | None = None
         """Whose frames are being measured, if any."""
         self.modules: Mapping[str, Module] = {}
-        """That new programmes have in place of built-in stages, by stage."""
+        """In place of built-in stages in all that is prepared from now on, by stage."""
 
-    def make(self, settings: Settings) -> SlopePipeline:
-        """Make the pipeline of these settings, and a programme for it; where there is a ring, for its frames.
+    def prepare(self, settings: Settings) -> PreparedSettings:
+        """Prepare settings; where there is a ring, for its frames.
 
         Raises
         ------
         InputError
             When the settings do not fit, or what an arm makes of them, or a module is refused.
         """
-        pipeline = self._make_pipeline(settings)
-        pipelines = [
-            pipeline if (own := arm.of(settings)) is settings else self._make_pipeline(own)
-            for arm in self._interleaving.arms
-        ]
-        for each in pipelines:
-            check_real_time(each)
-        programme = Programme(pipelines, self.modules, self._workers, self._budget_s)
+        pipelines = [self.make_pipeline(each) for each in self.of_arms(settings)]
+        for pipeline in pipelines:
+            check_real_time(pipeline)
+        prepared = PreparedSettings(pipelines, settings, self.modules, self._workers, self._budget_s)
         ring = self.ring
         if ring is not None:
-            programme.paths(ring)
-        self._made[pipeline] = programme
-        return pipeline
+            prepared.paths(ring)
+        return prepared
 
-    def of(self, pipeline: SlopePipeline) -> Programme:
-        """Return what was made with a pipeline."""
-        return self._made[pipeline]
+    def of_arms(self, settings: Settings) -> list[Settings]:
+        """Return the settings of every arm."""
+        return [arm.of(settings) for arm in self._interleaving.arms]
+
+
+class _WritableMemory:
+    """An array's memory, said to be writable. Not a class for each array: classes need the collector."""
+
+    def __init__(self, array: NDArray[Any]) -> None:
+        self._array = array
+        interface = array.__array_interface__
+        self.__array_interface__ = {**interface, "data": (interface["data"][0], False)}
 
 
 def writable_view(array: NDArray[Any]) -> NDArray[Any]:
@@ -170,12 +178,4 @@ def writable_view(array: NDArray[Any]) -> NDArray[Any]:
 
     Nobody writes: it spares compiling every kernel once more for memory that is read-only.
     """
-
-    class _Memory:
-        __array_interface__ = {  # noqa: RUF012 (what NumPy looks for)
-            **array.__array_interface__,
-            "data": (array.__array_interface__["data"][0], False),
-        }
-        owner = array
-
-    return np.asarray(_Memory())
+    return np.asarray(_WritableMemory(array))

@@ -15,8 +15,8 @@ import faintspot as fs
 from faintspot.cli.realtime_modules import COMMANDS
 from faintspot.realtime.control import ControlServer
 from faintspot.realtime.modular import ModularPipeline
-from faintspot.realtime.module_loading import Module
-from faintspot.realtime.modules import module_handlers
+from faintspot.realtime.module_commands import module_commands
+from faintspot.realtime.module_loading import Module, load_module
 from faintspot.realtime.private_socket import socket_path
 
 
@@ -32,6 +32,9 @@ class Host:
 
     def module_fault(self) -> str | None:
         return self.fault
+
+    def admit(self, name_or_path: str) -> Module:
+        return load_module(name_or_path)
 
     def load(self, module: Module) -> int | None:
         wanted = {**self.loaded, module.stage: module}
@@ -53,7 +56,7 @@ def host() -> Host:
 def name(host: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     name = f"fs_test_{uuid4().hex[:12]}"
     monkeypatch.chdir(tmp_path)
-    with ControlServer(socket_path(name), module_handlers(host)):
+    with ControlServer(socket_path(name), module_commands(host)):
         yield name
 
 
@@ -113,4 +116,4 @@ def test_the_last_fault_is_shown(name: str, host: Host) -> None:
 @pytest.mark.parametrize("fields", [{}, {"source": 3}, {"source": ""}])
 def test_garbage(host: Host, fields: dict[str, object]) -> None:
     with pytest.raises(fs.InputError, match="source: expected a text"):
-        module_handlers(host)["load"](dict(fields))
+        module_commands(host)["load"](dict(fields))

@@ -1,0 +1,192 @@
+"""Making and opening streams of pyshmem so that nobody else can hold them up, or have files made elsewhere.
+
+pyshmem has one lock file for every stream, in $PYSHMEM_LOCK_DIR or a folder of the user's in the temporary
+directory, and waits for a lock for ever. All programs that share a stream must use the same folder, also
+those that know nothing of faintspot; so it stays where it is, but must belong to the user and let nobody
+else in.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import math
+import os
+import secrets
+import stat
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.realtime.pixel_segment import FOLDER
+from faintspot.realtime.processes import process_age_s
+
+LOCK_LIMIT_S = 1.0
+_LOOK_S = 0.01
+_CLOCKS_AGREE_S = 0.1
+_BESIDE_BYTES = 1 << 16  # of pyshmem's own, beside a stream's data
+_PARTS = ("", "_meta", "_gpu")
+
+
+def pyshmem_module(purpose: str) -> Any:
+    """Return pyshmem.
+
+    Raises
+    ------
+    MissingExtraError
+        Without it; `purpose` says what for.
+    """
+    try:
+        import pyshmem
+    except ImportError:
+        raise MissingExtraError("pyshmem", "realtime", purpose) from None
+    return pyshmem
+
+
+def lock_file(name: str) -> Path:
+    """Return the lock file of a stream, in a private folder that exists, which is made where there is none.
+
+    Raises
+    ------
+    InputError
+        When the folder is not the user's alone, or something else than a file is in the lock file's place.
+    """
+    folder = _private_lock_folder()
+    path = folder / f"{_base(name)}.lock"
+    if os.path.lexists(path) and not stat.S_ISREG(os.lstat(path).st_mode):
+        raise InputError(f"{path}: expected a lock file or nothing, got another kind of file; remove it")
+    return path
+
+
+def create_stream(name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Any:
+    """Create a stream; one that is damaged, or whose maker has died, is replaced.
+
+    Raises
+    ------
+    MissingExtraError
+        Without pyshmem.
+    InputError
+        When a living process publishes under that name, another user has taken it, the lock folder is not
+        private, or shared memory is short.
+    """
+    pyshmem = pyshmem_module("publishing slopes in shared memory")
+    try:
+        _check_free(name)
+        for path in _left_behind(pyshmem, name):
+            path.unlink()  # pyshmem does not remove what is damaged
+        _reserve(name, math.prod(shape) * np.dtype(dtype).itemsize + _BESIDE_BYTES)
+        return pyshmem.create(name, shape=shape, dtype=dtype)
+    except InputError:
+        raise
+    except (OSError, ValueError, RuntimeError) as error:
+        text = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise InputError(f"{name}: this stream cannot be made ({text})") from None
+
+
+def _base(name: str) -> str:
+    """What pyshmem calls a stream's files."""
+    return f"ps_{hashlib.sha1(name.encode(), usedforsecurity=False).hexdigest()[:14]}"
+
+
+def _private_lock_folder() -> Path:
+    """Where pyshmem keeps its locks, checked."""
+    chosen = os.environ.get("PYSHMEM_LOCK_DIR")
+    folder = Path(chosen or Path(tempfile.gettempdir()) / f"pyshmem-locks-{os.getuid()}")
+    advice = "set PYSHMEM_LOCK_DIR to one, the same for all programs that share streams"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: no folder for the locks of streams ({error.strerror}); {advice}"
+        ) from None
+    try:
+        status = os.fstat(descriptor)
+        if status.st_uid == os.geteuid() and status.st_mode & 0o077 and not chosen:
+            os.fchmod(descriptor, 0o700)  # pyshmem lets everybody in, who could then hold the locks
+            status = os.fstat(descriptor)
+        if status.st_uid != os.geteuid() or status.st_mode & 0o077:
+            raise InputError(
+                f"{folder}: expected a folder of your own that nobody else may enter (mode 0700); {advice}"
+            )
+    finally:
+        os.close(descriptor)
+    return folder
+
+
+def _check_free(name: str) -> None:
+    """Refuse a name whose lock is held, which a living publisher does, or that another user has taken."""
+    path = lock_file(name)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        if not _lock_within(descriptor, LOCK_LIMIT_S):
+            raise InputError(
+                f"{name}: a living process publishes under this name (it holds {path}); stop it or choose "
+                "another --name"
+            )
+    finally:
+        os.close(descriptor)
+    for part in _PARTS:
+        segment = FOLDER / f"{_base(name)}{part}"
+        if os.path.lexists(segment) and os.lstat(segment).st_uid != os.geteuid():
+            raise InputError(
+                f"{name}: {segment} belongs to another user; have it removed or choose another --name"
+            )
+
+
+def _lock_within(descriptor: int, limit_s: float) -> bool:
+    """Lock an open file for this descriptor alone; return whether that went within the time."""
+    end = time.monotonic() + limit_s
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                return False
+        time.sleep(_LOOK_S)
+
+
+def _left_behind(pyshmem: Any, name: str) -> list[Path]:
+    """The files of a stream of that name that is nobody's; InputError when its maker lives."""
+    parts = [path for part in _PARTS if os.path.lexists(path := FOLDER / f"{_base(name)}{part}")]
+    if not parts:
+        return []
+    made = min(os.lstat(path).st_mtime for path in parts)
+    try:
+        stream = pyshmem.open(name)
+    except (OSError, ValueError):  # damaged, or never finished
+        return parts
+    pid = stream.creator_pid
+    stream.close()
+    # A process that is younger than the stream has only got its maker's number, as after a container's
+    # restart.
+    if process_age_s(pid) >= time.time() - made - _CLOCKS_AGREE_S:
+        raise InputError(
+            f"{name}: a living process publishes under this name (pid {pid}); stop it or choose another "
+            "--name"
+        )
+    return parts
+
+
+def _reserve(name: str, size: int) -> None:
+    """Refuse what there is no room for: writing into shared memory that is full kills the process."""
+    path = FOLDER / f".{_base(name)}.{secrets.token_hex(8)}"
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        os.unlink(path)
+        os.posix_fallocate(descriptor, 0, size)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise InputError(
+            f"{name}: this stream cannot be made: {size} bytes, more than is left in {FOLDER}"
+        ) from None
+    finally:
+        os.close(descriptor)
