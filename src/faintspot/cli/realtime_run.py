@@ -84,7 +84,7 @@ def run(
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.interleaving import Interleaving
     from faintspot.realtime.scheduling import real_time
-    from faintspot.realtime.written_changes import parse_subapertures
+    from faintspot.written_changes import parse_subapertures
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     processors = parse_subapertures(cpus) if cpus else None

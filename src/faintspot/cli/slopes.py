@@ -11,6 +11,7 @@ from faintspot.cli.progress import progress_bar
 from faintspot.flags import SubapertureFlag
 from faintspot.presets import PRESETS
 from faintspot.recorded import Summary, measure_recorded
+from faintspot.written_changes import parse_changes
 
 
 @click.command(short_help="Turn recorded frames into slopes.")
@@ -30,6 +31,12 @@ from faintspot.recorded import Summary, measure_recorded
     default="slopes.zarr",
     show_default=True,
     help="What to write, by its ending: .zarr, .fits, .fits.gz, .npz or .csv.",
+)
+@click.option(
+    "--estimator", metavar="NAME", help="Instead of that in the configuration; see faintspot estimators."
+)
+@click.option(
+    "--set", "changes", metavar="NAME=VALUE", multiple=True, help="An option of the estimator; several times."
 )
 @click.option("--no-denoise", is_flag=True, help="Switch the denoising off: the other arm of a comparison.")
 @click.option(
@@ -53,6 +60,8 @@ def command(
     frames: tuple[str, ...],
     config: str,
     output: str,
+    estimator: str | None,
+    changes: tuple[str, ...],
     no_denoise: bool,
     preset: str | None,
     device: str,
@@ -76,6 +85,7 @@ def command(
       faintspot slopes night1.fits night2.fits.gz -c faintspot.toml -o slopes.zarr
       faintspot slopes night1.fits -o plain.zarr --no-denoise
       faintspot slopes night1.fits -o slopes.zarr --preset fast
+      faintspot slopes night1.fits -o ml.zarr --estimator ml --set model_error=0.1
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
     with progress_bar("slopes") as advance:
@@ -83,6 +93,10 @@ def command(
             frames,
             config,
             output,
+            changes={
+                **({} if estimator is None else {"estimator": estimator}),
+                **(parse_changes(changes) if changes else {}),
+            },
             denoise=not no_denoise,
             preset=preset,
             device=device,

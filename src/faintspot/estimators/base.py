@@ -18,7 +18,7 @@ from faintspot.errors import InputError
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels.groups import COMMON_ROWS, STAGE_ROWS
-from faintspot.options import Options
+from faintspot.options import Options, is_auto
 
 Floats = NDArray[np.float64]
 
@@ -165,7 +165,7 @@ class Estimator(Options):
     def _span(self, name: str, n_subapertures: int, pixels: int) -> str:
         """Return the values of an option: one, or from which to which."""
         if isinstance(getattr(self, name), str):
-            return str(getattr(self, name))
+            return "automatic" if is_auto(getattr(self, name)) else str(getattr(self, name))
         values = self.values(name, n_subapertures, pixels)
         if values.dtype.kind not in "iuf":
             return ", ".join(dict.fromkeys(str(value) for value in values))

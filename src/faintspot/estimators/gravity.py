@@ -90,7 +90,8 @@ class KeepingBrightest(Gravity):
     def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
         """Say what is done after the denoising."""
         kept, rule = (self._span(name, n_subapertures, pixels) for name in ("keep_brightest", "rule"))
-        return f"{kept} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
+        number = "an automatic number of" if is_auto(self.keep_brightest) else kept
+        return f"{number} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Numbers of kept pixels around the automatic one; speckles spread the light over more."""

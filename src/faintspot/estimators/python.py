@@ -55,6 +55,23 @@ class PythonPrepared(Prepared):
         """See `Prepared`."""
         keep_all(table)
 
+    def positions(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the positions (n, 2) of the spots of one frame, px from the windows' middles."""
+        found = self._found(images, self.sensor.zero)
+        return np.stack([found.x, found.y], axis=1).astype(np.float32)
+
+    def _found(self, images: NDArray[np.float32], prior: NDArray[np.floating[Any]]) -> Positions:
+        """Return what the estimator finds, checked."""
+        found = self.estimator.locate(images, self.sensor, prior.astype(np.float64))
+        if isinstance(found, Positions):
+            return found
+        array, n = np.asarray(found), self.sensor.n
+        if array.shape != (n, 2):
+            raise InputError(
+                f"estimator {self.estimator.name!r}: locate: expected ({n}, 2), got {array.shape}"
+            )
+        return Positions(array[:, 0], array[:, 1])
+
     def locate_frame(
         self,
         images: NDArray[np.float32],
@@ -82,14 +99,7 @@ class PythonPrepared(Prepared):
             When the estimator returns something of another shape.
         """
         sensor, n = self.sensor, self.sensor.n
-        found = self.estimator.locate(images, sensor, (sensor.zero + prior.T).astype(np.float64))
-        if not isinstance(found, Positions):
-            array = np.asarray(found)
-            if array.shape != (n, 2):
-                raise InputError(
-                    f"estimator {self.estimator.name!r}: locate: expected ({n}, 2), got {array.shape}"
-                )
-            found = Positions(array[:, 0], array[:, 1])
+        found = self._found(images, sensor.zero + prior.T)
         light = images.sum(axis=(1, 2)) if found.flux is None else found.flux
         usable = np.isfinite(found.x) & np.isfinite(found.y) & np.isfinite(light)
         usable &= np.ones(n, bool) if found.valid is None else np.asarray(found.valid, bool)

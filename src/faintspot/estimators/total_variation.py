@@ -101,8 +101,9 @@ class TotalVariation(KeepingBrightest):
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
-        where, strength = "", self._span("noise_std", n_subapertures, pixels)
+        where, unit, strength = "", "", self._span("noise_std", n_subapertures, pixels)
         if not is_auto(self.noise_std):
+            unit = " e-"
             denoised = int(np.count_nonzero(self.values("noise_std", n_subapertures, pixels)))
             if denoised < n_subapertures:
                 where = f" in {denoised} of {n_subapertures} sub-apertures"
@@ -110,7 +111,7 @@ class TotalVariation(KeepingBrightest):
             self._span(name, n_subapertures, pixels) for name in ("tolerance", "max_iterations")
         )
         return (
-            f"total-variation denoising{where} of strength {strength} e- ({self.algorithm}, tolerance "
+            f"total-variation denoising{where} of strength {strength}{unit} ({self.algorithm}, tolerance "
             f"{tolerance}, at most {limit} iterations); {self.kept_in_words(n_subapertures, pixels)}"
         )
 

@@ -9,8 +9,8 @@ from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.estimators.registry import estimators
 from faintspot.realtime.live import check_names
-from faintspot.realtime.written_changes import parse_changes
 from faintspot.settings import Settings, without_denoising
+from faintspot.written_changes import parse_changes
 
 _SET, _NONE = "set", "none"
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.estimators.python import PythonPrepared
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.frame_path import FramePath, Progress, check_real_time
 from faintspot.realtime.interleaving import Interleaving
@@ -17,6 +18,7 @@ from faintspot.realtime.module_loading import Module
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import ARRIVALS, ROWS
 from faintspot.realtime.workers import Workers
+from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.slopes import Slopes
 
@@ -85,9 +87,10 @@ class PreparedSettings:
     ) -> None:
         self.settings, self.layout = settings, pipelines[0].layout
         self._pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
+        own = [stages_of(pipeline, modules) for pipeline in self._pipelines]
         self._modular = [
-            ModularPipeline(pipeline, modules, budget_s=budget_s) if modules else None
-            for pipeline in self._pipelines
+            ModularPipeline(pipeline, stages, budget_s=budget_s) if stages else None
+            for pipeline, stages in zip(self._pipelines, own, strict=True)
         ]
         self._ring: PixelRing | None = None
         self._paths: tuple[MeasuringPath, ...] = ()
@@ -113,6 +116,19 @@ class PreparedSettings:
             path = ModularPath(modular, pixels, progress, built_in, budget_s=self._budget_s)
         path.warm_up()
         return path
+
+
+def stages_of(pipeline: SlopePipeline, modules: Mapping[str, Module]) -> Mapping[str, Module]:
+    """Return the modules, and what an estimator in NumPy does in the place of the compiled centroid."""
+    prepared = pipeline.preparation.prepared
+    if not isinstance(prepared, PythonPrepared) or "centroid" in modules:
+        return modules
+
+    def make(layout: Layout, settings: Settings) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+        return prepared.positions
+
+    name = prepared.estimator.name
+    return {**modules, "centroid": Module(name, "centroid", make, type(prepared.estimator).__module__, "")}
 
 
 class SettingsPreparer:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,7 @@ def measure_recorded(
     *,
     denoise: bool = True,
     preset: str | None = None,
+    changes: Mapping[str, Any] | None = None,
     device: str = "cpu",
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
@@ -83,6 +84,8 @@ def measure_recorded(
         .zarr, .fits, .npz or .csv.
     denoise : bool
         False switches the denoising off for all sub-apertures.
+    changes : mapping, optional
+        New values of settings by name, instead of those in the configuration; "estimator" is one.
     preset : str, optional
         "accurate" or "fast", instead of that in the configuration.
     device : str
@@ -107,6 +110,8 @@ def measure_recorded(
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
     layout, settings, calibration, psf, score = configuration.load_all(configuration_file)
+    if changes:
+        settings = settings.replace(**changes)
     if not denoise:
         settings = without_denoising(settings, "denoise = False")
     if preset is not None:

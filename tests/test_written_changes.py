@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from faintspot.errors import InputError
-from faintspot.realtime.written_changes import parse_changes, parse_subapertures
+from faintspot.written_changes import parse_changes, parse_subapertures
 
 
 def test_parsing_changes() -> None:
@@ -65,6 +65,6 @@ def test_any_text_is_parsed_or_refused_in_one_line(text: str) -> None:
 
 
 def test_commands_that_only_ask_import_nothing_that_takes_time() -> None:
-    code = "import faintspot.cli.realtime, faintspot.realtime.written_changes, sys; print(*sys.modules)"
+    code = "import faintspot.cli.realtime, faintspot.written_changes, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numba", "scipy", "faintspot.pipeline"} & set(done.stdout.split())
