@@ -212,9 +212,9 @@ def test_get_is_plain_and_complete(live: LiveSettings) -> None:
     values = json.loads(json.dumps(live.get(), allow_nan=False))
     assert values["noise_std"] == 0.5
     assert values["spot_fwhm_px"] == [2.0, None, None, None, None, None]
-    assert values["estimator"] == "cog"
-    assert set(live.get(["rule", "steps"])) == {"rule", "steps"}
-    for bad in (["rules"], "rule", 3, [1]):
+    assert values["estimator"] == "tv"
+    assert set(live.get(["rule", "flux_e"])) == {"rule", "flux_e"}
+    for bad in (["rules"], "rule", 3, [1], ["steps"]):  # steps: of other estimators
         with pytest.raises(InputError):
             live.get(bad)  # type: ignore[arg-type]
 
