@@ -2,8 +2,8 @@
 
 Denoising (20 iterations), finding the threshold of the brightest pixels, subtracting it and the centre of
 gravity are timed one by one, by the kernels that the pipeline is made of, on one group of W sub-apertures
-in loops compiled here. "gather, calibrate, store" is the difference of the pipeline with denoising switched
-off and the last three (it includes normalising the images, so that the sum is a little above the whole).
+in loops compiled here. "gather, calibrate, store" is the difference of the pipeline that does not
+denoise and the last three (it includes normalising the images, so that the sum is a little above the whole).
 All in turns, on one processor, the best of all turns. The second table is the pipeline alone, with threads.
 """
 
@@ -18,8 +18,10 @@ from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinne
 from benchmarks.rivals import ITERATIONS, KEEP, NOISE_STD, Problem, problem
 from faintspot.kernels import brightest, total_variation
 from faintspot.kernels.flat_start import NO_TABLE
+from faintspot.kernels.gravity import gravity_scratch
+from faintspot.kernels.groups import new_scratch
 from faintspot.kernels.host import lanes_for
-from faintspot.kernels.parallel import available_cpus, new_scratch
+from faintspot.kernels.parallel import available_cpus
 
 SIDES = (8, 10, 16, 32)
 WIDTHS = (16, 8, 4)
@@ -35,9 +37,21 @@ _denoise_group = total_variation.denoise_group
 
 @njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
 def _denoise(count: Any, lanes: Any, table: Any, ny: Any, nx: Any, scratch: Any) -> None:
-    image, output, state, rows, numbers, counts, _ = scratch
+    own = scratch.own
     for _ in range(count):
-        _denoise_group(lanes, total_variation.FGP, table, ny, nx, image, output, state, rows, numbers, counts)
+        _denoise_group(
+            lanes,
+            total_variation.FGP,
+            table,
+            ny,
+            nx,
+            scratch.image,
+            scratch.spare,
+            own.state,
+            own.rows,
+            own.denoiser,
+            own.counts,
+        )
 
 
 @njit(nogil=True, error_model="numpy")  # type: ignore[untyped-decorator, unused-ignore]
@@ -61,17 +75,17 @@ def _centroid(count: Any, lanes: Any, ny: Any, nx: Any, image: Any, numbers: Any
 def _stages(case: Problem, side: int, width: int) -> dict[str, Candidate]:
     """Return a run of every stage, _REPEATS times on the first W sub-apertures."""
     lanes, pixels = lanes_for(np.float32, width), side * side
-    scratch = new_scratch(lanes, side, side)
-    image, output, _, _, numbers, counts, _ = scratch
-    image.reshape(pixels, width)[:] = case.images[:width].reshape(width, pixels).T
-    rows = numbers.reshape(-1, width)
+    own = gravity_scratch(lanes, side, side)
+    scratch = new_scratch(lanes, side, side, own)
+    scratch.image.reshape(-1, width)[:pixels] = case.images[:width].reshape(width, pixels).T
+    rows = own.denoiser.reshape(-1, width)
     rows[total_variation.STRENGTH], rows[total_variation.TOLERANCE] = NOISE_STD, 0.0
-    counts.reshape(-1, width)[total_variation.LIMIT] = ITERATIONS
-    rows = rows[total_variation.LANE_ROWS :]
+    own.counts.reshape(-1, width)[total_variation.LIMIT] = ITERATIONS
+    centroid = own.centroid
+    rows = centroid.reshape(-1, width)
     rows[brightest.RANK], rows[brightest.SUBTRACT] = KEEP + 1, 1.0
-    centroid = rows.reshape(-1)
     _denoise(1, lanes, NO_TABLE, side, side, scratch)
-    denoised, left = output.copy(), output.copy()
+    denoised, left = scratch.spare.copy(), scratch.spare.copy()
     _threshold(1, lanes, pixels, denoised, centroid)
     return {
         "denoise": lambda: _denoise(_REPEATS, lanes, NO_TABLE, side, side, scratch),
@@ -83,7 +97,7 @@ def _stages(case: Problem, side: int, width: int) -> dict[str, Candidate]:
 
 def _stage_row(side: int, width: int) -> Row:
     n = _GROUPS * width
-    case, undenoised = problem(n, side, width=width), problem(n, side, width=width, denoise=False)
+    case, undenoised = problem(n, side, width=width), problem(n, side, width=width, estimator="brightest")
     stages = _stages(case, side, width)
     pipelines: dict[str, Candidate] = {"whole": case.slopes, "undenoised": undenoised.slopes}
     times = interleaved(stages | pipelines, seconds=1.0, fewest=10)

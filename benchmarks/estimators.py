@@ -15,9 +15,9 @@ import numpy as np
 
 import faintspot as fs
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio, spread
-from faintspot.kernels import fused
+from faintspot.estimators import estimator_named
+from faintspot.kernels.groups import Source, light_of_groups, new_scratch
 from faintspot.kernels.host import lanes_for
-from faintspot.kernels.parallel import new_scratch
 from faintspot.preparation import packed_calibration
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E, READ_NOISE_E = 20, 12, 0.45, 200.0, 0.1
@@ -39,14 +39,17 @@ def _pipelines(layout: fs.Layout) -> dict[str, fs.SlopePipeline]:
     rotated = fs.PSF.analytic(elongation=2.0, angle_deg=30.0)
 
     def pipeline(estimator: str, spot: fs.PSF = psf, **settings: Any) -> fs.SlopePipeline:
-        chosen = fs.Settings(estimator=estimator, keep_brightest=KEEP, **settings)
+        if "keep_brightest" in estimator_named(estimator).declared():
+            settings["keep_brightest"] = KEEP
+        chosen = fs.Settings(estimator, **settings)
         return fs.SlopePipeline(layout, chosen, calibration, psf=spot, score=score, threads=1)
 
     near: dict[str, Any] = {"search_range_px": 1.0}
     tv: dict[str, Any] = {"noise_std": NOISE_STD, "tolerance": 0.0, "max_iterations": ITERATIONS}
     return {
-        "tv": pipeline("cog", **tv),
-        "cog": pipeline("cog", denoise=False),
+        "tv": pipeline("tv", **tv),
+        "brightest": pipeline("brightest"),
+        "centroid": pipeline("centroid"),
         "thresholded": pipeline("thresholded", threshold_e=0.5),
         "smoothed": pipeline("smoothed", smoothing_px=0.7),
         "weighted": pipeline("weighted", **near),
@@ -66,12 +69,11 @@ def _gather(layout: fs.Layout, frame: Any) -> Candidate:
     n, (ny, nx) = len(layout), layout.window
     calibration = packed_calibration(layout, fs.Calibration(), lanes.width)
     scratch, light = new_scratch(lanes, ny, nx), np.empty((1, n), np.float32)
-    groups, frames = -(-n // lanes.width), frame[None]
+    groups = -(-n // lanes.width)
+    source = Source(lanes, frame[None], layout.corners, ny, nx, calibration, np.inf)
 
     def run() -> None:
-        fused.light_of_groups(
-            lanes, frames, layout.corners, ny, nx, calibration, np.inf, 0, groups, scratch, light
-        )
+        light_of_groups(source, 0, groups, scratch, light)
 
     return run
 
@@ -79,7 +81,7 @@ def _gather(layout: fs.Layout, frame: Any) -> Candidate:
 def own_cost(times: Times, name: str) -> float:
     """Return what an estimator adds to gathering, over what 20 iterations add to the pipeline without."""
     added = best(times, name) - best(times, "gather")
-    return added / (best(times, "tv") - best(times, "cog"))
+    return added / (best(times, "tv") - best(times, "brightest"))
 
 
 def _row(name: str, n: int, times: Times) -> Row:

@@ -25,7 +25,7 @@ from faintspot.loop.telescope import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0
 FRAMES = 400
-PLAIN = fs.Settings(denoise=False, keep_brightest=80)
+PLAIN = fs.Settings("brightest", keep_brightest=80)
 TV = fs.Settings(noise_std=0.3, keep_brightest=80)
 
 Wavefront = NDArray[np.float32]

@@ -28,8 +28,8 @@ WAYS: dict[str, tuple[int, dict[str, Any]]] = {
     "TV, preset fast, 8 x 8": (8, fast()),
     "TV, 20 iterations, 16 x 16": (16, {}),
     "smoothed, 16 x 16": (16, {"estimator": "smoothed"}),
-    "brightest pixels, 16 x 16": (16, {"denoise": False}),
-    "brightest pixels, 8 x 8": (8, {"denoise": False}),
+    "brightest pixels, 16 x 16": (16, {"estimator": "brightest"}),
+    "brightest pixels, 8 x 8": (8, {"estimator": "brightest"}),
 }
 
 

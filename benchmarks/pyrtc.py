@@ -60,11 +60,10 @@ SAME_POSITION_PX = 1e-4
 """Same algorithm: only float32 rounding may differ."""
 ARMS: dict[str, tuple[dict[str, Any], float | None]] = {
     "plain": ({"estimator": "thresholded", "threshold_e": 0.0}, 1.0),
-    "12 brightest": ({"estimator": "cog", "denoise": False, "keep_brightest": 12}, None),
+    "12 brightest": ({"estimator": "brightest", "keep_brightest": 12}, None),
     "TV, 10 iterations": (
         {
-            "estimator": "cog",
-            "denoise": True,
+            "estimator": "tv",
             "noise_std": 2.0,
             "tolerance": 0.0,
             "max_iterations": 10,

@@ -32,6 +32,7 @@ import faintspot as fs
 from benchmarks import rival_others, sweeps
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from benchmarks.rival_numpy import NumpyRival, locate
+from faintspot.estimators import estimator_named
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E = 20, 12, 0.45, 200.0
 NUMPY_BLOCKS = (64, 128, 256, 512)
@@ -87,7 +88,13 @@ def layout_of(n: int, pixels: int = 16) -> fs.Layout:
 
 
 def problem(
-    n: int, pixels: int = 16, *, threads: int = 1, width: int | None = None, **settings: Any
+    n: int,
+    pixels: int = 16,
+    *,
+    threads: int = 1,
+    width: int | None = None,
+    estimator: str = "tv",
+    **settings: Any,
 ) -> Problem:
     """Simulate faint spots and put them into a frame."""
     layout = layout_of(n, pixels)
@@ -96,10 +103,15 @@ def problem(
     frame = np.zeros(layout.frame_shape, np.float32)
     for (row, column), image in zip(layout.corners, images, strict=True):
         frame[row : row + pixels, column : column + pixels] = image
-    chosen = {"tolerance": 0.0, "max_iterations": ITERATIONS, "keep_brightest": KEEP} | settings
-    pipeline = fs.SlopePipeline(
-        layout, fs.Settings(noise_std=NOISE_STD, **chosen), threads=threads, width=width
-    )
+    kind = estimator_named(estimator)
+    usual = {
+        "noise_std": NOISE_STD,
+        "tolerance": 0.0,
+        "max_iterations": ITERATIONS,
+        "keep_brightest": KEEP,
+    } | settings
+    chosen = kind(**{name: value for name, value in usual.items() if name in kind.declared()})
+    pipeline = fs.SlopePipeline(layout, chosen, threads=threads, width=width)
     return Problem(layout, frame, np.ascontiguousarray(images), pipeline)
 
 

@@ -1,7 +1,7 @@
 """How many steps the estimators that know the spot need: R against that of many more steps.
 
 "weighted" moves its weight; "matched" and "ml" make Fisher-scoring steps from the smoothed image's peak,
-"map" from the posterior's mean. Nothing iterates in "cog" without denoising, "thresholded" and "smoothed" (a
+"map" from the posterior's mean. Nothing iterates in "brightest", "centroid", "thresholded" and "smoothed" (a
 single convolution, whose taps are cut where the Gaussian has ended); the passes of "trained" are trained one
 after the other, so that their number is part of the score.
 """

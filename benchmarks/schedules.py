@@ -46,6 +46,7 @@ from benchmarks.schedule_cases import (
 )
 from benchmarks.schedule_steps import tables_of_steps
 from faintspot.estimators import measure
+from faintspot.estimators.gravity import FLUX_FLOOR
 from faintspot.kernels import scoring
 
 REALISATIONS, QUICK_REALISATIONS = 4000, 500
@@ -132,7 +133,7 @@ def kept_pixels(case: Case, noise_std: float, images: Images, truth: Floats) -> 
         denoised,
         case.cell.pixels,
         scoring.SUBTRACT_NEXT,
-        fs.Settings.flux_floor,
+        FLUX_FLOOR,
         np.inf,
         truth,
         0,

@@ -15,8 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from faintspot.kernels import sweeps as kernel
+from faintspot.kernels.gravity import gravity_scratch
 from faintspot.kernels.host import lanes_for
-from faintspot.kernels.parallel import new_scratch
 from faintspot.kernels.simd import splat, store
 
 SIDE = 16
@@ -46,7 +46,8 @@ class Group:
     def __init__(self, width: int, side: int = SIDE) -> None:
         self.width, self.side = width, side
         self.lanes = lanes_for(np.float32, width)
-        _, _, self.state, self.rows, _, _, _ = new_scratch(self.lanes, side, side)
+        scratch = gravity_scratch(self.lanes, side, side)
+        self.state, self.rows = scratch.state, scratch.rows
         pixels = self.state.reshape(side * side, kernel.STATE_VECTORS, width)
         generator = np.random.default_rng(1)
         pixels[:, kernel.IMAGE] = generator.standard_normal((side * side, width), np.float32)

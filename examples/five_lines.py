@@ -24,7 +24,7 @@ frames, truth = fs.simulate.sensor_frames(
 # Frames in, slopes out.
 pipeline = fs.SlopePipeline(layout, fs.Settings(noise_std=3.0, keep_brightest=9))
 slopes = pipeline(frames)
-plain = fs.SlopePipeline(layout, fs.Settings(denoise=False, keep_brightest=7))(frames)
+plain = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=7))(frames)
 for name, result in (("TV", slopes), ("no TV", plain)):
     error = np.abs(np.stack([result.x, result.y], axis=-1) - truth).mean()
     print(f"{name}: slope error R = {error:.4f} px")

@@ -104,7 +104,7 @@ ARMS = {
         hcipy.ShackHartmannWavefrontSensorEstimator(sensor.mla_grid, sensor.mla_index, lit)
     ],
     "HCIPy, thresholded": [Thresholded(level) for level in (1.0, 2.0, 3.0)],
-    "faintspot, brightest pixels": [ours(denoise=False, keep_brightest=k) for k in (20, 40)],
+    "faintspot, brightest pixels": [ours(estimator="brightest", keep_brightest=k) for k in (20, 40)],
     "faintspot, smoothed": [ours(estimator="smoothed", keep_brightest=k) for k in (20, 40)],
     "faintspot, TV": [ours(noise_std=s, keep_brightest=k) for s in (0.3, 0.6, 0.9) for k in (20, 40)],
 }

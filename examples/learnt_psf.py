@@ -104,7 +104,7 @@ def compare(
     ratios: list[float] = []  # actual over stated standard error, of errors below 1 px
 
     def error(settings: fs.Settings, arm: Any = None) -> float:
-        at_full_light = ml if settings.estimator == "map" else settings
+        at_full_light = ml if settings.estimator.takes_prior else settings
         truth = bench.truth(1, place(positions(full, at_full_light, BRIGHT_READ_NOISE_E, arm, 1 / share)))
         slopes = positions(thin[1], settings, read_noise, arm)
         found = place(slopes) - truth
@@ -116,12 +116,14 @@ def compare(
 
     analytic = fs.PSF.analytic("diffraction"), one[1] * share
     learnt = [learnt_from(thin[0][: 4 * bench.n], read_noise), learnt_from(thin[0], read_noise)]
-    errors = [
-        min(error(fs.Settings(denoise=False, keep_brightest=k, search_range_px=SEARCH_PX)) for k in KEPT)
-    ]
-    for name in ("cog", "smoothed", "weighted"):  # with the learnt PSF's width, settings found by themselves
-        automatic = {"noise_std": "auto", "keep_brightest": "auto", "flux_e": flux}
-        errors.append(error(ml.replace(estimator=name, **automatic), learnt[1]))
+    errors = [min(error(fs.Settings("brightest", keep_brightest=k, search_range_px=SEARCH_PX)) for k in KEPT)]
+    found_by_themselves: dict[str, dict[str, Any]] = {
+        "tv": {"noise_std": "auto", "keep_brightest": "auto"},
+        "smoothed": {"keep_brightest": "auto"},
+        "weighted": {},
+    }
+    for name, automatic in found_by_themselves.items():  # with the learnt PSF's width
+        errors.append(error(ml.replace(estimator=name, flux_e=flux, **automatic), learnt[1]))
     errors += [error(ml, arm) for arm in (analytic, *learnt, (bright[0], bright[1] * share))]
     errors += [error(ml.replace(estimator="map", prior_std_px=PRIOR_PX, flux_e=flux), learnt[1])]
     background = float(one[1][0])

@@ -47,7 +47,7 @@ def errors(
     layout: fs.Layout, settings: fs.Settings, frames: list[NDArray[Any]], bright: list[NDArray[Any]]
 ) -> Any:
     """Errors of all slopes of the frames of every shift, against the bright frame of the same shift."""
-    plain = fs.SlopePipeline(layout, settings.replace(denoise=False))
+    plain = fs.SlopePipeline(layout, settings.replace(estimator="brightest"))
     pipeline = fs.SlopePipeline(layout, settings)
     parts = []
     for stack, mean in zip(frames, bright, strict=True):
@@ -97,7 +97,7 @@ def main() -> None:
             ]
             strength = float(suggested_strength(read_noise, flux, layout.pixels))
             for mode, kept in (("best k", KEPT), (f"fixed k={FIXED}", (FIXED,))):
-                plain = [fs.Settings(denoise=False, keep_brightest=k) for k in kept]
+                plain = [fs.Settings("brightest", keep_brightest=k) for k in kept]
                 tv = [
                     fs.Settings(noise_std=strength * f, keep_brightest=k)
                     for f in STRENGTH_FACTORS

@@ -46,7 +46,7 @@ class Case:
         """The same for some of the images."""
         per_image = {
             name: value[places]
-            for name, value in vars(self.settings).items()
+            for name, value in self.settings.chosen().items()
             if isinstance(value, np.ndarray)
         }
         psf, score = self.psf, self.score
@@ -103,15 +103,28 @@ def random_score(rng: np.random.Generator, n: int) -> TrainedScore:
     )
 
 
+def settings_of(estimator: str, **options: Any) -> fs.Settings:
+    """Settings with those of the options that the estimator has."""
+    return with_options(
+        fs.Settings(estimator, **({"noise_std": 0.0} if estimator == "tv" else {})), **options
+    )
+
+
+def with_options(settings: fs.Settings, **options: Any) -> fs.Settings:
+    """The same with those of the options changed that the estimator has."""
+    declared = settings.declared()
+    return settings.replace(**{name: value for name, value in options.items() if name in declared})
+
+
 def random_settings(rng: np.random.Generator, estimator: str, n: int, window: tuple[int, int]) -> fs.Settings:
     """Different settings for every sub-aperture."""
     pixels = window[0] * window[1]
     optional: dict[str, Any] = {}
     if rng.random() < 0.5:
         optional["search_range_px"] = rng.uniform(1.0, max(window), n)
-    return fs.Settings(
-        estimator=estimator,
-        denoise=False,
+    return settings_of(
+        estimator,
+        noise_std=0.0,
         keep_brightest=rng.integers(3, pixels, n),
         threshold_e=rng.uniform(0.0, 20.0, n),
         smoothing_px=rng.uniform(0.3, 1.5, n),

@@ -59,6 +59,9 @@ def tasks(case: Case) -> list[Task]:
     """What the oracle's estimators may know about each image."""
     n, ny, nx = case.images.shape
     calibration, settings = case.calibration, case.settings
+    own = {
+        name: _each(case, name) for name in ("weight_floor", "model_error", "prior_std_px", "weight_fwhm_px")
+    }
     noise = (calibration.read_noise_e or 0.0) / calibration.em_gain
     excess = 2.0 if calibration.em_gain > 1 else 1.0
     search = np.nan_to_num(case.each("search_range_px"), nan=max(nx, ny) / 2)
@@ -68,20 +71,27 @@ def tasks(case: Case) -> list[Task]:
             Task(
                 variance=noise**2 + excess * calibration.background_e,
                 excess=excess,
-                weight_floor=case.each("weight_floor")[s],
-                model_error=case.each("model_error")[s],
+                weight_floor=own["weight_floor"][s],
+                model_error=own["model_error"][s],
                 search_range=(search[s], search[s]),
-                steps=settings.steps,
+                steps=settings.steps if "steps" in settings.declared() else 0,
                 error_scale=case.each("error_scale")[s],
                 prior=(0.0, 0.0) if case.prior is None else tuple(case.prior[s]),
-                prior_std=case.each("prior_std_px")[s],
-                weight_fwhm=case.each("weight_fwhm_px")[s],
+                prior_std=own["prior_std_px"][s],
+                weight_fwhm=own["weight_fwhm_px"][s],
                 spot_fwhm=math.sqrt(case.each("spot_fwhm_px")[s] * case.each("spot_fwhm_y_px")[s]),
                 axis_ratio=case.each("spot_fwhm_y_px")[s] / case.each("spot_fwhm_px")[s],
                 phases=PHASES,
             )
         )
     return made
+
+
+def _each(case: Case, name: str) -> NDArray[np.float64]:
+    """Values of an option for all images; NaN where the estimator has no such option."""
+    if name in case.settings.declared():
+        return case.each(name)
+    return np.full(len(case.images), np.nan)
 
 
 def spot_tasks(case: Case) -> list[Task]:
@@ -93,7 +103,7 @@ def spot_tasks(case: Case) -> list[Task]:
     reach = start_reach(width.max(), (ny, nx))
     noise = case.calibration.read_noise_e or 0.0
     whole = noise < 0.25 and case.calibration.em_gain == 1 and case.calibration.background_e == 0
-    whole = whole and case.settings.estimator != "matched"
+    whole = whole and case.settings.estimator.name != "matched"
     made = []
     for task, kind in zip(tasks(case), index, strict=True):
         variance = task.variance
@@ -137,7 +147,7 @@ def exact_spots(psf: PSF) -> list[Spot]:
 
 
 def by_fit(case: Case, s: int, g: Floats, task: Task) -> Estimate:
-    return oracle.fisher(g, task, case.settings.estimator, begin(case, s, g, task))
+    return oracle.fisher(g, task, case.settings.estimator.name, begin(case, s, g, task))
 
 
 def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
@@ -186,18 +196,21 @@ def by_score(case: Case, s: int, g: Floats, task: Task) -> Estimate:
 
 def by_gravity(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     """Without denoising."""
-    keep, image = int(case.each("keep_brightest")[s]), g
-    if case.settings.estimator == "thresholded":
+    name, image = case.settings.estimator.name, g
+    if name == "centroid":
+        left = g
+    elif name == "thresholded":
         left = np.maximum(g - case.each("threshold_e")[s], 0.0)
     else:
-        if case.settings.estimator == "smoothed":
+        if name == "smoothed":
             std = case.each("smoothing_px")
             reach = min(math.ceil(2.5 * std.max()), max(g.shape) - 1)
             image = oracle.smoothed(g, std[s], std[s], reach)
-        left = naive.brightest_pixels(image, keep)
+        left = naive.brightest_pixels(image, int(case.each("keep_brightest")[s]))
     x, y = naive.centre_of_gravity(left)
     error_x, error_y = (
-        task.error_scale * e for e in oracle.gravity_error(left, g, task.variance, task.excess)
+        task.error_scale * e
+        for e in oracle.gravity_error(left, g, task.variance, task.excess, every_pixel=name == "centroid")
     )
     (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
     return Estimate(
@@ -207,7 +220,9 @@ def by_gravity(case: Case, s: int, g: Floats, task: Task) -> Estimate:
 
 Method = Callable[[Case, int, Floats, Task], Estimate]
 METHODS: dict[str, tuple[Callable[[Case], list[Task]], Method]] = {
-    "cog": (tasks, by_gravity),
+    "brightest": (tasks, by_gravity),
+    "tv": (tasks, by_gravity),
+    "centroid": (tasks, by_gravity),
     "thresholded": (tasks, by_gravity),
     "smoothed": (tasks, by_gravity),
     "weighted": (tasks, by_weight),
@@ -221,7 +236,7 @@ METHODS: dict[str, tuple[Callable[[Case], list[Task]], Method]] = {
 def estimates(case: Case) -> Iterator[list[Estimate]]:
     """For every image the oracle's estimate, and those of images and spots off by rounding."""
     rng = np.random.default_rng(0)
-    tasks_of, method = METHODS[case.settings.estimator]
+    tasks_of, method = METHODS[case.settings.estimator.name]
     for s, (g, task) in enumerate(zip(electrons(case), tasks_of(case), strict=True)):
         found = [method(case, s, g, task)]
         size = EPS * np.abs(g).max()

@@ -5,7 +5,7 @@ Written from the definitions, not from the kernels, so that a mistake in one doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -240,16 +240,7 @@ def slopes(
         window = (slice(row, row + ny), slice(column, column + nx))
         value = {
             name: settings.values(name, n, ny * nx)[s]
-            for name in (
-                "noise_std",
-                "tolerance",
-                "max_iterations",
-                "keep_brightest",
-                "rule",
-                "denoise",
-                "flux_floor",
-                "max_bad_fraction",
-            )
+            for name in ("keep_brightest", "rule", "flux_floor", "max_bad_fraction")
         }
         image = electrons[window]
         bad = int(np.isnan(image).sum())
@@ -260,24 +251,34 @@ def slopes(
             flags |= Flag.TOO_MANY_BAD_PIXELS
         elif bad:
             flags |= Flag.BAD_PIXELS
-        strength = float(value["noise_std"]) if value["denoise"] else 0.0
-        denoised = tv_denoise(
-            fill_bad_pixels(image),
-            strength,
-            settings.algorithm,
-            float(value["tolerance"]),
-            int(value["max_iterations"]),
-            settings.preset == "fast",
-        )
+        denoised = _denoised(fill_bad_pixels(image), settings, s, n)
         if denoised.infeasible:
             flags |= Flag.INFEASIBLE_STRENGTH
-        if not denoised.converged and value["tolerance"] > 0:
+        if not denoised.converged:
             flags |= Flag.NOT_CONVERGED
         results.append(_located(denoised, value, flags, bad, layout.centres[s], layout.corners[s]))
         if reference is not None and results[-1].flags & (Flag.NO_LIGHT | Flag.TOO_MANY_BAD_PIXELS) == 0:
             results[-1].x -= float(np.asarray(reference)[s, 0])
             results[-1].y -= float(np.asarray(reference)[s, 1])
     return results
+
+
+def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:
+    """The image of sub-aperture `s` of `n` as the estimator denoises it, if it does."""
+    if settings.estimator.name == "brightest":
+        return tv_denoise(image, 0.0, "fgp", 0.0, 1, False)
+    strength, tolerance, limit = (
+        settings.values(name, n, image.size)[s] for name in ("noise_std", "tolerance", "max_iterations")
+    )
+    denoised = tv_denoise(
+        image,
+        float(strength),
+        settings.algorithm,
+        float(tolerance),
+        int(limit),
+        settings.preset == "fast",
+    )
+    return replace(denoised, converged=denoised.converged or tolerance == 0)
 
 
 def _located(denoised: Denoised, value: Any, flags: int, bad: int, centre: Floats, corner: Any) -> Slope:

@@ -307,20 +307,20 @@ def smoothed_brightest(
 
 
 def gravity_error(
-    image: ArrayLike, g: ArrayLike, variance: float, excess: float = 1.0
+    image: ArrayLike, g: ArrayLike, variance: float, excess: float = 1.0, every_pixel: bool = False
 ) -> tuple[float, float]:
     """Standard error of the centre of gravity of an image left by a background subtraction.
 
     var_x = sum over kept pixels of ((u - x)^2 + 1/12) (v + e max(g, 0)) / (sum of the kept)^2, `g` being
-    the calibrated image and the kept pixels those above zero in `image`; 1/12 px^2 as it is not known where
-    in a pixel the light fell.
+    the calibrated image and the kept pixels those above zero in `image`, or every one; 1/12 px^2 as it is not
+    known where in a pixel the light fell.
     """
     image, g = np.asarray(image, np.float64), np.asarray(g, np.float64)
     x, y = naive.centre_of_gravity(image)
     total, var_x, var_y = 0.0, 0.0, 0.0
     for j, v in enumerate(pixel_centres(g.shape[0])):
         for i, u in enumerate(pixel_centres(g.shape[1])):
-            if image[j, i] > 0:
+            if every_pixel or image[j, i] > 0:
                 noise = variance + excess * max(g[j, i], 0.0)
                 total += image[j, i]
                 var_x += ((u - x) ** 2 + 1 / 12) * noise

@@ -11,15 +11,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.estimate.image_cases import refused
-from tests.estimator_cases import Case, assert_same, assert_sane, one_psf, random_case, random_score
+from tests.estimator_cases import (
+    Case,
+    assert_same,
+    assert_sane,
+    one_psf,
+    random_case,
+    random_score,
+    settings_of,
+    with_options,
+)
 
 import faintspot as fs
-from faintspot.estimators import ESTIMATORS, measure
+from faintspot.estimators import estimators, measure
 from faintspot.sensor.psf import PSF
 
 Flag = fs.SubapertureFlag
 SEEDS = st.integers(0, 2**32 - 1)
-EVERY = pytest.mark.parametrize("estimator", ESTIMATORS)
+EVERY = pytest.mark.parametrize("estimator", list(estimators()))
 FITTED = ("matched", "ml", "map")
 
 
@@ -59,8 +68,6 @@ def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
     """Images with the simplest settings."""
     n = len(images)
     chosen: dict[str, Any] = {
-        "estimator": estimator,
-        "denoise": False,
         "threshold_e": 1.0,
         "spot_fwhm_px": 2.0,
         "keep_brightest": 5,
@@ -68,7 +75,7 @@ def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
     }
     score = random_score(np.random.default_rng(0), n) if estimator == "trained" else None
     psf = one_psf() if estimator in FITTED else None
-    return Case(images, fs.Settings(**chosen), fs.Calibration(read_noise_e=1.0), psf, score)
+    return Case(images, settings_of(estimator, **chosen), fs.Calibration(read_noise_e=1.0), psf, score)
 
 
 class TestImages:
@@ -157,7 +164,8 @@ class TestSettings:
         def extreme(*values: float) -> NDArray[np.float64]:
             return rng.choice(values, 6)
 
-        chosen = case.settings.replace(
+        chosen = with_options(
+            case.settings,
             search_range_px=extreme(1e-3, 0.5, 3.0, 1e4),
             flux_e=extreme(1e-3, 1.0, 1e12),
             prior_std_px=extreme(1e-6, 0.3, 1e4),
@@ -208,8 +216,8 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("name", "value"),
         [
-            ("estimator", "centroid"),
-            ("estimator", None),
+            ("estimator", "centre"),
+            ("estimator", 3),
             ("steps", 0),
             ("steps", 2.5),
             ("steps", 101),
@@ -233,8 +241,14 @@ class TestRefused:
         ],
     )
     def test_bad_settings(self, name: str, value: Any) -> None:
+        whose = next((each for each, kind in estimators().items() if name in kind.declared()), "tv")
+        own: dict[str, Any] = {"noise_std": 1.0} if whose == "tv" else {}
         with refused(name):
-            fs.Settings(**{"noise_std": 1.0, name: value})
+            fs.Settings(**{"estimator": whose, **own, name: value})
+
+    def test_options_of_another_estimator(self) -> None:
+        with refused("threshold_e: an option of 'thresholded', not of 'ml'"):
+            fs.Settings("ml", threshold_e=1.0)
 
     @pytest.mark.parametrize(
         ("estimator", "words"),

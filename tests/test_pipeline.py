@@ -51,14 +51,16 @@ class TestAgainstOracle:
         assert_same(stages.slopes, case.pipeline()(case.frame))
         assert np.array_equal(stages.raw, case.layout.images(case.frame), equal_nan=True)
         for s in range(n):
-            denoised = fs.tv_denoise(
-                stages.calibrated[s],
-                each("noise_std")[s] if each("denoise")[s] else 0.0,
-                algorithm=case.settings.algorithm,
-                preset=case.settings.preset,
-                tolerance=each("tolerance")[s],
-                max_iterations=each("max_iterations")[s],
-            )
+            denoised = stages.calibrated[s]
+            if case.settings.estimator.denoises:
+                denoised = fs.tv_denoise(
+                    denoised,
+                    each("noise_std")[s],
+                    algorithm=case.settings.algorithm,
+                    preset=case.settings.preset,
+                    tolerance=each("tolerance")[s],
+                    max_iterations=each("max_iterations")[s],
+                )
             assert np.array_equal(stages.denoised[s], denoised)
             background = fs.brightest_pixels(denoised, each("keep_brightest")[s], rule=str(each("rule")[s]))
             assert np.array_equal(stages.background_subtracted[s], background)
@@ -160,7 +162,6 @@ class TestSettings:
             {"max_iterations": 2},
             {"keep_brightest": 20},
             {"rule": "threshold"},
-            {"denoise": False},
             {"flux_floor": 1.0, "keep_brightest": 1},
             {"noise_std": [1.0, 2.5, 3.5]},
         ]
@@ -182,6 +183,13 @@ class TestSettings:
             for i, s in enumerate(where):
                 for field in FIELDS:
                     assert getattr(changed, field)[s] == getattr(single[i], field)[s]
+
+    def test_strength_0_is_the_estimator_that_does_not_denoise(self) -> None:
+        layout = fs.Layout.grid((5, 5), pixels=8)
+        frame = np.random.default_rng(9).poisson(9.0, layout.frame_shape).astype(np.float32)
+        expected = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=10))(frame)
+        denoised = fs.Settings("tv", noise_std=0.0, keep_brightest=10)
+        assert_same(fs.SlopePipeline(layout, denoised)(frame), expected)
 
     def test_no_tolerance_never_stops_early(self) -> None:
         """Whatever the tolerance of the sub-apertures that share its group."""

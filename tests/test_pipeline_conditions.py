@@ -167,7 +167,7 @@ class TestWindows:
         frames, _ = fs.simulate.sensor_frames(
             layout.corners, (8, 8), (16, 16), 1, flux_e=1e4, positions=positions[None]
         )
-        slopes = fs.SlopePipeline(layout, fs.Settings(denoise=False, keep_brightest=5))(frames[0])
+        slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=5))(frames[0])
         assert np.allclose(np.stack([slopes.x, slopes.y], -1), positions, atol=0.15)
         assert np.array_equal(slopes.vector, np.concatenate([slopes.x, slopes.y]))
 
@@ -188,7 +188,7 @@ class TestPhysics:
         frame = images.reshape(100, 100, 16, 16).swapaxes(1, 2).reshape(1600, 1600)
         strength = np.sqrt(9 + 200 / 256)
         arms = {
-            "without": fs.Settings(denoise=False, keep_brightest=case["without"]["k"]),
+            "without": fs.Settings("brightest", keep_brightest=case["without"]["k"]),
             "with_tv": fs.Settings(noise_std=strength, keep_brightest=case["with_tv"]["k"]),
         }
         errors = {}

@@ -63,5 +63,14 @@ def test_import_is_light() -> None:
 
 
 def test_sensor_needs_no_kernels() -> None:
-    statement = "import faintspot\nfaintspot.Settings(noise_std=1.0)\nfaintspot.Calibration()"
+    """Neither the sensor nor the declaration of options; settings have an estimator, which has a kernel."""
+    statement = (
+        "import faintspot, faintspot.options, faintspot.tables\n"
+        "faintspot.Layout.grid((2, 2), pixels=4)\nfaintspot.Calibration()"
+    )
     assert imported_by(statement) == set()
+
+
+def test_settings_load_no_more_than_numba_and_scipy() -> None:
+    statement = "import faintspot\nfaintspot.Settings(noise_std=1.0)"
+    assert imported_by(statement) <= {"numba", "llvmlite", "scipy"}

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 
 from faintspot.errors import InputError
 from faintspot.files import write_atomically
@@ -89,6 +88,8 @@ def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]
     InputError
         When the file exists and is not TOML, or cannot be written.
     """
+    import tomlkit
+
     path = Path(path)
     document = parse_file(path) if path.exists() else tomlkit.document()
     for name, values in tables.items():
@@ -101,6 +102,8 @@ def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]
 
 def tables_as_text(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """Return tables as TOML text."""
+    import tomlkit
+
     document = tomlkit.document()
     for name, values in tables.items():
         document[name] = _toml_table(values)
@@ -135,6 +138,8 @@ def is_map(value: Any) -> bool:
 
 
 def _toml_table(values: Mapping[str, Any]) -> Any:
+    import tomlkit
+
     table = tomlkit.table()
     for key, value in values.items():
         table[key] = _toml_value(value)
@@ -142,6 +147,8 @@ def _toml_table(values: Mapping[str, Any]) -> Any:
 
 
 def _toml_value(value: Any) -> Any:
+    import tomlkit
+
     if isinstance(value, PerSubaperture):
         inline = tomlkit.inline_table()
         if value.default is not None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-import tomlkit
-from tomlkit.exceptions import TOMLKitError
+from typing import TYPE_CHECKING, Any
 
 from faintspot.errors import InputError
+
+if TYPE_CHECKING:
+    import tomlkit
 
 
 def parse_file(path: str | Path, *, if_missing: str = "") -> tomlkit.TOMLDocument:
@@ -46,6 +46,9 @@ def parse_text(text: str, where: str) -> tomlkit.TOMLDocument:
     InputError
         When it is not TOML.
     """
+    import tomlkit  # here: layouts and calibrations are made without any file, too
+    from tomlkit.exceptions import TOMLKitError
+
     try:
         return tomlkit.parse(text)
     except TOMLKitError as error:

@@ -19,7 +19,7 @@ from faintspot.adapters.hcipy import SlopeEstimator  # noqa: E402
 
 SIDE, LENSLETS, WIDTH_M, WAVELENGTH_M, F_NUMBER = 12, 7, 4.2e-3, 0.7e-6, 150.0
 PIXEL_M = WIDTH_M / (LENSLETS * SIDE)
-EVERYTHING = Settings(denoise=False, keep_brightest=SIDE * SIDE, rule="threshold")  # as HCIPy's own
+EVERYTHING = Settings("brightest", keep_brightest=SIDE * SIDE, rule="threshold")  # as HCIPy's own
 FAINT = Settings(noise_std=1.0, keep_brightest=20)
 
 
@@ -127,7 +127,7 @@ def test_a_detector_with_other_pixels(optics: Any) -> None:
     detector = hcipy.NoisyDetector(grid, include_photon_noise=False, subsampling=2)
     detector.integrate(image_through(optics), 1)
     image = detector.read_out()
-    settings = Settings(denoise=False, keep_brightest=36, rule="threshold")
+    settings = Settings("brightest", keep_brightest=36, rule="threshold")
     estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=settings, detector_grid=grid)
     coarse = hcipy.MicroLensArray(grid, optics.mla_grid, 1.0)
     expected = theirs(coarse, image, np.ones(49, bool))
@@ -180,7 +180,8 @@ def test_axes_that_run_backwards(optics: Any) -> None:
         ({"estimation_subapertures": np.zeros(49, bool)}, "at least one lenslet"),
         ({"pixels": 14}, "49 lenslets|leave it|overlap"),
         ({"pixels": 3}, "pixels = 3"),
-        ({"settings": Settings(estimator="ml")}, "psf"),
+        ({"settings": Settings(estimator="ml")}, "calibration.read_noise_e"),
+        ({"settings": Settings(estimator="matched")}, "psf"),
     ],
 )
 def test_refused_in_one_line(optics: Any, change: dict[str, Any], message: str) -> None:

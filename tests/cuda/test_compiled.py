@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from faintspot.kernels.fused import DENOISE, SMOOTH
 
+from faintspot.kernels.gravity import DENOISE, SMOOTH
 from faintspot.kernels.total_variation import CHAMBOLLE, FGP
 
 HOPPER = (9, 0)

@@ -59,7 +59,7 @@ def test_suggested_strength_gains_and_the_full_noise_gains_less() -> None:
 
     suggested = float(suggested_strength(0.1, 50.0, 256))
     full = float(np.sqrt(0.1**2 + 50.0 / 256))
-    plain, standard_error = error(Settings(denoise=False, keep_brightest=12))
+    plain, standard_error = error(Settings("brightest", keep_brightest=12))
     assert error(Settings(noise_std=suggested, keep_brightest=12))[0] < plain - 5 * standard_error
     assert (
         error(Settings(noise_std=suggested, keep_brightest=12))[0]

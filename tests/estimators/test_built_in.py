@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import faintspot as fs
-from faintspot.estimators import Estimator, estimator_named
+from faintspot.estimators import Estimator, estimator_named, registry
 from faintspot.estimators.registry import estimators
 from faintspot.testing import FLUX_E, READ_NOISE_E, SIDE, EstimatorTests
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_estimator.py"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def only_here() -> Iterator[None]:
+    """The example's estimator is known to the tests of this module alone."""
+    yield
+    registry._kinds.pop("power", None)
+    sys.modules.pop("own_estimator", None)
 
 
 class TestBrightest(EstimatorTests):
@@ -22,6 +33,8 @@ class TestBrightest(EstimatorTests):
 
 
 class TestTotalVariation(EstimatorTests):
+    # Its iterations stop at a relative change of 1 %, where they have not yet made the image symmetric.
+    centre_tolerance_px = 0.015
     # What the denoising does to the noise is not in its standard errors.
     error_ratio = (0.5, 2.0)
 
@@ -96,6 +109,7 @@ def example_estimator() -> type[Estimator]:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look up annotations
     spec.loader.exec_module(module)
     return module.PowerCentroid  # type: ignore[no-any-return]
 

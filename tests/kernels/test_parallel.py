@@ -44,5 +44,25 @@ def test_scratch_is_of_each_thread_and_fits_the_window() -> None:
 
     run_groups(job, 100, lanes_for(np.float32, 4), (6, 5), 2)
     first, second = used.values()
-    assert first[0].size == second[0].size == 6 * 5 * 4
-    assert not any(np.shares_memory(a, b) for a in first for b in second)
+    # One vector more than pixels: reading a pixel's right neighbour never leaves the memory.
+    assert first.image.size == second.image.size == (6 * 5 + 1) * 4
+    assert first.spare.size == 6 * 5 * 4
+    assert not any(np.shares_memory(a, b) for a in memory_of(first) for b in memory_of(second))
+
+
+def memory_of(scratch: Any) -> list[Any]:
+    """Every array of a scratch, the estimator's own ones, too."""
+    *common, own = scratch
+    return [*common, *own]
+
+
+def test_scratch_is_kept_until_the_shape_of_the_work_changes() -> None:
+    used: list[Any] = []
+
+    def job(start: int, stop: int, scratch: Any) -> None:
+        used.append(scratch)
+
+    for window in ((6, 5), (6, 5), (6, 6)):
+        run_groups(job, 1, lanes_for(np.float32, 4), window, 1)
+    assert used[0] is used[1]
+    assert used[2].spare.size == 6 * 6 * 4

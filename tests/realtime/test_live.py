@@ -247,6 +247,6 @@ def test_get_is_plain_and_complete(live: LiveSettings[fs.SlopePipeline]) -> None
     live.propose({"estimator": "weighted", "spot_fwhm_px": 2.0})
     live.take(2)
     assert live.get(["steps", "flux_e"]) == {"steps": 3, "flux_e": None}  # those of the preset "fast"
-    for bad in (["rules"], "rule", 3, [1]):
+    for bad in (["rules"], "rule", 3, [1], ["noise_std"]):  # noise_std: of other estimators
         with pytest.raises(InputError):
             live.get(bad)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "median_module.py"
 N = len(LAYOUT)
 ALL = {
     "tv": SETTINGS,
-    "plain": SETTINGS.replace(denoise=False),
+    "plain": SETTINGS.replace(estimator="brightest"),
     "threshold": SETTINGS.replace(rule="threshold"),
     "each": SETTINGS.replace(noise_std=np.linspace(0, 3, N), keep_brightest=np.arange(N) + 3),
     "smoothed": fs.Settings(estimator="smoothed", keep_brightest=9),

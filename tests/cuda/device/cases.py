@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -26,10 +25,8 @@ def small_case(seed: int, dtype: str, window: tuple[int, int], columns: int = 3,
     y, x = np.mgrid[: layout.frame_shape[0], : layout.frame_shape[1]]
     for centre_x, centre_y in layout.centres + rng.uniform(-1, 1, layout.centres.shape):
         frame += rng.uniform(20, 60) * np.exp(-((x - centre_x) ** 2 + (y - centre_y) ** 2) / 2)
-    settings = random_settings(rng, columns, ny * nx)
-    chosen = {field.name: getattr(settings, field.name) for field in fields(settings)}
-    chosen["max_iterations"] = np.minimum(settings.max_iterations, 12)
-    settings = fs.Settings(**chosen | fixed)
+    settings = random_settings(rng, columns, ny * nx, denoised=True)
+    settings = settings.replace(**{"max_iterations": np.minimum(settings.max_iterations, 12)} | fixed)
     if np.dtype(dtype).kind == "u":
         frame = np.rint(frame)
         frame[rng.random(frame.shape) < 0.004] = np.iinfo(dtype).max

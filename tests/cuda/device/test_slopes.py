@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cuda.device.cases import Flag, assert_near, small_case
+from tests.estimator_cases import settings_of
 from tests.pipeline_cases import assert_equals_oracle, assert_same
 
 import faintspot as fs
@@ -32,7 +33,7 @@ def on_gpu(case: Any) -> fs.Slopes:
 def test_random_sensors(window: tuple[int, int], dtype: str) -> None:
     """Settings, rules, iteration limits and bad pixels of every sub-aperture of its own."""
     for seed in range(2 if window[0] < 8 else 1):
-        denoised = {"denoise": True, "rule": "subtract_next", "noise_std": 0.8} if window[0] >= 8 else {}
+        denoised = {"rule": "subtract_next", "noise_std": 0.8} if window[0] >= 8 else {}
         case = small_case(seed, dtype, window, columns=2, **denoised)
         found = on_gpu(case)
         assert_near(case, found, case.pipeline()(case.frame))
@@ -42,7 +43,7 @@ def test_random_sensors(window: tuple[int, int], dtype: str) -> None:
 @pytest.mark.parametrize("algorithm", ["fgp", "chambolle"])
 @pytest.mark.parametrize("rule", ["subtract_next", "subtract_kth", "threshold"])
 def test_algorithms_and_rules(algorithm: str, rule: str) -> None:
-    fixed: dict[str, Any] = {"algorithm": algorithm, "rule": rule, "denoise": True, "keep_brightest": 7}
+    fixed: dict[str, Any] = {"algorithm": algorithm, "rule": rule, "keep_brightest": 7}
     case = small_case(3, "uint16", (6, 8), noise_std=2.5, tolerance=1e-2, max_iterations=15, **fixed)
     # "threshold" is not continuous in the image: no equal pixels here, and none that is bad.
     case = replace(case, calibration=fs.Calibration(dark=20.0, read_noise_e=2.5, saturation_adu=1e6))
@@ -70,16 +71,14 @@ def test_preset_fast(window: tuple[int, int], algorithm: str) -> None:
     assert np.abs(fs.SlopePipeline(layout, from_zero)(frame).vector - expected.vector).max() > 1e-3
 
 
-@pytest.mark.parametrize("estimator", ["cog", "smoothed", "thresholded"])
+@pytest.mark.parametrize("estimator", ["brightest", "centroid", "smoothed", "thresholded"])
 def test_estimators(estimator: str) -> None:
     layout = fs.Layout.grid((1, 3), pixels=(7, 9))
     frame = np.random.default_rng(5).poisson(4.0, layout.frame_shape).astype(np.uint16)
     frame[2:5, 3:6] += np.uint16(20)
     frame[3, 11:13] += np.uint16(40)
-    settings = fs.Settings(
-        estimator=estimator,
-        noise_std=1.5,
-        denoise=False,
+    settings = settings_of(
+        estimator,
         keep_brightest=9,
         smoothing_px=[0.6, 0.9, 0.6],
         threshold_e=5.0,
@@ -187,7 +186,7 @@ def test_explain_works() -> None:
 def test_other_estimators_are_refused() -> None:
     layout = fs.Layout.grid((1, 2), pixels=8)
     settings = fs.Settings(estimator="weighted", spot_fwhm_px=2.0)
-    with pytest.raises(fs.InputError, match=r"settings.estimator = 'weighted': device=.cuda. runs 'cog'"):
+    with pytest.raises(fs.InputError, match=r"estimator = 'weighted': device=.cuda. runs 'brightest', 'tv'"):
         fs.SlopePipeline(layout, settings, device="cuda")
 
 

@@ -12,10 +12,13 @@ from tests.estimate.image_cases import refused
 
 import faintspot as fs
 from faintspot import configuration
-from faintspot.settings import PerSubaperture
+from faintspot.estimators import Estimator, estimators
+from faintspot.options import PerSubaperture
 
 LAYOUT = "[layout.grid]\nshape = [2, 3]\npixels = 4\n"
-SETTINGS = "[settings]\nnoise_std = 0.5\n"
+SETTINGS = '[estimator]\nname = "tv"\nnoise_std = 0.5\n'
+FORMER = "[settings]\nnoise_std = 0.5\n"
+"""As version 0.1 wrote it."""
 
 
 def written(folder: Path, text: str) -> Path:
@@ -38,17 +41,30 @@ def each(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 numbers = st.floats(0, 1, width=64)
-all_settings = st.builds(
+shared: dict[str, Any] = {
+    "search_range_px": st.none() | each(st.floats(0.1, 100)),
+    "max_bad_fraction": each(numbers),
+    "flux_e": st.none() | each(st.floats(0.1, 1e6)),
+}
+denoised = st.builds(
     fs.Settings,
+    st.just("tv"),
     noise_std=each(st.floats(0, 1e6)),
     tolerance=each(numbers),
     max_iterations=each(st.integers(1, 10_000)),
     keep_brightest=st.one_of(st.none(), each(st.integers(1, 1000))),
     rule=each(st.sampled_from(["subtract_next", "threshold", "subtract_kth"])),
-    denoise=each(st.booleans()),
     algorithm=st.sampled_from(["fgp", "chambolle"]),
     flux_floor=each(numbers),
-    max_bad_fraction=each(numbers),
+    **shared,
+)
+fitted = st.builds(
+    fs.Settings,
+    st.just("ml"),
+    model_error=each(numbers),
+    steps=st.none() | st.integers(1, 100),
+    spot_fwhm_px=st.none() | each(st.floats(0.5, 60)),
+    **shared,
 )
 maps = hnp.arrays(np.float64, (6, 7), elements=st.floats(-1e6, 1e6) | st.just(np.nan))
 all_calibrations = st.builds(
@@ -64,10 +80,38 @@ all_calibrations = st.builds(
 )
 
 
-@given(all_settings)
+@given(denoised | fitted)
 def test_settings_round_trip(tmp_path_factory: pytest.TempPathFactory, settings: fs.Settings) -> None:
     path = tmp_path_factory.mktemp("settings") / "faintspot.toml"
     settings.save(path)
+    assert fs.Settings.load(path) == settings
+
+
+def some_options(kind: type[Estimator]) -> dict[str, Any]:
+    """A value of every option of an estimator that is not its default."""
+    values: dict[str, Any] = {}
+    for name, declared in kind.declared().items():
+        default = kind.defaults()[name]
+        if declared.choices:
+            values[name] = next(choice for choice in declared.choices if choice != default)
+        else:
+            number = 3 if declared.whole else 0.375
+            values[name] = PerSubaperture(number, {2: number}) if declared.per_subaperture else number
+    return values
+
+
+@pytest.mark.parametrize("name", list(estimators()))
+def test_every_estimator_comes_back(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "faintspot.toml"
+    kind = estimators()[name]
+    settings = fs.Settings(kind(**some_options(kind)), search_range_px=2.0, flux_e=[10.0, 20.0, 30.0])
+    settings.save(path)
+    text = path.read_text()
+    assert text.startswith(f'[estimator]\nname = "{name}"\n')
+    assert "[settings]\nsearch_range_px = 2.0\n" in text
+    assert set(settings.estimator.chosen()) == set(kind.declared())
+    assert fs.Settings.load(path) == settings
+    written(tmp_path, configuration.to_text(settings))
     assert fs.Settings.load(path) == settings
 
 
@@ -137,7 +181,8 @@ def test_all_together_and_again(tmp_path: Path) -> None:
     for part in (*parts, *parts):
         part.save(path)
     assert configuration.load_all(path)[:3] == parts
-    assert path.read_text().count("[settings]") == 1
+    assert path.read_text().count("[estimator]") == 1
+    assert "[settings]" not in path.read_text()  # nothing that all estimators share was set
 
 
 def test_comments_and_other_tables_stay(tmp_path: Path) -> None:
@@ -146,7 +191,7 @@ def test_comments_and_other_tables_stay(tmp_path: Path) -> None:
     fs.Settings(noise_std=2.5).save(path)
     fs.Calibration(em_gain=3.0).save(path)
     saved = path.read_text()
-    assert saved.startswith(text.partition("[settings]")[0])
+    assert saved.startswith(text.partition("[estimator]")[0])
     assert fs.Settings.load(path).noise_std == 2.5
     assert fs.Calibration.load(path).em_gain == 3.0
     fs.Layout.grid((1, 1), pixels=8).save(path)
@@ -186,44 +231,121 @@ def test_grid(tmp_path: Path) -> None:
 def test_some_subapertures(tmp_path: Path) -> None:
     path = written(
         tmp_path,
-        "[settings]\nnoise_std = { default = 2.5, 4 = 3.0 }\n"
-        'rule = { default = "threshold", 0 = "subtract_kth" }\n',
+        '[estimator]\nname = "tv"\nnoise_std = { default = 2.5, 4 = 3.0 }\n'
+        'rule = { default = "threshold", 0 = "subtract_kth" }\n'
+        "[settings]\nflux_e = { default = 100.0, 1 = 50.0 }\n",
     )
     settings = fs.Settings.load(path)
     assert settings.values("noise_std", 6, 16).tolist() == [2.5] * 4 + [3.0, 2.5]
     assert settings.values("rule", 2, 16).tolist() == ["subtract_kth", "threshold"]
+    assert settings.values("flux_e", 3, 16).tolist() == [100.0, 50.0, 100.0]
 
 
 def test_no_calibration_means_electrons(tmp_path: Path) -> None:
-    path = written(tmp_path, LAYOUT + SETTINGS)
+    path = written(tmp_path, LAYOUT + FORMER)
     assert fs.Calibration.load(path) == fs.Calibration()
     assert configuration.load_all(path)[2] == fs.Calibration()
+
+
+# Settings of version 0.1 -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("former", "now"),
+    [
+        ("noise_std = 0.5", fs.Settings("tv", noise_std=0.5)),
+        ('estimator = "cog"\nnoise_std = 0.5\ndenoise = true', fs.Settings("tv", noise_std=0.5)),
+        ("denoise = false\nkeep_brightest = 7\nnoise_std = 2", fs.Settings("brightest", keep_brightest=7)),
+        (
+            "noise_std = 2.0\ndenoise = { default = true, 3 = false }",
+            fs.Settings("tv", noise_std=PerSubaperture(2.0, {3: 0.0})),
+        ),
+        ("noise_std = 2.0\ndenoise = [true, false]", fs.Settings("tv", noise_std=[2.0, 0.0])),
+        (
+            'estimator = "ml"\nmodel_error = 0.2\nnoise_std = 1.0\nkeep_brightest = 7\ndenoise = false\n'
+            "flux_floor = 0.1\nsearch_range_px = 3.0",
+            fs.Settings("ml", model_error=0.2, search_range_px=3.0),
+        ),
+        (
+            'estimator = "thresholded"\nthreshold_e = 4\nsmoothing_px = 1\nprior_std_px = 1\nflux_e = 9',
+            fs.Settings("thresholded", threshold_e=4.0, flux_e=9.0),
+        ),
+        ('estimator = "smoothed"\nkeep_brightest = 7\nsteps = 3', fs.Settings("smoothed", keep_brightest=7)),
+    ],
+)
+def test_former_settings(former: str, now: fs.Settings, tmp_path: Path) -> None:
+    """Options that say nothing to the estimator are left out; saving writes today's form."""
+    path = written(tmp_path, f"# mine\n{LAYOUT}\n[settings]\n{former}\n")
+    settings = fs.Settings.load(path)
+    assert settings == now
+    assert configuration.has(path, "settings")
+    settings.save(path)
+    text = path.read_text()
+    assert f'[estimator]\nname = "{now.estimator.name}"' in text
+    assert text.startswith("# mine\n[layout.grid]")
+    assert "denoise" not in text
+    assert fs.Settings.load(path) == now
+    assert len(configuration.load_all(path).layout) == 6
+
+
+def test_an_estimator_alone_is_enough(tmp_path: Path) -> None:
+    path = written(tmp_path, f'{LAYOUT}[estimator]\nname = "brightest"\n')
+    assert configuration.has(path, "settings")
+    assert not configuration.has(path, "calibration")
+    assert configuration.load_all(path).settings == fs.Settings("brightest")
+
+
+def estimator(text: str) -> str:
+    return f'[estimator]\nname = "tv"\n{text}'
 
 
 @pytest.mark.parametrize(
     ("words", "text"),
     [
         ("setings: unknown table; did you mean settings?", "[setings]\n"),
-        ("colours: unknown table; known: layout, calibration, settings", "[colours]\n"),
-        ("settings.noise_sdt: unknown key; did you mean noise_std?", "[settings]\nnoise_sdt = 1"),
-        ("settings.zzz: unknown key; known: noise_std", "[settings]\nnoise_std = 1\nzzz = 1"),
+        ("colours: unknown table; known: layout, calibration, estimator, settings", "[colours]\n"),
         ("expected a table [settings], found layout", LAYOUT),
         ("expected a table [settings], found none", ""),
         ("settings: expected a table, got 3", "settings = 3"),
+        ("estimator: expected a table, got 'ml'", "estimator = 'ml'"),
+        ("estimator.name: expected one of brightest, tv", "[estimator]\nnoise_std = 1"),
+        ("estimator = 'newton': expected one of", "[estimator]\nname = 'newton'"),
+        ("estimator = 3: expected one of", "[estimator]\nname = 3"),
+        ("'gaussian' is now 'smoothed'", "[estimator]\nname = 'gaussian'"),
+        (
+            "estimator.noise_sdt: unknown option of 'tv'; did you mean noise_std?",
+            estimator("noise_sdt = 1"),
+        ),
+        ("estimator.zzz: unknown option of 'tv'; known: flux_floor", estimator("noise_std = 1\nzzz = 1")),
+        ("estimator.threshold_e: an option of 'thresholded', not of 'tv'", estimator("threshold_e = 1")),
+        ("estimator.flux_e: expected in the table [settings]", estimator("noise_std = 1\nflux_e = 9")),
+        ("settings.noise_std: unknown key; known: search_range_px", estimator("[settings]\nnoise_std = 1")),
+        ("settings.flux: unknown key; did you mean flux_e?", estimator("noise_std=1\n[settings]\nflux = 1")),
+        ("settings.flux_e = -1", estimator("noise_std = 1\n[settings]\nflux_e = -1")),
+        ("estimator.noise_std: expected a number (electrons)", estimator("")),
+        ("estimator.noise_std = -1: expected a number of at least 0", estimator("noise_std = -1")),
+        ("estimator.noise_std", estimator('noise_std = "low"')),
+        ("estimator.noise_std", estimator("noise_std = nan")),
+        ("estimator.noise_std", estimator("noise_std = 2026-01-01")),
+        ("estimator.noise_std.first", estimator("noise_std = { default = 1.0, first = 2.0 }")),
+        ("estimator.noise_std = -3", estimator("noise_std = { default = 1.0, 7 = -3.0 }")),
+        ("estimator.noise_std", estimator("noise_std = { 7 = 3.0 }")),
+        ("estimator.rule = 'kth'", estimator("noise_std = 1\nrule = 'kth'")),
+        ("estimator.tolerance = 5: expected a number from 0 to 1", estimator("noise_std = 1\ntolerance = 5")),
+        ("estimator.algorithm", estimator("noise_std = 1\nalgorithm = 1")),
+        ("estimator.algorithm", estimator("noise_std = 1\nalgorithm = { default = 'fgp' }")),
+        ("settings: expected arrays of one length", estimator("noise_std = [1, 2]\ntolerance = [0, 0, 0]")),
+        (
+            "settings: expected arrays of one length",
+            estimator("noise_std = [1, 2]\n[settings]\nflux_e = [1, 2, 3]"),
+        ),
+        # As version 0.1 wrote them.
+        ("settings.noise_sdt: unknown", "[settings]\nnoise_sdt = 1"),
         ("settings.noise_std: expected a number (electrons)", "[settings]\n"),
         ("settings.noise_std = -1: expected a number of at least 0", "[settings]\nnoise_std = -1"),
-        ("settings.noise_std", '[settings]\nnoise_std = "low"'),
-        ("settings.noise_std", "[settings]\nnoise_std = nan"),
-        ("settings.noise_std", "[settings]\nnoise_std = 2026-01-01"),
         ("settings.noise_std.first", "[settings]\nnoise_std = { default = 1.0, first = 2.0 }"),
-        ("settings.noise_std = -3", "[settings]\nnoise_std = { default = 1.0, 7 = -3.0 }"),
-        ("settings.noise_std", "[settings]\nnoise_std = { 7 = 3.0 }"),
-        ("settings.rule = 'kth'", "[settings]\nnoise_std = 1\nrule = 'kth'"),
-        ("settings.tolerance = 5: expected a number from 0 to 1", "[settings]\nnoise_std = 1\ntolerance = 5"),
         ("settings.denoise = 'on'", "[settings]\nnoise_std = 1\ndenoise = 'on'"),
-        ("settings.algorithm", "[settings]\nnoise_std = 1\nalgorithm = 1"),
-        ("settings.algorithm", "[settings]\nnoise_std = 1\nalgorithm = { default = 'fgp' }"),
-        ("settings: expected arrays of one length", "[settings]\nnoise_std = [1, 2]\ntolerance = [0, 0, 0]"),
+        ("estimator = 'newton'", "[settings]\nestimator = 'newton'"),
         ("not a TOML file", "[settings\nnoise_std = 1"),
         ("not a TOML file", "[settings]\nnoise_std = 1\nnoise_std = 2"),
         ("not a TOML file", "SIMPLE  =                    T"),
