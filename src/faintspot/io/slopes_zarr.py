@@ -87,7 +87,8 @@ class StoreStorage:
         group: Any = zarr.open_group(str(self.place), mode="r+", use_consolidated=False)
         try:
             # A chunk of zeros is written like any other: one that is not there has been lost.
-            self._arrays = {name: group[name].with_config({"write_empty_chunks": True}) for name in VARIABLES}
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                self._arrays = {name: group[name] for name in VARIABLES}
         except (KeyError, ValueError) as error:
             raise InputError(
                 f"{self.place}: damaged, it cannot be resumed: delete it ({one_line(error)})"
