@@ -134,6 +134,85 @@ def test_exists_already_and_overwrite_keeps_the_calibration(folder: Path, run: C
     assert Calibration.load("new.toml") == Calibration(dark=90.0, gain_e_per_adu=2.0)
 
 
+@pytest.mark.usefixtures("no_picture")
+def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
+    """A cube of darks is averaged, a flat divided by its mean, bad pixels come as a map or a list."""
+    rng = np.random.default_rng(2)
+    dark, flat = rng.uniform(50, 150, SHAPE), rng.uniform(0.8, 1.2, SHAPE)
+    bad = np.zeros(SHAPE, bool)
+    bad[3, 5] = bad[40, 41] = True
+    cube = (frames().astype(np.float32) - OFFSET_ADU) * flat + dark
+    np.save("a.npy", cube)
+    np.save("dark.npy", np.stack([dark - 3, dark + 3]))
+    np.save("flat.npy", np.stack([20000 * flat, 20000 * flat]))
+    np.save("map.npy", bad)
+    np.save("list.npy", np.argwhere(bad))
+    options = ("--dark", "dark.npy", "--flat", "flat.npy", "--read-noise", "3", "--pixels", 16)
+    run.ok("layout", "a.npy", "-o", "new.toml", *options, "--bad-pixels", "map.npy")
+    calibration = Calibration.load("new.toml")
+    np.testing.assert_allclose(calibration.dark, dark)
+    np.testing.assert_allclose(calibration.flat, flat / flat.mean())
+    assert calibration.read_noise_e == 3.0
+    assert len(Layout.load("new.toml")) == 49
+    run.ok("layout", "a.npy", "-o", "other.toml", *options, "--bad-pixels", "list.npy")
+    assert np.asarray(Calibration.load("other.toml").bad_pixels).tolist() == [[3, 5], [40, 41]]
+    np.save("dark.npy", dark[:, :10])
+    run.refused("layout", "a.npy", "-o", "o.toml", *options, naming=("dark", "(150, 160)"))
+    run.refused("layout", "a.npy", "-o", "o.toml", "--read-noise", "-1", naming=("read_noise_e",))
+    np.save("flat.npy", np.zeros(SHAPE))
+    run.refused("layout", "a.npy", "-o", "o.toml", "--flat", "flat.npy", naming=("flat.npy", "above 0"))
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_which_lenslets(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")
+    run.ok(*arguments, "--window", "12,16")
+    whole = Layout.load("new.toml")
+    assert whole.window == (12, 16)
+    run.ok(*arguments, "--window", "12,16", "--exclude", "0,7-13, 48")
+    chosen = np.setdiff1d(np.arange(49), [0, *range(7, 14), 48])
+    assert Layout.load("new.toml") == whole[chosen]
+    run.ok(*arguments, "--pupil", "78,75,45,10")
+    radius = np.hypot(*(Layout.load("new.toml").centres - (78, 75)).T)
+    assert 10 <= radius.min() <= radius.max() <= 45
+    assert len(radius) == np.count_nonzero(np.abs(np.hypot(*(lattice("square") - (78, 75)).T) - 27.5) <= 17.5)
+    run.ok(*arguments, "--roi", "0,0,110,90")
+    assert len(Layout.load("new.toml")) == 4 * 5  # rows and columns of nodes in it
+    run.ok(*arguments, "--lit-fraction", "0.9")
+    assert len(Layout.load("new.toml")) > 40
+    for option, value, words in (
+        ("--exclude", "3,x", "such as 3,17,40-45"),
+        ("--exclude", "40-49", "from 0 to 48"),
+        ("--exclude", "5-2", "from 0 to 48"),
+        ("--exclude", "0-48", "no sub-aperture is left"),
+        ("--pupil", "1,2", "X,Y,R or X,Y,R,INNER"),
+        ("--pupil", "80,80,-3", "radius"),
+        ("--roi", "0,0,1000,10", "within the frame's 160 columns"),
+        ("--window", "12", "height and width"),
+        ("--window", "3,12", "pixels = 3"),
+        ("--lit-fraction", "2", "lit-fraction = 2"),
+        ("--pitch", "2", "windows below 4 px are not supported yet"),
+    ):
+        assert words in run.refused("layout", "a.npy", "-o", "o.toml", option, value).error
+    run.refused(
+        "layout", "a.npy", "-o", "o.toml", "--window", "9,9", "--pixels", "9", naming=("one of them",)
+    )
+    assert not (folder / "o.toml").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_numbers_are_plain_and_doubt_is_said(folder: Path, run: Commands) -> None:
+    np.save("a.npy", 400.0 * (frames().astype(float) - OFFSET_ADU))
+    out = run.ok("layout", "a.npy", "-o", "new.toml").out
+    assert "e+" not in out
+    assert "doubtful" not in out
+    array = frames().astype(float) - OFFSET_ADU
+    array[:, :, 80:] *= 0.4
+    np.save("b.npy", array)
+    assert "  doubtful: " in run.ok("layout", "b.npy", "-o", "b.toml").out
+
+
 def test_pure_noise(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
     run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch"))

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import configuration
+from faintspot.cli import layout_options
+from faintspot.cli.layout_options import plain
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
-from faintspot.io.frames import FrameSource, open_frames, read_array
+from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.hot_pixels import find_hot_pixels
@@ -24,6 +26,8 @@ from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _FIRST_FRAMES = 20  # measured for the settings
+# What the finder calls what these options give.
+_OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels": "--bad-pixels"}
 
 
 @click.command(short_help="Find the sub-apertures in a frame and write a configuration.")
@@ -50,15 +54,47 @@ _FIRST_FRAMES = 20  # measured for the settings
 @click.option(
     "--pixels", type=int, metavar="N", help="Side of a window. Default: the largest without overlap."
 )
+@click.option("--window", metavar="NY,NX", help="Height and width of a window that is not square, pixels.")
+@click.option(
+    "--lit-fraction",
+    type=float,
+    metavar="PART",
+    help="Least flux of a lit lenslet, as a part of the median. Default: where fewest are, 0.18 to 0.5.",
+)
+@click.option(
+    "--pupil",
+    metavar="X,Y,R[,INNER]",
+    help="Centre and radius, pixels, of the disk whose lenslets are taken, lit or not; with the inner radius "
+    "of an annulus.",
+)
+@click.option(
+    "--exclude",
+    metavar="LIST",
+    help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
+)
+@click.option(
+    "--roi",
+    metavar="X0,Y0,X1,Y1",
+    help="Look only at columns X0 to X1 - 1 and rows Y0 to Y1 - 1 of the frame.",
+)
 @click.option(
     "--move-windows",
     is_flag=True,
     help="Move all windows alike, off their spots, to save lenslets at the frame's edge.",
 )
-@click.option("--dark", metavar="FILE|ADU", help="Dark frame, as FILE or FILE:ARRAY, or a number of ADU.")
+@click.option(
+    "--dark",
+    metavar="FILE|ADU",
+    help="Dark frame, or several (averaged), as FILE or FILE:ARRAY, or a number of ADU.",
+)
+@click.option("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
+@click.option(
+    "--bad-pixels", metavar="FILE", help="Map that is not 0 where a pixel is bad, or rows of row, column."
+)
 @click.option(
     "--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: 1, frames in electrons."
 )
+@click.option("--read-noise", type=float, metavar="E", help="Read noise in electrons, for the configuration.")
 @click.option(
     "--mask-hot-pixels",
     is_flag=True,
@@ -77,9 +113,17 @@ def command(
     geometry: str,
     pitch: float | None,
     pixels: int | None,
+    window: str | None,
+    lit_fraction: float | None,
+    pupil: str | None,
+    exclude: str | None,
+    roi: str | None,
     move_windows: bool,
     dark: str | None,
+    flat: str | None,
+    bad_pixels: str | None,
     gain: float | None,
+    read_noise: float | None,
     mask_hot_pixels: bool,
     key: str | None,
     overwrite: bool,
@@ -88,7 +132,8 @@ def command(
 
     FRAME is a file with spots, from one frame to many of the same field (the first 200 are averaged). Square
     and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are lit. A
-    picture shows the frame with the windows that were found: look at it.
+    picture shows the frame with the windows that were found: look at it. --lit-fraction, --pupil and
+    --exclude correct which are lit.
 
     A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
     Else the settings written beside the layout are a start: the strength noise_std is taken from the frame's
@@ -98,29 +143,29 @@ def command(
     Examples:
       faintspot layout flat_wavefront.fits -o faintspot.toml
       faintspot layout cube.npz --dark dark.fits --gain 1.9 --pixels 16
+      faintspot layout eye.fits --pupil 512,498,320,40 --exclude 0-3,57
     """
     target = Path(output)
     keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
     if target.exists() and not overwrite and not keeps_settings:
         raise InputError(f"{output}: exists already; --overwrite replaces its layout and settings")
+    options = {
+        "geometry": geometry,
+        "pitch_px": pitch,
+        "pixels": layout_options.window(pixels, window),
+        "lit_fraction": lit_fraction,
+        "pupil": layout_options.numbers("--pupil", pupil, (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
+        "roi": layout_options.numbers("--roi", roi, (4,), "X0,Y0,X1,Y1 in pixels"),
+        "move_windows": move_windows,
+    }
     with open_frames(frames, key=key) as source:
-        calibration = _calibration(target, dark, gain)
+        calibration = layout_options.calibration(
+            target, dark=dark, flat=flat, bad_pixels=bad_pixels, gain_e_per_adu=gain, read_noise_e=read_noise
+        )
         mean = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
-        bad = np.isnan(mean)
-        try:
-            found = find_layout(
-                np.where(bad, 0, mean),
-                geometry=geometry,
-                pitch_px=pitch,
-                pixels=pixels,
-                bad_pixels=bad,
-                move_windows=move_windows,
-            )
-        except InputError as error:
-            text = str(error).replace("pitch_px", "--pitch PX")
-            raise InputError(f"{source.description}: {text}") from None
+        found = _found(source.description, mean, exclude, options)
         layout = found.layout
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, layout, mean, hot)
@@ -128,8 +173,9 @@ def command(
     if keeps_settings:
         settings = configuration.load(target, "settings")
         notes.append(f"  the settings that {output} has are kept")
-    drawn = _draw(np.where(bad, np.nanmedian(mean), mean), layout, picture, target)
-    for item in (layout, settings, calibration):
+    drawn = _draw(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, picture, target)
+    # The layout last: it may be long, and whatever is saved after it reads it again.
+    for item in (settings, calibration, layout):
         configuration.save(target, item)
     for line in [*_describe(output, found, settings, noise, flux), *notes]:
         click.echo(line)
@@ -140,16 +186,37 @@ def command(
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
 
+def _found(
+    description: str, mean: NDArray[np.float64], exclude: str | None, options: dict[str, Any]
+) -> FoundLayout:
+    """Find the layout, and say in an error where, and which option changes it."""
+    bad = np.isnan(mean)
+    try:
+        found = find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
+    except InputError as error:
+        text = str(error)
+        for name, option in _OPTIONS.items():
+            text = text.replace(name, option)
+        raise InputError(f"{description}: {text}") from None
+    return replace(found, layout=layout_options.without(found.layout, exclude))
+
+
 def _describe(output: str, found: FoundLayout, settings: Settings, noise: float, flux: float) -> list[str]:
     """Say in a few lines what was found, and what was left out."""
     layout = found.layout
+    strength = getattr(settings, "noise_std", None)  # kept settings may be those of another estimator
+    noise_std = "" if strength is None else f": noise_std {plain(strength)}"
     rows, columns = layout.cells.max(axis=0) + 1
     height, width = layout.window
     lines = [
         f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
         f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px",
-        f"  background noise {noise:.2g} e-, median flux {flux:.4g} e-: noise_std {settings.noise_std}",
+        f"  background noise {plain(noise)} e-, median flux {plain(flux)} e-{noise_std}",
     ]
+    if found.lenslets.doubt:
+        lines.append(
+            f"  doubtful: {found.lenslets.doubt} (look at the picture; --lit-fraction or --pupil decides)"
+        )
     if len(found.cut):
         lines.append(
             f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "
@@ -201,21 +268,6 @@ def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path
             raise
         return f"no picture: {error}"
     return f"picture: {path}"
-
-
-def _calibration(target: Path, dark: str | None, gain: float | None) -> Calibration:
-    """The calibration that the configuration has already, with what was given now."""
-    calibration: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
-    if gain is not None:
-        calibration = replace(calibration, gain_e_per_adu=gain)
-    if dark is None:
-        return calibration
-    try:
-        return replace(calibration, dark=float(dark))
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        return replace(calibration, dark=read_array(dark))
 
 
 def _completed(

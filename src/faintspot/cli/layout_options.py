@@ -1,0 +1,108 @@
+"""What the options of `faintspot layout` say: numbers, ranges of numbers, and maps of the camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot import configuration
+from faintspot.errors import InputError
+from faintspot.io.frames import read_array
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+
+
+def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: str) -> list[float] | None:
+    """Return the numbers of a text such as 1,2.5,3; InputError when they are not so many."""
+    if text is None:
+        return None
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not np.isfinite(values).all():
+        raise InputError(f"{option} {text}: expected {expected}")
+    return values
+
+
+def window(pixels: int | None, text: str | None) -> int | tuple[int, int] | None:
+    """Return the window's side, or its height and width, of the two options that say it."""
+    if text is None:
+        return pixels
+    if pixels is not None:
+        raise InputError("--pixels, --window: expected one of them, got both")
+    height, width = numbers("--window", text, (2,), "height and width in pixels, such as 12,16") or (0, 0)
+    return (height, width)  # type: ignore[return-value]  # checked for whole numbers where windows are made
+
+
+def without(layout: Layout, text: str | None) -> Layout:
+    """Return the layout without the sub-apertures of a text such as 3,17,40-45."""
+    if text is None:
+        return layout
+    kept = np.ones(len(layout), dtype=bool)
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdecimal() or not (last.isdecimal() or not dash):
+            raise InputError(
+                f"--exclude {text}: expected numbers and ranges of sub-apertures, such as 3,17,40-45"
+            )
+        low, high = int(first), int(last or first)
+        if not low <= high < len(layout):
+            raise InputError(f"--exclude {part.strip()}: expected sub-apertures from 0 to {len(layout) - 1}")
+        kept[low : high + 1] = False
+    if not kept.any():
+        raise InputError(f"--exclude {text}: no sub-aperture is left of {len(layout)}")
+    return layout[kept]
+
+
+def calibration(target: Path, **given: Any) -> Calibration:
+    """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
+    known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
+    maps = {"dark": dark_level, "flat": flat_field, "bad_pixels": bad_pixels}
+    changes = {
+        name: maps[name](value) if name in maps else value
+        for name, value in given.items()
+        if value is not None
+    }
+    return replace(known, **changes)
+
+
+def dark_level(text: str) -> Any:
+    """Return a dark level in ADU: a number, or a frame, the mean of several."""
+    try:
+        return float(text)
+    except ValueError:
+        return _mean_map(text)
+
+
+def flat_field(text: str) -> NDArray[np.float64]:
+    """Return the relative response of the pixels: a frame, or the mean of several, divided by its mean."""
+    flat = _mean_map(text)
+    usable = np.isfinite(flat) & (flat > 0)
+    if not usable.any():
+        raise InputError(f"{text}: expected a flat field, no pixel is above 0")
+    return np.asarray(flat / flat[usable].mean())
+
+
+def bad_pixels(text: str) -> NDArray[Any]:
+    """Return bad pixels: a map in which all but 0 is bad, or rows of (row, column)."""
+    array = read_array(text)
+    if array.ndim == 2 and array.shape[1] == 2:
+        return array
+    return np.asarray((array != 0) | ~np.isfinite(array))
+
+
+def plain(value: Any) -> str:
+    """Return a number with three digits, never as 6.7e+02; what is not one number as it is."""
+    if not isinstance(value, float | int):
+        return str(value)
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
+
+
+def _mean_map(text: str) -> NDArray[np.float64]:
+    array = read_array(text)
+    return np.asarray(array.mean(axis=0, dtype=np.float64) if array.ndim == 3 else array, dtype=np.float64)
