@@ -12,7 +12,7 @@ from tests.sensor.sensor_cases import spot_frame
 
 import faintspot as fs
 from faintspot.sensor import windows
-from faintspot.sensor.windows import find_layout
+from faintspot.sensor.found_layout import find_layout
 
 
 def nodes(

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.checks import finite_array
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
-from faintspot.sensor.layout import LARGEST_WINDOW, SMALLEST_WINDOW, Layout
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.slopes import Slopes
 
 _EXACT_PX = 1e-6  # what a centre in pixels may be off by rounding

@@ -12,9 +12,9 @@ from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.layout import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.settings import Settings
 from faintspot.slopes import Slopes
 

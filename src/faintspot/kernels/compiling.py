@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.types import Array, BaseNamedTuple, BaseTuple, NamedTuple
+from numba.core import types as numba_types
 
 
 @cache
@@ -87,12 +87,15 @@ class Direct:
         return self._entry(*arguments)
 
 
+types: Any = numba_types  # as far as mypy knows, a part of it is missing
+
+
 def _writable(kind: Any) -> Any:
     """Return the type of arrays that may be written to, also within tuples."""
-    if isinstance(kind, Array):
+    if isinstance(kind, types.Array):
         return kind.copy(readonly=False)
-    if isinstance(kind, BaseNamedTuple):
-        return NamedTuple([_writable(each) for each in kind], kind.instance_class)
-    if isinstance(kind, BaseTuple):
-        return BaseTuple.from_types([_writable(each) for each in kind])
+    if isinstance(kind, types.BaseNamedTuple):
+        return types.NamedTuple([_writable(each) for each in kind], kind.instance_class)
+    if isinstance(kind, types.BaseTuple):
+        return types.BaseTuple.from_types([_writable(each) for each in kind])
     return kind

@@ -17,8 +17,9 @@ from faintspot.planner.photometry import (
     Photometry,
 )
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.layout import LARGEST_WINDOW, SMALLEST_WINDOW, Layout
+from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
+from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.simulate.detector import Detector
 from faintspot.simulate.turbulence import LARGEST_D_OVER_R0
 

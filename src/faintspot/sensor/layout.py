@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.sensor.window_size import pair_of_numbers, window_size
 from faintspot.tables import check_fields, chosen_fields, errors_of_table, read_tables, save_tables, table_of
 from faintspot.toml_files import check_keys, checked_table
 
+if TYPE_CHECKING:
+    from faintspot.sensor.windows import Windows
+
 GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
 GEOMETRIES = ("square", "hexagonal")
-SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Layout:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        put(self, "frame_shape", _pair("layout.frame_shape", self.frame_shape, 1, 2**31))
+        put(self, "frame_shape", pair_of_numbers("layout.frame_shape", self.frame_shape, 1, 2**31))
         put(self, "window", window_size("layout.window", self.window))
         corners = _rows_of_two("layout.corners", self.corners)
         corners = numbers_between("layout.corners", corners, -(2**31), 2**31, integer=True)
@@ -163,10 +166,10 @@ class Layout:
         InputError
             When nothing is lit, or as for `Layout`.
         """
-        n_rows, n_columns = _pair("shape", shape, 1, 10_000)
+        n_rows, n_columns = pair_of_numbers("shape", shape, 1, 10_000)
         window = window_size("pixels", pixels)
-        step = window if pitch is None else _pair("pitch", pitch, 1, 10_000)
-        start = _pair("origin", origin, 0, 2**31)
+        step = window if pitch is None else pair_of_numbers("pitch", pitch, 1, 10_000)
+        start = pair_of_numbers("origin", origin, 0, 2**31)
         outer = np.inf if outer_radius is None else number_between("outer_radius", outer_radius, 0.0)
         inner = 0.0 if inner_radius is None else number_between("inner_radius", inner_radius, 0.0)
         cells = np.stack(np.meshgrid(np.arange(n_rows), np.arange(n_columns), indexing="ij"), -1).reshape(
@@ -220,16 +223,16 @@ class Layout:
         Layout
             Of the lit sub-apertures whose windows lie within the frame. Windows have the spots' mean lattice
             in their middle, unless they were moved; `centres` always holds the lattice.
-            `faintspot.sensor.windows.find_layout` says which lenslets were left out at the frame's edge.
+            `faintspot.sensor.found_layout.find_layout` says which lenslets were left out at the frame's edge.
 
         Raises
         ------
         InputError
             When no regular array of spots is found.
         """
-        from faintspot.sensor.windows import find_layout
+        from faintspot.sensor.windows import find_windows
 
-        return find_layout(
+        found = find_windows(
             frame,
             pixels=pixels,
             move_windows=move_windows,
@@ -237,7 +240,23 @@ class Layout:
             pitch_px=pitch_px,
             bad_pixels=bad_pixels,
             **options,
-        ).layout
+        )
+        return cls.of_windows(found)
+
+    @classmethod
+    def of_windows(cls, found: Windows) -> Layout:
+        """Return the layout of the windows that lie within the frame."""
+        grid, within = found.lenslets, found.within
+        return cls(
+            found.frame_shape,
+            found.window,
+            found.corners[within],
+            grid.centres[within],
+            grid.cells[within],
+            grid.geometry,
+            grid.pitch_px,
+            grid.angle_deg,
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Layout:
@@ -285,21 +304,6 @@ class Layout:
         return array[..., rows, columns]
 
 
-def finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
-    """Return a real array of two or three dimensions, which may hold NaN."""
-    from faintspot.checks import real_array
-
-    array = real_array(name, value, minimum_dimensions=2)
-    if array.ndim > 3:
-        raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
-    return array
-
-
-def window_size(name: str, value: Any) -> tuple[int, int]:
-    """Return height and width of a window, from one number or two."""
-    return _pair(name, value, SMALLEST_WINDOW, LARGEST_WINDOW)
-
-
 def _index(chosen: Any, length: int) -> NDArray[np.int64]:
     """Return the numbers of the chosen ones of so many sub-apertures."""
     if isinstance(chosen, slice):
@@ -319,15 +323,6 @@ def _index(chosen: Any, length: int) -> NDArray[np.int64]:
     if len(index) == 0:
         raise InputError("layout[...]: expected at least one sub-aperture, none is chosen")
     return np.asarray(index)
-
-
-def _pair(name: str, value: Any, low: float, high: float) -> tuple[int, int]:
-    """Two whole numbers, from one or two."""
-    array = numbers_between(name, value, low, high, integer=True)
-    if array.ndim > 1 or array.size not in (1, 2):
-        raise InputError(f"{name}: expected one or two whole numbers, got shape {array.shape}")
-    first, second = np.broadcast_to(array, 2)
-    return int(first), int(second)
 
 
 def _rows_of_two(name: str, value: Any) -> NDArray[Any]:

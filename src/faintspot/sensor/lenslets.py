@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std
-from faintspot.sensor.layout import SMALLEST_WINDOW
 from faintspot.sensor.lit import Lit, find_lit
 from faintspot.sensor.nodes import NodeLight, measure_nodes, spot_width
 from faintspot.sensor.region import Pupil, Rectangle
+from faintspot.sensor.window_size import SMALLEST_WINDOW
 
 _FIT_PASSES = 4
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from faintspot.checks import real_array
 from faintspot.errors import InputError
-from faintspot.sensor.layout import LARGEST_WINDOW, Layout, finite_or_masked, window_size
 from faintspot.sensor.lenslets import LensletGrid, find_lenslets
+from faintspot.sensor.window_size import LARGEST_WINDOW, window_size
 
 # Windows may be spread this far from their spots to be a pixel larger: as far as rounding their corners to
 # whole pixels moves them anyway.
@@ -19,39 +20,42 @@ _SPREAD_PX = 0.5
 _LARGEST_SHIFT = 0.35  # of a window's side, by which windows that may be moved are moved off their spots
 
 
-@dataclass(frozen=True)
-class FoundLayout:
-    """A layout found in a frame, and what was left out of it.
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of the lenslets that were found in a frame.
 
     Parameters
     ----------
-    layout : Layout
-        The lit sub-apertures whose windows lie within the frame.
+    frame_shape, window : (int, int)
+    corners : (n, 2) array of int
+        Row and column of every window's first pixel.
+    within : (n,) array of bool
+        Whether it lies within the frame.
     lenslets : LensletGrid
         All lit lenslets, those at the edge too.
-    cut : (n, 2) array
-        x, y of the lit lenslets that were left out because their window leaves the frame, px.
     """
 
-    layout: Layout
+    frame_shape: tuple[int, int]
+    window: tuple[int, int]
+    corners: NDArray[np.int64]
+    within: NDArray[np.bool_]
     lenslets: LensletGrid
-    cut: NDArray[np.float64]
 
 
-def find_layout(
+def find_windows(
     frame: ArrayLike,
     *,
     pixels: int | tuple[int, int] | None = None,
     move_windows: bool = False,
     **options: Any,
-) -> FoundLayout:
-    """Find the sub-apertures of a frame, and say which were left out.
+) -> Windows:
+    """Find the lenslets of a frame, and a window for each.
 
     Parameters
     ----------
     frame : (h, w) or (n, h, w) array
     pixels : int or (int, int), optional
-        Window, see `Layout.from_frame`.
+        Window, see `faintspot.Layout.from_frame`.
     move_windows : bool
         Whether all windows may be moved off the spots to save those at the frame's edge.
     **options
@@ -62,7 +66,7 @@ def find_layout(
     InputError
         When no regular array of spots is found, or no window lies within the frame.
     """
-    array = finite_or_masked("frame", frame)
+    array = _finite_or_masked("frame", frame)
     window = None if pixels is None else window_size("pixels", pixels)
     grid = find_lenslets(array, **options)
     shape = (int(array.shape[-2]), int(array.shape[-1]))
@@ -80,17 +84,15 @@ def find_layout(
             f"frame: the windows of all {len(corners)} lenslets found leave the frame; "
             f"try pixels < {min(window)}"
         )
-    layout = Layout(
-        shape,
-        window,
-        corners[within],
-        grid.centres[within],
-        grid.cells[within],
-        grid.geometry,
-        grid.pitch_px,
-        grid.angle_deg,
-    )
-    return FoundLayout(layout, grid, grid.centres[~within])
+    return Windows(shape, window, corners, within, grid)
+
+
+def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
+    """Return a real array of two or three dimensions, which may hold NaN."""
+    array = real_array(name, value, minimum_dimensions=2)
+    if array.ndim > 3:
+        raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
+    return array
 
 
 def _largest_window(middles: NDArray[np.float64], pitch_px: float) -> tuple[int, int]:

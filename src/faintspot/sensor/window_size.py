@@ -1,0 +1,26 @@
+"""How large windows may be, and pairs of numbers such as their size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from faintspot.checks import numbers_between
+from faintspot.errors import InputError
+
+SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
+
+
+def window_size(name: str, value: Any) -> tuple[int, int]:
+    """Return height and width of a window, from one number or two."""
+    return pair_of_numbers(name, value, SMALLEST_WINDOW, LARGEST_WINDOW)
+
+
+def pair_of_numbers(name: str, value: Any, low: float, high: float) -> tuple[int, int]:
+    """Two whole numbers, from one or two."""
+    array = numbers_between(name, value, low, high, integer=True)
+    if array.ndim > 1 or array.size not in (1, 2):
+        raise InputError(f"{name}: expected one or two whole numbers, got shape {array.shape}")
+    first, second = np.broadcast_to(array, 2)
+    return int(first), int(second)
