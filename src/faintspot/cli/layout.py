@@ -204,13 +204,14 @@ def _found(
 def _describe(output: str, found: FoundLayout, settings: Settings, noise: float, flux: float) -> list[str]:
     """Say in a few lines what was found, and what was left out."""
     layout = found.layout
-    strength = plain(settings.noise_std) if isinstance(settings.noise_std, float) else settings.noise_std
-    rows, columns = layout.cells.max(axis=0) + 1
+    strength = getattr(settings, "noise_std", None)  # kept settings may be those of another estimator
+    noise_std = "" if strength is None else f": noise_std {plain(strength)}"
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
     height, width = layout.window
     lines = [
         f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
         f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px",
-        f"  background noise {plain(noise)} e-, median flux {plain(flux)} e-: noise_std {strength}",
+        f"  background noise {plain(noise)} e-, median flux {plain(flux)} e-{noise_std}",
     ]
     if found.lenslets.doubt:
         lines.append(

@@ -96,8 +96,10 @@ def bad_pixels(text: str) -> NDArray[Any]:
     return np.asarray((array != 0) | ~np.isfinite(array))
 
 
-def plain(value: float) -> str:
-    """Return a number with three digits, never as 6.7e+02."""
+def plain(value: Any) -> str:
+    """Return a number with three digits, never as 6.7e+02; what is not one number as it is."""
+    if not isinstance(value, float | int):
+        return str(value)
     return np.format_float_positional(float(f"{value:.3g}"), trim="-")
 
 
