@@ -19,9 +19,9 @@ from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.layout import GEOMETRIES, Layout
+from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
@@ -206,7 +206,7 @@ def _describe(output: str, found: FoundLayout, settings: Settings, noise: float,
     layout = found.layout
     strength = getattr(settings, "noise_std", None)  # kept settings may be those of another estimator
     noise_std = "" if strength is None else f": noise_std {plain(strength)}"
-    rows, columns = layout.cells.max(axis=0) + 1
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
     height, width = layout.window
     lines = [
         f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
