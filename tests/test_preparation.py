@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot import configuration, spot_tables
+from faintspot import configuration
+from faintspot.estimators import spot_tables
 
 LAYOUT = fs.Layout.grid((3, 4), pixels=12)
 NOISE = fs.Calibration(read_noise_e=1.0)
@@ -54,7 +55,7 @@ class TestWhatIsMissing:
             fs.SlopePipeline(LAYOUT, fs.Settings(noise_std="auto"), NOISE)
 
     def test_level(self) -> None:
-        with pytest.raises(fs.InputError, match=r"settings\.threshold_e"):
+        with pytest.raises(fs.InputError, match=r"estimator\.threshold_e"):
             fs.SlopePipeline(LAYOUT, fs.Settings(estimator="thresholded"), NOISE)
 
     def test_index_of_another_sensor(self) -> None:
@@ -139,7 +140,7 @@ class TestConfiguration:
     def test_mistakes(self, tmp_path: Path, table: str, message: str) -> None:
         path = tmp_path / "faintspot.toml"
         configuration.save(path, LAYOUT)
-        configuration.save(path, fs.Settings(denoise=False))
+        configuration.save(path, fs.Settings("brightest"))
         with path.open("a") as file:
             file.write("\n" + table)
         with pytest.raises(fs.InputError) as caught:

@@ -9,7 +9,7 @@ import pytest
 from tests.estimate.image_cases import refused
 
 import faintspot as fs
-from faintspot.estimators import estimator_named
+from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.options import PerSubaperture
 from faintspot.settings import option_names
 
@@ -169,7 +169,7 @@ class TestReplace:
 class TestEstimators:
     def test_a_name_or_an_object(self) -> None:
         by_name = fs.Settings("ml", model_error=0.2, search_range_px=2.0)
-        made = estimator_named("ml")(model_error=0.2)
+        made = MaximumLikelihood(model_error=0.2)
         by_object = fs.Settings(made, search_range_px=2.0)
         assert by_object == by_name
         assert by_object.estimator is made
@@ -179,7 +179,7 @@ class TestEstimators:
 
     def test_an_object_has_its_options_already(self) -> None:
         with refused("model_error: give it to the estimator's own object"):
-            fs.Settings(estimator_named("ml")(), model_error=0.2)
+            fs.Settings(MaximumLikelihood(), model_error=0.2)
 
     def test_options_are_those_of_the_estimator_and_the_shared_ones(self) -> None:
         settings = fs.Settings("thresholded", threshold_e=3.0)
@@ -213,7 +213,7 @@ class TestEstimators:
         assert smoothed == fs.Settings(
             "smoothed", keep_brightest=9, smoothing_px=0.8, search_range_px=3.0, flux_e=[1.0, 2.0]
         )
-        ml = tv.replace(estimator=estimator_named("ml")(model_error=0.3))
+        ml = tv.replace(estimator=MaximumLikelihood(model_error=0.3))
         assert ml == fs.Settings("ml", model_error=0.3, search_range_px=3.0, flux_e=[1.0, 2.0])
         with refused("noise_std: an option of 'tv', not of 'smoothed'"):
             tv.replace(estimator="smoothed", noise_std=2.0)

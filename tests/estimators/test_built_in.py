@@ -12,8 +12,17 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.estimators import Estimator, estimator_named, registry
-from faintspot.estimators.registry import estimators
+from faintspot.estimators import Estimator, estimators, registry
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.centroid import CentreOfGravity
+from faintspot.estimators.matched import Matched
+from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
+from faintspot.estimators.maximum_likelihood import MaximumLikelihood
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.thresholded import Thresholded
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.estimators.trained import Trained
+from faintspot.estimators.weighted import Weighted
 from faintspot.testing import FLUX_E, READ_NOISE_E, SIDE, EstimatorTests
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_estimator.py"
@@ -29,7 +38,7 @@ def only_here() -> Iterator[None]:
 
 class TestBrightest(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("brightest")(keep_brightest=20)
+        return BrightestPixels(keep_brightest=20)
 
 
 class TestTotalVariation(EstimatorTests):
@@ -39,7 +48,7 @@ class TestTotalVariation(EstimatorTests):
     error_ratio = (0.5, 2.0)
 
     def make(self) -> Estimator:
-        return estimator_named("tv")(noise_std=2.0, keep_brightest=20)
+        return TotalVariation(noise_std=2.0, keep_brightest=20)
 
 
 class TestSmoothed(EstimatorTests):
@@ -47,37 +56,37 @@ class TestSmoothed(EstimatorTests):
     error_ratio = (0.5, 2.0)
 
     def make(self) -> Estimator:
-        return estimator_named("smoothed")(keep_brightest=20)
+        return Smoothed(keep_brightest=20)
 
 
 class TestCentroid(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("centroid")()
+        return CentreOfGravity()
 
 
 class TestThresholded(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("thresholded")(threshold_e=5.0)
+        return Thresholded(threshold_e=5.0)
 
 
 class TestWeighted(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("weighted")()
+        return Weighted()
 
 
 class TestMatched(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("matched")()
+        return Matched()
 
 
 class TestMaximumLikelihood(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("ml")()
+        return MaximumLikelihood()
 
 
 class TestMaximumAPosteriori(EstimatorTests):
     def make(self) -> Estimator:
-        return estimator_named("map")(prior_std_px=0.5)
+        return MaximumAPosteriori(prior_std_px=0.5)
 
 
 @functools.cache
@@ -97,7 +106,7 @@ class TestTrained(EstimatorTests):
     centre_tolerance_px = 0.02
 
     def make(self) -> Estimator:
-        return estimator_named("trained")()
+        return Trained()
 
     def score(self) -> fs.TrainedScore:
         return trained_score()

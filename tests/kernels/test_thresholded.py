@@ -30,10 +30,10 @@ def in_lanes(pipeline: fs.SlopePipeline, frame: np.ndarray) -> fs.Slopes:
     prepared: Any = pipeline.preparation.prepared
     other = copy.copy(pipeline)
     other.preparation = copy.copy(pipeline.preparation)
-    other.preparation.prepared = copy.copy(prepared)
-    other.preparation.prepared.kernel = gravity_of_groups
-    other.preparation.prepared.tables = prepared.tables.gravity
-    other.preparation._made = None
+    changed: Any = copy.copy(prepared)
+    changed.kernel, changed.tables = gravity_of_groups, prepared.tables.gravity
+    other.preparation.prepared = changed
+    other.preparation._made, other.preparation._kernels = None, {}
     return other(frame)
 
 

@@ -19,9 +19,9 @@ from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.layout import GEOMETRIES, Layout
-from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots

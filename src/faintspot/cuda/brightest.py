@@ -146,7 +146,7 @@ def make_standard_errors(strips: Strips) -> Any:
         within = float32(1.0 / 12.0)  # of the light in a pixel, where in it is not known: px^2
         noise, noise_y = float32(0.0), float32(0.0)
         for r in range(rows):
-            if left[r] > float32(0.0):
+            if left[r] != float32(0.0):
                 pixel = max(image[r], float32(0.0)) * excess + variance
                 away = from_y + float32(r)
                 noise += pixel

@@ -261,7 +261,7 @@ def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, la
             left = select(g >= threshold, g - offset, zero)
             row, row_x = row + left, multiply_add(left, column, row_x)
             variance = multiply_add(maximum(load(lanes, measured, here), zero), e, v)
-            variance = select(left > zero, variance, zero)
+            variance = select(absolute(left) > zero, variance, zero)
             away = variance * column
             part, part_x, part_xx = part + variance, part_x + away, multiply_add(away, column, part_xx)
         line = _from_middle(lanes, y, ny)
