@@ -99,8 +99,8 @@ class Workplace:
 
 def run_units(
     function: Callable[..., Arrays], units: list[Unit], store: UnitStore, place: Workplace
-) -> dict[str, Arrays]:
-    """Run the units whose results are not stored yet, store each as it finishes, and return all results.
+) -> Mapping[str, Arrays]:
+    """Run the units whose results are not stored yet, store each as it finishes; return all results, by key.
 
     Results do not depend on where units run, in which order, or on interruptions.
 
@@ -127,7 +127,23 @@ def run_units(
         for unit, result in _finished(function, missing, place, count):
             store.write(unit.key, result)
             count.at(unit.key, unit.size)
-    return {unit.key: store.read(unit.key) for unit in units}
+    return _Stored(store, [unit.key for unit in units])
+
+
+class _Stored(Mapping[str, Arrays]):
+    """Results of units by key, read when they are asked for."""
+
+    def __init__(self, store: UnitStore, keys: list[str]) -> None:
+        self._store, self._keys = store, keys
+
+    def __getitem__(self, key: str) -> Arrays:
+        return self._store.read(key)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)
 
 
 Finished = Iterator[tuple[Unit, Arrays]]

@@ -65,15 +65,12 @@ def study_curves(dataset: xarray.Dataset, mode: str) -> dict[Configuration, Curv
     if mode not in modes:
         raise InputError(f"mode {mode!r}: expected one of {', '.join(modes)}")
     arms = tuple(str(name) for name in dataset["arm"].values)
-    of_mode = dataset[["error", "error_se", "error_covariance"]].sel(mode=mode)
+    of_mode = dataset[["error", "error_covariance"]].sel(mode=mode)
     error = of_mode["error"].transpose("cell", "arm").values
-    error_se = of_mode["error_se"].transpose("cell", "arm").values
     covariance = of_mode["error_covariance"].transpose("cell", "arm", "arm2").values
     flux = np.asarray(dataset["flux_e"].values, dtype=np.float64)
     return {
-        configuration: Curve(
-            configuration, flux[cells], arms, error[cells], error_se[cells], covariance[cells]
-        )
+        configuration: Curve(flux[cells], arms, error[cells], covariance[cells])
         for configuration, cells in cells_by_configuration(dataset).items()
     }
 
