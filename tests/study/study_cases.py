@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import xarray
 
-from faintspot.study.specification import KEEPING_ARMS
+from faintspot.study.arms import keeps_every_k, kind_of
 
-ARMS = ("plain", "tv", "threshold", "gaussian", "median", "thresholded")
+ARMS = ("brightest", "tv", "threshold", "smoothed", "median", "thresholded")
 ESTIMATOR_ARMS = ("ml", "map", "weighted")
 MODES = ("best", "fixed20", "fixed40", "fixed60")
 DEFAULTS: dict[str, Any] = {
@@ -49,7 +49,7 @@ def dataset(
     *,
     relative_se: float = 0.003,
     correlation: float = 0.6,
-    rise_with_k: Callable[[str], float] = lambda arm: 0.5 if arm == "plain" else 0.1,
+    rise_with_k: Callable[[str], float] = lambda arm: 0.5 if arm == "brightest" else 0.1,
     unfinished: Sequence[int] = (),
     arms: tuple[str, ...] = ARMS,
 ) -> xarray.Dataset:
@@ -64,7 +64,7 @@ def dataset(
     at_k = values[:, :, :1] * rise
     beyond = np.array([cell["pixels"] ** 2 - 1 for cell in every])[:, None, None] < k
     at_k = np.where(beyond, np.nan, at_k)
-    at_k[:, [arm not in KEEPING_ARMS for arm in arms]] = np.nan
+    at_k[:, [not keeps_every_k(kind_of(arm)) for arm in arms]] = np.nan
     done = np.ones(n, dtype=bool)
     done[list(unfinished)] = False
     choice = np.broadcast_to(0.5, values.shape).copy()

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.study import StudySpecification, Sweep, estimator_arms, measure_cell
+from faintspot.study import StudySpecification, Sweep, measure_cell
+from faintspot.study import arms as study_arms
+from faintspot.study.arms import CellArms
 from faintspot.study.cell import realisations
-from faintspot.study.estimator_arms import EstimatorArms
-from faintspot.study.specification import ESTIMATOR_ARMS, Robustness
 
-ARMS = ("plain", *ESTIMATOR_ARMS)
+ESTIMATOR_ARMS = ("weighted", "matched", "ml", "map", "trained")
+ARMS = ("brightest", *ESTIMATOR_ARMS)
 COUNT = 2000
 
 
@@ -30,7 +31,7 @@ def quick_training() -> Iterator[None]:
     """Train on fewer spots: worse by 2 % (30 e-)."""
     with pytest.MonkeyPatch.context() as patch:
         quick = functools.partial(fs.train_estimator, realisations=3000)
-        patch.setattr(estimator_arms, "train_estimator", quick)
+        patch.setattr(study_arms, "train_estimator", quick)
         yield
 
 
@@ -45,7 +46,7 @@ def test_estimators_reach_the_bound(measured: dict[str, Any]) -> None:
     efficiency = dict(zip(ARMS, measured["photon_efficiency"][:, 0], strict=True))
     for arm in ("ml", "map", "trained"):
         assert 0.8 < efficiency[arm] < 1.2
-    assert efficiency["plain"] < efficiency["weighted"] < efficiency["ml"]
+    assert efficiency["brightest"] < efficiency["weighted"] < efficiency["ml"]
 
 
 def test_efficiency_is_that_of_the_public_function(measured: dict[str, Any]) -> None:
@@ -59,7 +60,7 @@ def test_efficiency_is_that_of_the_public_function(measured: dict[str, Any]) -> 
 def test_stated_errors_are_actual_ones(measured: dict[str, Any]) -> None:
     """10 % of the estimators' own accuracy and 5 standard errors of 1.3 %."""
     stated = dict(zip(ARMS, measured["stated_over_actual"], strict=True))
-    assert np.isnan(stated["plain"])
+    assert np.isnan(stated["brightest"])
     for arm in ("ml", "map", "trained"):
         assert stated[arm] == pytest.approx(1.0, abs=0.17)
     assert np.isfinite(measured["stated_over_actual_all"][1:]).all()
@@ -77,9 +78,9 @@ def test_positions_stay_within_the_search_range() -> None:
     specification = specification_of(flux_e=5, read_noise_e=3)
     cell = specification.cells()[0]
     ((images, _),) = realisations(cell, 200, np.random.default_rng(1))
-    arms = EstimatorArms(cell, 1, 1.0, 5.0)
+    arms = CellArms(cell, specification, 5.0)
     for arm in ESTIMATOR_ARMS:
-        slopes = arms.measure(arm, specification.candidates(arm, cell)[0], images)
+        slopes = arms.measure(arm, arms.candidates(arm)[0], images)
         assert max(np.abs(slopes.x).max(), np.abs(slopes.y).max()) <= 1.0 + 1e-6, arm
 
 
@@ -89,7 +90,7 @@ def test_cameras_are_known_to_the_estimators(changes: dict[str, Any]) -> None:
     specification = specification_of(flux_e=200, **changes)
     cell = specification.cells()[0]
     ((images, truth),) = realisations(cell, 1500, np.random.default_rng(1))
-    slopes = EstimatorArms(cell, 1, 1.0, 200.0).measure("ml", Robustness(0.0, 0.0), images)
+    slopes = CellArms(cell, specification, 200.0).measure("ml", (), images)
     errors = np.stack([slopes.x, slopes.y], axis=-1) - truth
     stated = np.sqrt(np.mean(np.square([slopes.standard_error_x, slopes.standard_error_y])))
     assert stated == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.2)
@@ -100,7 +101,7 @@ def test_speckled_spots() -> None:
         specification_of(flux_e=200, d_over_r0=3),
         realisations=800,
         corrected=True,
-        arms=["plain", "ml", "trained"],
+        arms=["brightest", "ml", "trained"],
         blurs=[0.0, 1.8],
         model_errors=[0.2],
     )

@@ -18,7 +18,7 @@ from faintspot.study.efficiency import compares_estimators, enough_photons, find
 from faintspot.study.estimator_figures import estimator_figures
 from faintspot.study.sweep import Cell
 
-ARMS = ("plain", "tv", "ml", "map", "weighted")
+ARMS = ("brightest", "tv", "ml", "map", "weighted")
 
 
 def error(cell: dict[str, Any], arm: str, mode: str) -> float:

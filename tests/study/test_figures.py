@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faintspot.study.cell_table import mode_in_words
 from tests.study.study_cases import ARMS, MODES, cells, dataset, power_law
 
-from faintspot.study.cell_numbers import mode_in_words
 from faintspot.study.figures import baselines_figure, kept_pixels_figure, sweep_figure
 from faintspot.study.kept_pixels import kept_panels, spread
 from faintspot.study.triple_picture import triple_images, triple_picture
@@ -50,7 +50,7 @@ def test_solid_is_tv_and_dashed_is_not() -> None:
     figure = sweep_figure(data, list(range(5)), "fig9", "A title").figure
     lines = [line for line in figure.axes[0].lines if np.size(line.get_xdata()) == 5]
     assert [line.get_linestyle() for line in lines] == ["-", "--"]
-    for line, arm in zip(lines, ("tv", "plain"), strict=True):
+    for line, arm in zip(lines, ("tv", "brightest"), strict=True):
         wanted = data["error"].sel(arm=arm, mode="best").values[:5]
         np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), wanted)
 
@@ -79,7 +79,7 @@ def test_kept_pixels_are_drawn_for_signals_sizes_and_noises() -> None:
     assert second.startswith("spot sizes")
     assert third.startswith("read noises")
     assert made.header[:3] == ["panel", "arm", "k"]
-    assert kept_pixels_figure(study().sel(arm=["plain"], arm2=["plain"])) is None
+    assert kept_pixels_figure(study().sel(arm=["brightest"], arm2=["brightest"])) is None
 
 
 def test_kept_panels_take_the_nearest_flux_and_the_largest_window() -> None:
@@ -94,7 +94,7 @@ def test_kept_panels_take_the_nearest_flux_and_the_largest_window() -> None:
 
 def test_spread_is_that_of_the_curve() -> None:
     data = study()
-    found = spread(data, 0, "plain")
+    found = spread(data, 0, "brightest")
     assert found is not None
     assert found[0] == pytest.approx(np.log(1 + 0.5 * np.log(6) ** 2 / 3))
     assert spread(data, 0, "thresholded") is None

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("xarray")
 
 from faintspot.study import StudySpecification, Sweep, run
-from faintspot.study.gains import gains_by_mode
+from faintspot.study.page_tables import gains_by_mode
 
 
 def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:
@@ -15,7 +15,7 @@ def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:
         Sweep("dark", flux_e=(10, 12), read_noise_e=(16,)),  # never reaches 0.15 px
     ]
     dataset = run(
-        StudySpecification("gains", sweeps, realisations=600, arms=("plain", "tv"), fixed_k=(20, 40)),
+        StudySpecification("gains", sweeps, realisations=600, arms=("brightest", "tv"), fixed_k=(20, 40)),
         workers=0,
     )
     table = gains_by_mode(dataset)

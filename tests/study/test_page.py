@@ -65,7 +65,7 @@ class TestPage:
 
     def test_of_arms_without_tv_has_no_verdict(self) -> None:
         data = of(paper.specification(quick=True, figures=["fig3"]))
-        html = study_report(data.sel(arm=["plain", "gaussian"], arm2=["plain", "gaussian"]))
+        html = study_report(data.sel(arm=["brightest", "smoothed"], arm2=["brightest", "smoothed"]))
         assert "No verdicts" in html
 
 

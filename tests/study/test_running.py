@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import os
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +10,6 @@ import numpy as np
 import pytest
 from tests.study.study_runs import N_CELLS, SPECIFICATION, assert_identical, assert_same
 
-import faintspot
 from faintspot import InputError, study
 from faintspot.study import running
 from faintspot.study.cell import score_cell
@@ -35,7 +28,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_in_memory(uninterrupted: Path) -> None:
     counts = []
     result = study.run(SPECIFICATION, workers=0, progress=lambda *count: counts.append(count))
-    assert counts == [(i, N_CELLS) for i in range(1, N_CELLS + 1)]
+    assert counts == [(i, N_CELLS) for i in range(N_CELLS + 1)]
     assert result["done"].all()
     assert_identical(result, study.open_study(uninterrupted))
 
@@ -55,7 +48,7 @@ def test_interrupted_and_started_again(tmp_path: Path, uninterrupted: Path) -> N
     assert counts[-1] == (N_CELLS - 4, N_CELLS - 4)
     assert_same(path, uninterrupted)
     study.run(SPECIFICATION, path, workers=0, progress=lambda *count: counts.append(count))
-    assert len(counts) == N_CELLS - 4
+    assert len(counts) == N_CELLS - 4 + 1
 
 
 def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
@@ -70,75 +63,18 @@ def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
             np.testing.assert_array_equal(part[name][cell], same[name], err_msg=name)
 
 
-@pytest.fixture
-def scheduler() -> Iterator[str]:
-    """Address of a Dask scheduler without workers."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=0, dashboard_address="localhost:0", silence_logs=logging.CRITICAL
-    ) as cluster:
-        yield cluster.scheduler_address
-
-
-@pytest.fixture
-def two_workers(scheduler: str) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Two Dask workers, processes of their own that nobody restarts."""
-    arguments = ["--no-nanny", "--nthreads", "1", "--no-dashboard", "--death-timeout", "60"]
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])}
-    workers = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        for _ in range(2)
-    ]
-    yield workers
-    for worker in workers:
-        worker.kill()
-        worker.wait()
-
-
-def test_one_of_two_worker_processes_is_killed(
-    scheduler: str, two_workers: list[subprocess.Popen[bytes]], tmp_path: Path, uninterrupted: Path
-) -> None:
-    distributed = pytest.importorskip("distributed")
-    with distributed.Client(scheduler, set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=60)
-        at_work = set(client.run(os.getpid).values())
-    assert at_work == {worker.pid for worker in two_workers}
-    counts = []
-
-    def kill_one(finished: int, total: int) -> None:
-        counts.append(finished)
-        if finished == 1:
-            os.kill(two_workers[0].pid, signal.SIGKILL)
-
-    path = tmp_path / "s.zarr"
+def test_processes(uninterrupted: Path, tmp_path: Path) -> None:
     lines: list[str] = []
-    study.run(SPECIFICATION, path, scheduler, kill_one, announce=lines.append)
-    assert two_workers[0].wait() == -signal.SIGKILL
-    assert two_workers[1].poll() is None
-    assert counts == list(range(1, N_CELLS + 1))
-    assert scheduler in lines[0]
-    assert_same(path, uninterrupted)
-
-
-def test_local_cluster(uninterrupted: Path, tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    study.run(SPECIFICATION, tmp_path / "s.zarr", workers=1)
+    study.run(SPECIFICATION, tmp_path / "s.zarr", workers=1, announce=lines.append)
     assert_same(tmp_path / "s.zarr", uninterrupted)
-
-
-def test_workers_of_another_version_are_refused() -> None:
-    with pytest.raises(InputError, match="another version"):
-        running._measure_on_worker(SPECIFICATION.cells()[0], SPECIFICATION, "other")
+    assert lines == ["1 process on this machine"]
 
 
 def test_bad_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(running, "_CONNECT_TIMEOUT_S", 0.3)
-    for address in ("nowhere", "tcp://127.0.0.1:1", "xyz://127.0.0.1:1"):
-        with pytest.raises(InputError, match=r"scheduler = .*cannot be reached") as raised:
-            study.run(SPECIFICATION, scheduler=address)
-        assert "\n" not in str(raised.value)
+    monkeypatch.setattr("faintspot.compare.running._CONNECT_TIMEOUT_S", 0.3)
+    with pytest.raises(InputError, match=r"scheduler = .*cannot be reached"):
+        study.run(SPECIFICATION, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="workers = -1"):
         study.run(SPECIFICATION, workers=-1)
     with pytest.raises(InputError, match="expected a StudySpecification"):

@@ -16,7 +16,7 @@ TEXT = """
 name = "mine"
 seed = 7
 realisations = 400
-arms = ["plain", "tv"]
+arms = ["brightest", "tv"]
 strengths = [0.5, 1.0]
 fixed_k = [10]
 
@@ -35,9 +35,7 @@ def test_toml() -> None:
     specification = StudySpecification.from_text(TEXT)
     assert (specification.name, specification.seed, specification.realisations) == ("mine", 7, 400)
     assert specification.modes == ("best", "fixed10")
-    first = specification.cells()[0]
-    assert specification.candidates("tv", first) == (0.5, 1.0)
-    assert np.isnan(specification.candidates("plain", first)).all()
+    assert specification.strengths == (0.5, 1.0)
     signal, size = specification.sweeps
     assert signal.flux_e == (10.0, 100.0, 1000.0)
     assert signal.read_noise_e == (0.1, 3.0)
@@ -66,7 +64,7 @@ def test_fingerprint_changes_with_everything() -> None:
     changes: dict[str, Any] = {
         "seed": 2,
         "realisations": 100,
-        "arms": ["plain", "tv"],
+        "arms": ["brightest", "tv"],
         "strengths": [0.5],
         "widths": [0.5],
         "thresholds": [1],
@@ -104,22 +102,24 @@ def test_search_range_is_the_same_for_all_arms() -> None:
     near, far = sweep.cells()
     old = StudySpecification("x", [sweep])
     assert old.search_range_of(far) == np.inf
-    new = replace(old, arms=["plain", "ml"])
+    new = replace(old, arms=["brightest", "ml"])
     assert (new.search_range_of(near), new.search_range_of(far)) == (1.0, 4.0)
     assert replace(new, search_range_px=2).search_range_of(far) == 2.0
 
 
-def test_modes_and_candidates_of_estimators() -> None:
+def test_former_names_of_arms() -> None:
+    """Those of version 0.1 still work."""
+    former = StudySpecification("x", [Sweep("a")], arms=["plain", "tv", "gaussian", "brightest"])
+    assert former.arms == ("brightest", "tv", "smoothed")
+
+
+def test_modes() -> None:
     sweep = Sweep("a", pixels=[4, 16], d_over_r0=[0, 2])
     specification = StudySpecification("x", [sweep], fixed_k=[20], corrected=True, blurs=[0.0, 1.0])
     assert specification.modes == ("best", "fixed20", "corrected")
-    still, speckled, still_large, _ = sweep.cells()
+    still, _, still_large, _ = sweep.cells()
     assert specification.kept_pixels(still) == {"best": None, "corrected": None}
     assert specification.kept_pixels(still_large) == {"best": None, "fixed20": 20, "corrected": None}
-    assert specification.candidates("ml", still) == ((0.0, 0.0),)
-    assert specification.candidates("matched", speckled) == ((0.0, 0.0), (1.0, 0.0))
-    assert len(specification.candidates("map", speckled)) == 2 * len(specification.model_errors)
-    assert len(specification.candidates("weighted", still)) > 1
 
 
 def test_noise_of_a_mean_pixel() -> None:
@@ -139,7 +139,7 @@ BAD = {
     'name = "x"\nrealizations = 3' + SWEEP: ("realizations", "did you mean realisations"),
     'name = "x"\nrealisations = 3' + SWEEP: ("realisations = 3", "20"),
     'name = "x"\nseed = -1' + SWEEP: ("seed = -1",),
-    'name = "x"\narms = ["plain", "tvs"]' + SWEEP: ("arms = 'tvs'", "'tv'"),
+    'name = "x"\narms = ["brightest", "tvs"]' + SWEEP: ("arms = 'tvs'", "'tv'"),
     'name = "x"\narms = []' + SWEEP: ("arms", "empty"),
     'name = "x"\nstrengths = [0]' + SWEEP: ("strengths = 0", "above 0"),
     'name = "x"\nstrengths = 1.0' + SWEEP: ("strengths", "list"),

@@ -17,7 +17,8 @@ from faintspot.study import StudySpecification, measure_cell, open_study
 pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
 
-from faintspot.study.store import VARIABLES, MemoryResults, StoredResults, new_dataset  # noqa: E402
+from faintspot.compare.store import MemoryStore  # noqa: E402
+from faintspot.study.store import VARIABLES, dataset_of, new_dataset, stored_units  # noqa: E402
 
 OTHER = replace(SPECIFICATION, seed=2)
 
@@ -44,67 +45,69 @@ def test_schema() -> None:
 
 def test_store_is_memory(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    stored, memory = StoredResults(path, SPECIFICATION), MemoryResults(SPECIFICATION)
-    assert_identical(stored.dataset(), memory.dataset())
+    stored, memory = stored_units(SPECIFICATION, path), MemoryStore()
+    assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
     for index in (2, 0):
         results = measure_cell(SPECIFICATION.cells()[index], SPECIFICATION)
-        stored.write(index, results)
-        memory.write(index, results)
-    assert_identical(stored.dataset(), memory.dataset())
-    assert np.flatnonzero(stored.done()).tolist() == [0, 2]
+        stored.write(str(index), results)
+        memory.write(str(index), results)
+    assert_identical(open_study(path), dataset_of(SPECIFICATION, memory))
+    assert [index for index in range(N_CELLS) if stored.done(str(index))] == [0, 2]
     # One chunk a cell and variable.
     assert sorted(p.name for p in (path / "error" / "c").iterdir()) == ["0", "2"]
-    again = StoredResults(path, SPECIFICATION)
-    np.testing.assert_array_equal(again.done(), memory.done())
     # A window of 6 x 6 pixels has no more than 35 k.
-    small = memory.dataset().isel(cell=0)
+    small = dataset_of(SPECIFICATION, memory).isel(cell=0)
     assert int(small["pixels"]) == 6
-    assert np.isfinite(small["error_at_k"].sel(arm="plain", k=slice(1, 35))).all()
+    assert np.isfinite(small["error_at_k"].sel(arm="brightest", k=slice(1, 35))).all()
     assert np.isnan(small["error_at_k"].sel(k=slice(36, None))).all()
     opened = xarray.open_zarr(path, consolidated=False)
-    np.testing.assert_array_equal(opened["error"], memory.dataset()["error"])
+    np.testing.assert_array_equal(opened["error"], dataset_of(SPECIFICATION, memory)["error"])
 
 
 def test_a_cell_half_written_is_not_done(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    store = StoredResults(path, SPECIFICATION)
+    store = stored_units(SPECIFICATION, path)
     results = measure_cell(SPECIFICATION.cells()[0], SPECIFICATION)
-    store.write(0, {"error": results["error"]})
+    store.write("0", {"error": results["error"]})
     (path / "done" / "c" / "0").unlink()  # as if killed before
     (path / "error" / "c" / "0" / "0" / "0").write_bytes(b"")
     (path / "error" / "c" / "0" / "0" / "0.abc.partial").write_bytes(b"half")
-    again = StoredResults(path, SPECIFICATION)
-    assert not again.done().any()
+    again = stored_units(SPECIFICATION, path)
+    assert again.is_empty
     assert not list(path.rglob("*.partial"))
-    again.write(0, results)
+    again.write("0", results)
     np.testing.assert_array_equal(open_study(path)["error"][0], results["error"])
 
 
 def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    StoredResults(path, SPECIFICATION)
+    stored_units(SPECIFICATION, path)
     with pytest.raises(InputError, match=r"s\.zarr: belongs to another study \('small'"):
-        StoredResults(path, OTHER)
-    StoredResults(path, OTHER, overwrite=True)
+        stored_units(OTHER, path)
+    stored_units(OTHER, path, overwrite=True)
     assert open_study(path).attrs["fingerprint"] == OTHER.fingerprint
-    file = tmp_path / "file"
-    file.write_text("mine")
     folder = tmp_path / "folder"
     folder.mkdir()
-    for taken in (file, folder):
-        with pytest.raises(InputError, match="is not the store of a study"):
-            StoredResults(taken, SPECIFICATION, overwrite=True)
-    assert file.read_text() == "mine"
-    with pytest.raises(InputError, match="does not exist"):
-        StoredResults(tmp_path / "no" / "s.zarr", SPECIFICATION)
     for wrong, found in ((folder, "something else"), (tmp_path / "nothing", "nothing")):
         with pytest.raises(InputError, match=f"found {found}"):
             open_study(wrong)
 
 
+def test_of_version_0_1(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    stored_units(SPECIFICATION, path)
+    metadata = json.loads((path / "zarr.json").read_text())
+    for name in ("format", "kind", "units"):
+        del metadata["attributes"][name]
+    (path / "zarr.json").write_text(json.dumps(metadata))
+    for refuse in (lambda: open_study(path), lambda: stored_units(SPECIFICATION, path)):
+        with pytest.raises(InputError, match=r"of faintspot 0\.1"):
+            refuse()
+
+
 def test_of_another_version(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    StoredResults(path, SPECIFICATION)
+    stored_units(SPECIFICATION, path)
     shutil.rmtree(path / "gain")
     with pytest.raises(InputError, match="has no gain: measured by another version"):
         open_study(path)
@@ -112,7 +115,7 @@ def test_of_another_version(tmp_path: Path) -> None:
 
 def test_damaged(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
-    StoredResults(path, SPECIFICATION).write(0, measure_cell(SPECIFICATION.cells()[0], SPECIFICATION))
+    stored_units(SPECIFICATION, path).write("0", measure_cell(SPECIFICATION.cells()[0], SPECIFICATION))
     (path / "error" / "c" / "0" / "0" / "0").write_bytes(b"rubbish")
     with pytest.raises(InputError, match="damaged") as raised:
         open_study(path)
@@ -121,4 +124,4 @@ def test_damaged(tmp_path: Path) -> None:
     metadata["shape"] = "many"
     (path / "done" / "zarr.json").write_text(json.dumps(metadata))
     with pytest.raises(InputError, match="damaged"):
-        StoredResults(path, SPECIFICATION)
+        stored_units(SPECIFICATION, path)

@@ -62,7 +62,10 @@ def test_a_smaller_gain_than_claimed_holds_in_part(number: int) -> None:
 
 
 def test_dependence_on_k_is_measured_in_best_k_and_over_the_fixed_ones() -> None:
-    flat, steep = (lambda arm: 0.5 if arm == "plain" else 0.1), (lambda arm: 0.1 if arm == "plain" else 0.5)
+    flat, steep = (
+        (lambda arm: 0.5 if arm == "brightest" else 0.1),
+        (lambda arm: 0.1 if arm == "brightest" else 0.5),
+    )
     good, bad = (verdicts(study(lambda cell: 1.0, rise_with_k=rise))[4] for rise in (flat, steep))
     assert good.best.outcome is HOLDS
     assert bad.best.outcome is FAILS
@@ -71,7 +74,7 @@ def test_dependence_on_k_is_measured_in_best_k_and_over_the_fixed_ones() -> None
 
 def test_fixed_k_decides_over_the_fixed_modes() -> None:
     def gain(cell: Cell, arm: str, mode: str) -> float:
-        return {"fixed40": 0.8, "fixed60": 0.6}.get(mode, 1.0) if arm == "plain" else 1.0
+        return {"fixed40": 0.8, "fixed60": 0.6}.get(mode, 1.0) if arm == "brightest" else 1.0
 
     assert verdicts(dataset(quick_cells(), power_law(gain)))[4].fixed.outcome is HOLDS
 
@@ -93,7 +96,7 @@ def test_no_difference_is_called_worse_in_five_per_cent_of_studies() -> None:
         mean, covariance = exact["error"].values, exact["error_covariance"].values
         for i, m in np.ndindex(mean.shape[0], mean.shape[2]):
             noisy["error"].values[i, :, m] = rng.multivariate_normal(mean[i, :, m], covariance[i, m])
-        rows = [row for row in against_tv(noisy, "best") if row.arm == "plain"]
+        rows = [row for row in against_tv(noisy, "best") if row.arm == "brightest"]
         alarms += any(row.larger > 0 for row in rows)
     assert alarms <= 12
 
@@ -108,7 +111,7 @@ def test_what_is_missing_is_said() -> None:
     found = verdicts(partial)
     assert found[0].outcome is Outcome.NOT_MEASURED
     assert found[0].best.in_words() == "no finished cells for it"
-    assert verdicts(partial.sel(arm=["plain", "gaussian"], arm2=["plain", "gaussian"])) == []
+    assert verdicts(partial.sel(arm=["brightest", "smoothed"], arm2=["brightest", "smoothed"])) == []
 
 
 def test_without_fixed_modes_only_best_k_decides() -> None:
@@ -143,8 +146,8 @@ def test_cases_are_counted_in_words() -> None:
 def test_guidance_follows_the_numbers() -> None:
     def with_gains(tv: float, gaussian: float) -> str:
         def gain(cell: Cell, arm: str, mode: str) -> float:
-            return {"tv": tv, "gaussian": gaussian}.get(
-                arm, 0.6 if mode != "best" and arm == "plain" else 1.0
+            return {"tv": tv, "smoothed": gaussian}.get(
+                arm, 0.6 if mode != "best" and arm == "brightest" else 1.0
             )
 
         return " ".join(guidance(dataset(quick_cells(), power_law(gain))))
@@ -158,7 +161,7 @@ def test_guidance_follows_the_numbers() -> None:
     assert "Advice: do not use TV" in bad
     assert "Gaussian smoothing, which is simpler and faster, is the better" in bad
     assert "It loses light in" in bad
-    assert "ahead of TV more often than behind: no denoising" in bad
+    assert "ahead of TV more often than behind: brightest pixels" in bad
     equal = with_gains(1.3, 1.3)
     assert "Neither is the better" in equal
     assert "Advice: tune k first" in equal
@@ -167,12 +170,12 @@ def test_guidance_follows_the_numbers() -> None:
 def test_guidance_without_curves_or_arms_says_so() -> None:
     few = study(lambda cell: 1.0, cells(fluxes=(1000.0,)))
     assert "flux gains cannot be given" in guidance(few)[0]
-    assert "no advice on TV" in guidance(few.sel(arm=["plain"], arm2=["plain"]))[0]
+    assert "no advice on TV" in guidance(few.sel(arm=["brightest"], arm2=["brightest"]))[0]
 
 
 def test_against_tv_counts_cells() -> None:
     rows = {row.arm: row for row in against_tv(study(lambda cell: 1.2, cells()), "best")}
     assert set(rows) == set(ARMS) - {"tv"}
-    assert (rows["plain"].smaller, rows["plain"].larger, rows["plain"].cells) == (0, 5, 5)
-    assert rows["plain"].mean_ratio > 1.08
-    assert rows["plain"].smallest == 0
+    assert (rows["brightest"].smaller, rows["brightest"].larger, rows["brightest"].cells) == (0, 5, 5)
+    assert rows["brightest"].mean_ratio > 1.08
+    assert rows["brightest"].smallest == 0

@@ -18,7 +18,6 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 from faintspot.study import demonstration
 from faintspot.study.demonstration import Comparison
-from faintspot.study.metric import magnitudes
 
 
 @click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
@@ -61,11 +60,10 @@ def command(output: str, frames: int, seed: int) -> None:
 def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
     """Return the slope errors of both arms and the flux gain as a table."""
     gain = comparison.flux_gain(rng)
-    magnitude_error = 2.5 / np.log(10) * gain.standard_error / gain.value
+    value, low, high = gain.magnitudes
     saved = (
-        f"denoising saves a factor {gain.value:.2f} ± {gain.standard_error:.2f} of light: "
-        f"{magnitudes(gain.value):.2f} ± {magnitude_error:.2f} mag"
-        if np.isfinite(gain.value)
+        f"denoising saves a factor {gain.in_words()} of light: {value:.2f} ({low:.2f} to {high:.2f}) mag"
+        if 0 < gain.factor < np.inf
         else "no flux that was simulated gives the same error with denoising"
     )
     table = Table(
@@ -78,14 +76,14 @@ def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
     for heading in ("e-", "R without", "R with TV", "difference", "k", "k, TV", "strength"):
         table.add_column(heading, justify="right", no_wrap=True)
     for i, flux in enumerate(demonstration.FLUXES_E):
-        plain, denoised = comparison.plain[i], comparison.denoised[i]
+        without, denoised = comparison.without[i], comparison.denoised[i]
         table.add_row(
             f"{flux:g}",
             *(
                 f"{estimate.value:.4f} ± {estimate.standard_error:.4f}"
-                for estimate in (plain.slope_error, denoised.slope_error, comparison.difference(i))
+                for estimate in (without.slope_error, denoised.slope_error, comparison.difference(i))
             ),
-            str(plain.settings.keep_brightest),
+            str(without.settings.keep_brightest),
             str(denoised.settings.keep_brightest),
             f"{denoised.settings.noise_std:.2f}",
         )
@@ -102,7 +100,7 @@ def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.ran
     np.save(folder / "frames.npy", frames)
     np.save(folder / "truth.npy", truth)
     arms, stages = [], {}
-    for name, chosen in (("TV", comparison.denoised[shown]), ("no TV", comparison.plain[shown])):
+    for name, chosen in (("TV", comparison.denoised[shown]), ("no TV", comparison.without[shown])):
         stem = name.lower().replace(" ", "-")
         config = folder / f"{stem}.toml"
         for item in (layout, chosen.settings, demonstration.CALIBRATION):

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from faintspot.estimators.base import Style
 from faintspot.estimators.gravity import GravityPrepared, KeepingBrightest
 from faintspot.estimators.registry import register
@@ -26,6 +29,10 @@ class BrightestPixels(KeepingBrightest):
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
         return f"no denoising; {self.kept_in_words(n_subapertures, pixels)}"
+
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `KeepingBrightest`."""
+        return images
 
     def prepared(self, sensor: Sensor) -> GravityPrepared:
         """See `Estimator`."""

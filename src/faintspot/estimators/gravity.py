@@ -87,6 +87,13 @@ class KeepingBrightest(Gravity):
             return min(max(FEWEST_KEPT, round(KEPT_FRACTION * pixels)), pixels - 1)
         return super().default_of(name, pixels)
 
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Return images (n, ny, nx) as the brightest pixels are sought in them; None: only its kernel knows.
+
+        Studies ask for it, which then keep every number of pixels at once.
+        """
+        return None
+
     def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
         """Say what is done after the denoising."""
         kept, rule = (self._span(name, n_subapertures, pixels) for name in ("keep_brightest", "rule"))

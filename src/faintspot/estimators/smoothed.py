@@ -70,6 +70,14 @@ class Smoothed(KeepingBrightest):
         width = float(automatic_smoothing(**scene.rule_arguments)) or _USUAL_PX
         return {**super().tuned(scene), "smoothing_px": [width * factor for factor in _WIDTHS]}
 
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `KeepingBrightest`; images are continued by zeros."""
+        from scipy.ndimage import gaussian_filter
+
+        width = float(self.values("smoothing_px", 1, images[0].size)[0])
+        smoothed: NDArray[np.float32] = gaussian_filter(images, width, mode="constant", axes=(-2, -1))
+        return smoothed
+
     def prepared(self, sensor: Sensor) -> GravityPrepared:
         """See `Estimator`."""
         return _Prepared(self, sensor)

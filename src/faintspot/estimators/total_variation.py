@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.estimate.automatic import automatic_strength
 from faintspot.estimate.noise import suggested_strength
-from faintspot.estimate.total_variation import ALGORITHMS
+from faintspot.estimate.total_variation import ALGORITHMS, tv_denoise
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import Floats, GravityPrepared, KeepingBrightest
@@ -126,6 +126,13 @@ class TotalVariation(KeepingBrightest):
         )
         strength = max(float(automatic_strength(**scene.rule_arguments)) or ordinary, _LEAST_STRENGTH_E)
         return {**super().tuned(scene), "noise_std": [strength * factor for factor in _STRENGTHS]}
+
+    def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """See `KeepingBrightest`."""
+        if is_auto(self.noise_std):
+            return None  # it follows from the light
+        limits = {name: getattr(self, name) for name in ("tolerance", "max_iterations")}
+        return tv_denoise(images, self.noise_std, algorithm=self.algorithm, preset=self.preset, **limits)
 
     def prepared(self, sensor: Sensor) -> GravityPrepared:
         """See `Estimator`."""

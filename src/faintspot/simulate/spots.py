@@ -18,6 +18,9 @@ Floats = NDArray[np.float64]
 SMALLEST_SIZE = 0.05
 """The smallest spot size accepted, 0.1 px wide: the narrower a rotated spot, the more samples it takes."""
 
+FWHM_OF_SIZE_1_PX = {"diffraction": 1.772, "gaussian": 2.0}
+"""Full width at half maximum of the optical spot of size 1, by profile."""
+
 _BLOCK_PIXELS = 1 << 15  # pixels worked on at a time: the temporary arrays stay in the processor's cache
 _RIGHT_ANGLE_TOLERANCE_DEG = 1e-9
 

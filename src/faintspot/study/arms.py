@@ -1,126 +1,241 @@
-"""The arms of a study that keep the brightest pixels, or what is above a threshold."""
+"""The arms of a study: estimators by name, what each may choose from in a cell, and how it measures there."""
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
-from faintspot.estimate.centroid import centre_of_gravity
-from faintspot.estimate.total_variation import tv_denoise
-from faintspot.kernels import scoring
+from faintspot import estimators
+from faintspot.compare.arms import Arm, Knowledge
+from faintspot.errors import InputError
+from faintspot.estimators.base import Estimator, Need, Style
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.gravity import KeepingBrightest
+from faintspot.estimators.registry import FORMER_NAMES, estimator_named
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.thresholded import Thresholded
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
 from faintspot.settings import Settings
-from faintspot.study.sweep import Cell
+from faintspot.simulate import Detector
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
+from faintspot.slopes import Slopes
+from faintspot.study.simple_denoisers import BrightestAsTheyAre, MedianFiltered
+from faintspot.training import train_estimator
 
-FLUX_FLOOR: float = Settings.flux_floor
-"""No light: the sum that is left is not above this fraction of the image's largest pixel."""
+if TYPE_CHECKING:
+    from faintspot.study.specification import StudySpecification
+    from faintspot.study.sweep import Cell
 
 Images = NDArray[np.float32]
-Floats = NDArray[np.float64]
+Kind = type[Estimator]
+
+_ONLY_HERE: dict[str, Kind] = {kind.name: kind for kind in (BrightestAsTheyAre, MedianFiltered)}
+DEFAULT_ARMS = tuple(
+    kind.name
+    for kind in (BrightestPixels, TotalVariation, BrightestAsTheyAre, Smoothed, MedianFiltered, Thresholded)
+)
+"""The built-in ones that know nothing of the spot."""
+_KEPT = "keep_brightest"
+_TRAINING = 1  # word that is added to a cell's seed
+_LEAST_LIGHT_E = 1e-3  # a mean of noise may be negative
 
 
-def error_table(
-    arm: str,
-    candidate: float,
-    cell: Cell,
-    images: Images,
-    truth: Floats,
-    search_range_px: float = math.inf,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return (|dx| + |dy|) / 2 of every image for every number k of kept pixels.
+def kind_of(arm: str) -> Kind:
+    """Return the estimator that an arm is.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+    """
+    name = FORMER_NAMES.get(arm, arm) if isinstance(arm, str) else arm
+    known = [*estimators.estimators(), *_ONLY_HERE]
+    if name not in known:
+        raise InputError(f"arms = {arm!r}: expected one of {', '.join(map(repr, known))}")
+    return _ONLY_HERE.get(name) or estimator_named(name)
+
+
+def label_of(arm: str) -> str:
+    """Return what tables and figures call an arm; its name where its estimator is not installed here."""
+    return kind_of(arm).label if _is_known(arm) else arm
+
+
+def style_of(arm: str) -> Style:
+    """Return how figures draw an arm."""
+    return kind_of(arm).style if _is_known(arm) else Estimator.style
+
+
+def knows_the_spot(arm: str) -> bool:
+    """Whether an arm is told more than the noise."""
+    return _is_known(arm) and Knowledge.of(kind_of(arm)) > Knowledge.NOISE
+
+
+def is_estimator(arm: str) -> bool:
+    """Whether an arm is not of studies alone."""
+    return arm not in _ONLY_HERE
+
+
+def keeps_every_k(kind: Kind) -> bool:
+    """Whether all numbers of kept pixels are measured at once: its denoised images are known."""
+    return issubclass(kind, KeepingBrightest) and kind.denoised is not KeepingBrightest.denoised
+
+
+def _is_known(arm: str) -> bool:
+    return arm in _ONLY_HERE or arm in estimators.estimators()
+
+
+# In a cell ------------------------------------------------------------------------------------------------
+
+Candidate = tuple[tuple[str, float], ...]
+"""What an arm may choose: options, in the units of the specification."""
+
+
+def shown(candidate: Candidate, option: str | None = None) -> float:
+    """Return the value of an option, or of the first; NaN where there is none."""
+    values = dict(candidate)
+    return next(iter(values.values()), math.nan) if option is None else values.get(option, math.nan)
+
+
+def detector_of(cell: Cell) -> Detector:
+    """Return the camera of a cell."""
+    return Detector(
+        read_noise_e=cell.read_noise_e * cell.em_gain, background_e=cell.background_e, em_gain=cell.em_gain
+    )
+
+
+class CellArms:
+    """The arms of a study in one cell: candidates, estimators, and slopes of images.
 
     Parameters
     ----------
-    arm : str
-        One of `faintspot.study.specification.BRIGHTEST_ARMS`.
-    candidate : float
-        "tv": strength, as a fraction of `cell.pixel_noise_e`; "gaussian": standard deviation, px, of the
-        Gaussian, the image being continued by zeros; "thresholded": threshold in units of
-        `cell.pixel_noise_e`; NaN for the others.
     cell : Cell
-    images : (n, side, side) array, float32
-    truth : (n, 2) array, px
-    search_range_px : float
-        Positions beyond plus or minus this become it, on each axis.
-
-    Returns
-    -------
-    errors : (n, K) array, float32
-        For k = 1 to K = side^2 - 1, px; K = 1 for "thresholded", which has no k.
-    valid : (n, K) array, bool
-        Whether there was light. Where not, the position counts as (0, 0).
+    specification : StudySpecification
+    light_e : float, optional
+        Mean electrons of an image as measured, which arms without a table are told. Default: the cell's.
     """
-    if arm == "thresholded":
-        positions, valid = _above_threshold(images, candidate * cell.pixel_noise_e, search_range_px)
-        return np.abs(positions - truth).mean(axis=1).astype(np.float32)[:, None], valid
-    prepared, rule = _prepared(arm, candidate, cell, images)
-    errors = np.empty((len(images), prepared.shape[1] - 1), np.float32)
-    valid = np.empty(errors.shape, np.bool_)
-    span = (0, len(images))
-    scoring.errors_of_every_k(
-        prepared, cell.pixels, rule, FLUX_FLOOR, search_range_px, truth, *span, errors, valid
-    )
-    return errors, valid
+
+    def __init__(self, cell: Cell, specification: StudySpecification, light_e: float | None = None) -> None:
+        self.cell, self._specification = cell, specification
+        self.light_e = max(cell.flux_e if light_e is None else light_e, _LEAST_LIGHT_E)
+        self.search_range_px = specification.search_range_of(cell)
+        self._within_px = min(self.search_range_px, cell.pixels / 2)
+        self.kinds = {arm: kind_of(arm) for arm in specification.arms}
+        self._calibration = Calibration(
+            read_noise_e=cell.read_noise_e * cell.em_gain,
+            em_gain=cell.em_gain,
+            background_e=cell.background_e,
+        )
+
+    def candidates(self, arm: str) -> list[Candidate]:
+        """Return what an arm chooses from."""
+        axes = self._axes(self.kinds[arm])
+        return [tuple(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+
+    def estimator(self, arm: str, candidate: Candidate) -> Estimator:
+        """Return the estimator with a candidate's options."""
+        return self.kinds[arm](**{name: value * self._unit(name) for name, value in candidate})
+
+    def measure(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
+        """Return the slopes of images (n, side, side) in photo-electrons."""
+        output = images * np.float32(self.cell.em_gain)  # as the camera gives it
+        made = self._arm(self.estimator(arm, candidate))
+        return estimators.measure(output, made.settings, calibration=self._calibration, **made.parts)
+
+    def _arm(self, estimator: Estimator) -> Arm:
+        """Tell an estimator what it has to know."""
+        told: dict[str, Any] = {}
+        if Need.WIDTH in estimator.needs:
+            told["spot_fwhm_px"], told["spot_fwhm_y_px"] = self._spot_fwhm_px
+        return Arm(
+            Settings(estimator, search_range_px=self._within_px, flux_e=self.light_e, **told),
+            self._psf if Need.PSF in estimator.needs else None,
+            self._score if Need.SCORE in estimator.needs else None,
+        )
+
+    def _axes(self, kind: Kind) -> dict[str, list[float]]:
+        """Values of every option that an arm chooses, in the units of the specification."""
+        listed = {
+            name: list(self._listed(name)) for name in kind.declared() if name in self._specification.LISTED
+        }
+        found_by_table = {_KEPT} if keeps_every_k(kind) else set()
+        made = kind(**{name: values[0] * self._unit(name) for name, values in listed.items()})
+        own = {
+            name: list(values)
+            for name, values in made.tuned(self.scene).items()
+            if name not in self._specification.LISTED.keys() | found_by_table
+        }
+        return {**listed, **own}
+
+    def _listed(self, option: str) -> tuple[float, ...]:
+        key, only_speckled = self._specification.LISTED[option]
+        if only_speckled and self.cell.d_over_r0 == 0:
+            return (0.0,)
+        return tuple(getattr(self._specification, key))
+
+    def _unit(self, option: str) -> float:
+        """Return what a number of the specification is multiplied with."""
+        if option in ("noise_std", "threshold_e"):
+            return self.cell.pixel_noise_e
+        return math.sqrt(math.prod(self._spot_fwhm_px)) if option == "weight_fwhm_px" else 1
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """What estimators are told of the cell that tune options of their own."""
+        cell = self.cell
+        return Scene(
+            flux_e=self.light_e,
+            read_noise_e=cell.read_noise_e,
+            window=(cell.pixels, cell.pixels),
+            spot_fwhm_px=FWHM_OF_SIZE_1_PX[cell.profile] * cell.size * math.sqrt(cell.elongation),
+            position_range_px=self._within_px,
+            elongation=cell.elongation,
+            excess_noise=cell.excess_noise,
+            background_e=cell.background_e,
+            d_over_r0=cell.d_over_r0,
+            profile=cell.profile,
+        )
+
+    @property
+    def _psf(self) -> PSF:
+        """The PSF without turbulence, as far out as a window sees it."""
+        cell = self.cell
+        radius = math.ceil(cell.pixels / 2 + self._within_px) + 2
+        return _psf_of(cell.profile, cell.size, cell.elongation, radius)
+
+    @functools.cached_property
+    def _spot_fwhm_px(self) -> tuple[float, float]:
+        """Width along x and y, without turbulence."""
+        along, across = self._psf.fwhm_px[0].tolist()
+        return along, across
+
+    @functools.cached_property
+    def _score(self) -> TrainedScore:
+        """Trained on spots of a seed of their own."""
+        cell = self.cell
+        entropy = [*cell.seed(self._specification.seed).entropy, _TRAINING]  # type: ignore[misc]
+        return train_estimator(
+            flux_e=self.light_e,
+            detector=detector_of(cell),
+            shape=(cell.pixels, cell.pixels),
+            profile=cell.profile,
+            size=cell.size,
+            elongation=cell.elongation,
+            d_over_r0=cell.d_over_r0,
+            position_range_px=cell.position_range_px,
+            search_range_px=self._within_px,
+            rng=np.random.default_rng(np.random.SeedSequence(entropy)),
+        )
 
 
-def position_table(
-    arm: str, candidate: float, cell: Cell, images: Images, search_range_px: float = math.inf
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the positions (n, K, 2), px, whose errors `error_table` returns, and their validity (n, K)."""
-    if arm == "thresholded":
-        above, valid = _above_threshold(images, candidate * cell.pixel_noise_e, search_range_px)
-        return above[:, None].astype(np.float64), valid
-    prepared, rule = _prepared(arm, candidate, cell, images)
-    positions = np.empty((len(images), prepared.shape[1] - 1, 2))
-    valid = np.empty(positions.shape[:2], np.bool_)
-    span = (0, len(images))
-    scoring.positions_of_every_k(
-        prepared, cell.pixels, rule, FLUX_FLOOR, search_range_px, *span, positions, valid
-    )
-    return positions, valid
-
-
-def _prepared(arm: str, candidate: float, cell: Cell, images: Images) -> tuple[Images, int]:
-    """Return the images (n, pixels) as the brightest pixels are sought in them, and the rule."""
-    prepared = images
-    if arm == "tv":
-        prepared = tv_denoise(images, candidate * cell.pixel_noise_e)
-    elif arm == "gaussian":
-        prepared = gaussian_filter(images, candidate, mode="constant", axes=(-2, -1))
-    elif arm == "median":
-        prepared = median_of_nine(images)
-    rule = scoring.THRESHOLD if arm == "threshold" else scoring.SUBTRACT_NEXT
-    return np.ascontiguousarray(prepared).reshape(len(images), -1), rule
-
-
-def median_of_nine(images: Images) -> Images:
-    """Return the median of each pixel and its eight neighbours; pixels at the edge continue outwards.
-
-    The median of nine numbers in three sorted columns is the median of the largest of the small ones, the
-    median of the middle ones and the smallest of the large ones.
-    """
-    padded = np.pad(images, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    low, middle, high = _sorted_three(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
-    small = np.maximum(np.maximum(low[..., :-2], low[..., 1:-1]), low[..., 2:])
-    centre = _sorted_three(middle[..., :-2], middle[..., 1:-1], middle[..., 2:])[1]
-    large = np.minimum(np.minimum(high[..., :-2], high[..., 1:-1]), high[..., 2:])
-    return _sorted_three(small, centre, large)[1]
-
-
-def _sorted_three(a: Images, b: Images, c: Images) -> tuple[Images, Images, Images]:
-    """Return the smallest, the middle and the largest of three images, pixel by pixel."""
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    return np.minimum(low, c), np.maximum(low, np.minimum(high, c)), np.maximum(high, c)
-
-
-def _above_threshold(
-    images: Images, threshold_e: float, search_range_px: float
-) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
-    """Centre of gravity (n, 2) of what is above a threshold, the threshold taken off, and validity (n, 1)."""
-    left = np.maximum(images - np.float32(threshold_e), np.float32(0.0))
-    largest = np.abs(images).max(axis=(1, 2))
-    valid = left.sum(axis=(1, 2)) > FLUX_FLOOR * largest
-    positions = np.where(valid[:, None], centre_of_gravity(left), 0.0)
-    return np.clip(positions, -search_range_px, search_range_px), valid[:, None]
+@functools.lru_cache(maxsize=16)
+def _psf_of(profile: str, size: float, elongation: float, radius_px: float) -> PSF:
+    return PSF.analytic(profile, size=size, elongation=elongation, radius_px=radius_px)

@@ -8,23 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.study.curves import study_curves
+from faintspot.study.paper import TV
 
 if TYPE_CHECKING:
     import xarray
 
-ARM_NAMES = {
-    "plain": "no denoising (no TV)",
-    "tv": "TV",
-    "threshold": "no denoising, rule “threshold”",
-    "gaussian": "Gaussian smoothing",
-    "median": "3 × 3 median filter",
-    "thresholded": "thresholded centre of gravity",
-    "weighted": "weighted centre of gravity",
-    "matched": "matched filter",
-    "ml": "maximum likelihood",
-    "map": "maximum likelihood with prior (MAP)",
-    "trained": "trained score",
-}
 _FAMILY_FALSE_ALARM = 0.05
 
 
@@ -54,20 +42,20 @@ def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
     for profile in sorted({key.profile for key in curves}):
         part = [curve for key, curve in curves.items() if key.profile == profile]
         arms = part[0].arms
-        if "tv" not in arms:
+        if TV not in arms:
             continue
         error = np.concatenate([curve.error for curve in part])
         measured = np.all(np.isfinite(error), axis=1)
         winner = np.argmin(error[measured], axis=1)
         for index, arm in enumerate(arms):
-            pairs = [curve.difference("tv", arm) for curve in part]
+            pairs = [curve.difference(TV, arm) for curve in part]
             difference, se = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
             known = np.isfinite(difference)
             n = int(known.sum())
-            if arm == "tv" or n == 0:
+            if arm == TV or n == 0:
                 continue
             limit = float(norm.isf(_FAMILY_FALSE_ALARM / n))
-            ratio = error[known, index] / error[known, arms.index("tv")]
+            ratio = error[known, index] / error[known, arms.index(TV)]
             rows.append(
                 AgainstTV(
                     arm,

@@ -12,19 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.compare.statistics import OUTLIER_PX, slope_statistics
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 from faintspot.simulate import subapertures
-from faintspot.study.arms import Images
-from faintspot.study.estimator_arms import EstimatorArms, detector_of
-from faintspot.study.metric import OUTLIER_PX, slope_statistics
-from faintspot.study.specification import (
-    BEST,
-    ESTIMATOR_ARMS,
-    KEEPING_ARMS,
-    Candidate,
-    Robustness,
-    StudySpecification,
-)
+from faintspot.study.arms import Candidate, CellArms, Images, detector_of, kind_of, shown
+from faintspot.study.specification import BEST, StudySpecification
 from faintspot.study.sweep import Cell
 from faintspot.study.tables import Block, Floats, HostTables, Tables, errors_of
 from faintspot.study.tuning import Choice, Tuning
@@ -65,12 +57,12 @@ class _Source:
         self._rng = np.random.default_rng(cell.seed(specification.seed))
         self._on_device: Any = None
         search, self._drawn = specification.search_range_of(cell), 0
-        self.tables: Tables = HostTables(cell, search)
+        self.tables: Tables = HostTables(search)
         if specification.device == "cuda":
             from faintspot.study import on_device
 
             self._on_device = on_device
-            self.tables = on_device.DeviceTables(cell, search)
+            self.tables = on_device.DeviceTables(search)
 
     def stacks(self, count: int) -> Iterator[list[Any]]:
         """Yield the next images, several blocks at a time."""
@@ -113,26 +105,26 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
 def score_cell(cell: Cell, specification: StudySpecification) -> Scores:
     """Choose each arm's settings on the first half of a cell's images, measure the second half with them."""
     half = specification.realisations // 2
-    source, estimators = _Source(cell, specification), None
-    tuning = Tuning(cell, specification, source.tables)
+    source, arms, tuning = _Source(cell, specification), None, None
     for stack in source.stacks(half):
-        if estimators is None:
-            estimators = _estimators(cell, specification, stack)
-        tuning.add(stack, estimators)
-    assert estimators is not None
+        if tuning is None:
+            arms = CellArms(cell, specification, _light_e(specification, source.tables, stack))
+            tuning = Tuning(arms, specification, source.tables)
+        tuning.add(stack)
+    assert arms is not None
+    assert tuning is not None
     scores = Scores(tuning.choices())
     for stack in source.stacks(specification.realisations - half):
-        scores.add(stack, source.tables, estimators)
+        scores.add(stack, source.tables, arms)
     return scores
 
 
-def _estimators(cell: Cell, specification: StudySpecification, stack: list[Any]) -> EstimatorArms:
-    """Return the arms that know the spot, and the mean light of images that they are told."""
-    light_e = 0.0
-    if set(specification.arms) & set(ESTIMATOR_ARMS):  # else images may stay where they are
-        light = np.concatenate([block.images.sum(axis=(1, 2), dtype=np.float64) for block in stack])
-        light_e = float(light.mean())
-    return EstimatorArms(cell, specification.seed, specification.search_range_of(cell), light_e)
+def _light_e(specification: StudySpecification, tables: Tables, stack: list[Any]) -> float | None:
+    """Return the mean light of images, which arms without tables are told."""
+    if all(tables.takes(kind_of(arm)) for arm in specification.arms):
+        return None  # images may stay where they are
+    light = np.concatenate([block.images.sum(axis=(1, 2), dtype=np.float64) for block in stack])
+    return float(light.mean())
 
 
 class Scores:
@@ -151,42 +143,39 @@ class Scores:
         """True positions (n, 2), px."""
         return np.concatenate(self._truth)
 
-    def add(self, blocks: list[Any], tables: Tables, estimators: EstimatorArms) -> None:
+    def add(self, blocks: list[Any], tables: Tables, arms: CellArms) -> None:
         """Score images."""
         self._truth += [block.truth for block in blocks]
         for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
-            if arm in ESTIMATOR_ARMS:
-                images = np.concatenate([block.images for block in blocks])
-                self._add_estimator(arm, candidate, images, estimators)
-            else:
+            if tables.takes(arms.kinds[arm]):
                 for block in blocks:
-                    self._add_table(arm, candidate, block, tables)
+                    self._add_table(arm, candidate, block, tables, arms)
+            else:
+                self._add_measured(arm, candidate, np.concatenate([block.images for block in blocks]), arms)
 
     def _modes(self, arm: str, candidate: Candidate) -> list[str]:
         """Modes in which an arm chose a candidate."""
         same = (arm, candidate)
         return [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
 
-    def _add_estimator(
-        self, arm: str, candidate: Candidate, images: Images, estimators: EstimatorArms
-    ) -> None:
-        slopes = estimators.measure(arm, candidate, images)
+    def _add_measured(self, arm: str, candidate: Candidate, images: Images, arms: CellArms) -> None:
+        slopes = arms.measure(arm, candidate, images)
         modes = self._modes(arm, candidate)
         for mode in modes:
             self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
             self._valid[arm, mode].append(slopes.valid)
-        if BEST in modes:
-            stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
+        stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
+        if BEST in modes and np.isfinite(stated).any():
             self._stated.setdefault(arm, []).append(stated.astype(np.float64))
 
-    def _add_table(self, arm: str, candidate: Any, block: Any, tables: Tables) -> None:
+    def _add_table(self, arm: str, candidate: Candidate, block: Any, tables: Tables, arms: CellArms) -> None:
         modes = self._modes(arm, candidate)
-        columns = [self.choices[arm, mode].column for mode in modes]
-        scored = tables.scored(arm, candidate, block, columns)
+        columns = [self.choices[arm, mode].column or 0 for mode in modes]
+        scored = tables.scored(arms.estimator(arm, candidate), block, columns)
         for i, mode in enumerate(modes):
             self._positions[arm, mode].append(scored.positions[:, i])
             self._valid[arm, mode].append(scored.valid[:, i])
-        if BEST in modes and arm in KEEPING_ARMS:
+        if BEST in modes and scored.sums.shape[1] > 1:
             self.sums[arm] = self.sums.get(arm, 0.0) + scored.sums
 
     def positions(self, arm: str, mode: str) -> Floats:
@@ -220,11 +209,9 @@ def results_of(cell: Cell, specification: StudySpecification, scores: Scores) ->
         results["error_covariance"][j] = covariance
         for i, arm in enumerate(arms):
             choice = scores.choices[arm, mode]
-            results["chosen_k"][i, j] = choice.column + 1 if arm in KEEPING_ARMS else np.nan
-            if isinstance(choice.candidate, Robustness):
-                results["chosen_candidate"][i, j], results["chosen_model_error"][i, j] = choice.candidate
-            else:
-                results["chosen_candidate"][i, j] = choice.candidate
+            results["chosen_k"][i, j] = np.nan if choice.column is None else choice.column + 1
+            results["chosen_candidate"][i, j] = shown(choice.candidate)
+            results["chosen_model_error"][i, j] = shown(choice.candidate, "model_error")
             results["invalid_fraction"][i, j] = 1.0 - scores.valid(arm, mode).mean()
             statistics = slope_statistics(positions[i][:, 0], positions[i][:, 1], truth)
             for name in STATISTICS:
@@ -277,7 +264,7 @@ def _results_at_k(cell: Cell, arms: Any, scores: Scores) -> dict[str, NDArray[An
     errors, standard_errors = np.full((2, len(arms), cell.pixels**2 - 1), np.nan)
     count = len(scores.truth)
     for i, arm in enumerate(arms):
-        if arm in KEEPING_ARMS:
+        if arm in scores.sums:
             mean, mean_square = scores.sums[arm] / count
             errors[i] = mean
             standard_errors[i] = np.sqrt(np.maximum(mean_square - mean**2, 0.0) / (count - 1))

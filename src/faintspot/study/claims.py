@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.study import judges
+from faintspot.study.paper import NO_TV, TV
 from faintspot.study.verdicts import Case, Finding, Verdict
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def verdicts(dataset: xarray.Dataset, seed: int = 2015) -> list[Verdict]:
         Of the bootstraps, so that the same study always gets the same verdicts.
     """
     modes = [str(name) for name in dataset["mode"].values]
-    if not {"plain", "tv"} <= {str(name) for name in dataset["arm"].values}:
+    if not {NO_TV, TV} <= {str(name) for name in dataset["arm"].values}:
         return []
     results = []
     for number, (claim, rule, judge) in enumerate(_CLAIMS, start=1):

@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
+from faintspot.compare.curves import Curve, Gain, gain_at_flux
+from faintspot.compare.statistics import Estimate, absolute_errors
 from faintspot.estimate.noise import suggested_strength
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.simulate import Detector, sensor_frames
-from faintspot.study.metric import Estimate, absolute_errors, flux_gain_with_error
+from faintspot.study.paper import NO_TV, TV, TV_OVER_NO_TV
 
 FLUXES_E = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0)
 SHOWN_FLUX_E = 60.0
@@ -35,8 +37,8 @@ EXCESS_NOISE = 2.0
 
 
 @dataclass(frozen=True)
-class Arm:
-    """One way to measure at one flux, with what was chosen for it and its errors on other frames."""
+class Scored:
+    """What was chosen at one flux, with its errors on other frames."""
 
     settings: Settings
     errors: NDArray[np.float64]
@@ -50,20 +52,25 @@ class Arm:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both arms at all fluxes, in one mode ("best k" or "fixed k")."""
+    """Measurements without and with denoising at every flux of FLUXES_E, in one mode."""
 
     mode: str
-    plain: list[Arm]
-    denoised: list[Arm]
+    without: list[Scored]
+    denoised: list[Scored]
 
     def difference(self, i: int) -> Estimate:
         """R without minus R with denoising at flux i, with its paired standard error."""
-        return Estimate.of_mean(self.plain[i].errors - self.denoised[i].errors)
+        return Estimate.of_mean(self.without[i].errors - self.denoised[i].errors)
 
-    def flux_gain(self, rng: np.random.Generator) -> Estimate:
+    def flux_gain(self, rng: np.random.Generator) -> Gain:
         """Flux gain of denoising at SHOWN_FLUX_E."""
-        plain, denoised = (np.stack([arm.errors for arm in arms]) for arms in (self.plain, self.denoised))
-        return flux_gain_with_error(FLUXES_E, plain, denoised, SHOWN_FLUX_E, rng)
+        errors = {TV: self.denoised, NO_TV: self.without}
+        curve = Curve.of_errors(
+            FLUXES_E, {arm: np.stack([each.errors for each in scored]) for arm, scored in errors.items()}
+        )
+        gain = gain_at_flux(curve, SHOWN_FLUX_E, rng, **TV_OVER_NO_TV)
+        assert gain is not None  # the flux is one of the curve's
+        return gain
 
 
 def demonstration_layout() -> Layout:
@@ -106,13 +113,13 @@ def compare(
         frames, truth = simulate(layout, flux, n_frames, rng)
         best = float(suggested_strength(READ_NOISE_E, flux, layout.pixels, excess_noise=EXCESS_NOISE))
         for comparison, kept in zip(comparisons, (BEST_KEPT, (FIXED_KEPT,)), strict=True):
-            without = [Settings(denoise=False, keep_brightest=k) for k in kept]
+            without = [Settings(NO_TV, keep_brightest=k) for k in kept]
             with_tv = [
-                Settings(noise_std=best * factor, keep_brightest=k)
+                Settings(TV, noise_std=best * factor, keep_brightest=k)
                 for factor in STRENGTH_FACTORS
                 for k in kept
             ]
-            comparison.plain.append(choose(layout, without, frames, truth))
+            comparison.without.append(choose(layout, without, frames, truth))
             comparison.denoised.append(choose(layout, with_tv, frames, truth))
         if progress is not None:
             progress(i + 1, len(FLUXES_E))
@@ -121,7 +128,7 @@ def compare(
 
 def choose(
     layout: Layout, candidates: list[Settings], frames: NDArray[Any], truth: NDArray[np.float64]
-) -> Arm:
+) -> Scored:
     """Choose the settings with the smallest R on the first half of the frames; score them on the other."""
     half = len(frames) // 2
 
@@ -130,4 +137,4 @@ def choose(
         return absolute_errors(slopes.x, slopes.y, truth[part]).ravel()
 
     best = min(candidates, key=lambda settings: float(errors(settings, slice(half)).mean()))
-    return Arm(best, errors(best, slice(half, None)))
+    return Scored(best, errors(best, slice(half, None)))

@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
+from faintspot.estimators.maximum_likelihood import MaximumLikelihood
+from faintspot.estimators.weighted import Weighted
+from faintspot.study.arms import knows_the_spot
 from faintspot.study.curves import Configuration
-from faintspot.study.specification import BEST, CORRECTED, ESTIMATOR_ARMS
+from faintspot.study.specification import BEST, CORRECTED
 
 if TYPE_CHECKING:
     import xarray
@@ -18,7 +22,9 @@ Floats = NDArray[np.float64]
 
 ENOUGH_PHOTONS = {0.1: 30.0, 3.0: 120.0, 16.0: 500.0}
 """Fewest electrons, by read noise, at which an estimator that knows the spot is expected at the bound."""
-EFFICIENT, EFFICIENT_WEIGHTED = 0.95, 0.75
+ML, MAP = MaximumLikelihood.name, MaximumAPosteriori.name
+EXPECTED_EFFICIENCY = {ML: 0.95, MAP: 0.95, Weighted.name: 0.75}
+"""Least photon efficiency, by arm, where there is light enough."""
 NEAR_BEST = 1.04
 """Gain-corrected rms over the smallest of all arms up to which an arm counts as near the best."""
 _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dominate its error
@@ -26,7 +32,7 @@ _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dom
 
 def compares_estimators(dataset: xarray.Dataset) -> bool:
     """Whether a study has arms that know the spot."""
-    return bool(set(ESTIMATOR_ARMS) & {str(arm) for arm in dataset["arm"].values})
+    return any(knows_the_spot(str(arm)) for arm in dataset["arm"].values)
 
 
 def enough_photons(read_noise_e: float, flux_e: float) -> bool:
@@ -90,8 +96,7 @@ def _efficient(cells: _Cells) -> list[str]:
     conditions = zip(cells.coordinate("read_noise_e"), cells.coordinate("flux_e"), strict=True)
     enough = np.array([enough_photons(float(noise), float(flux)) for noise, flux in conditions])
     found = []
-    targets = {"ml": EFFICIENT, "map": EFFICIENT, "weighted": EFFICIENT_WEIGHTED}
-    for arm, target in targets.items():
+    for arm, target in EXPECTED_EFFICIENCY.items():
         if arm in cells.arms and enough.any():
             values = np.where(enough, cells.of("photon_efficiency", arm), np.inf)
             lowest = int(np.argmin(values))
@@ -105,15 +110,15 @@ def _efficient(cells: _Cells) -> list[str]:
 
 
 def _outlier_dominated(cells: _Cells) -> list[str]:
-    if not {"ml", "map"} <= set(cells.arms):
+    if not {ML, MAP} <= set(cells.arms):
         return []
-    dominated = cells.of("outlier_fraction", "ml") > _OUTLIERS
+    dominated = cells.of("outlier_fraction", ML) > _OUTLIERS
     if not dominated.any():
         return []
-    errors, se = cells.values("error", BEST)[dominated], cells.of("error_se", "map")[dominated]
-    own = cells.of("error", "map")[dominated]
+    errors, se = cells.values("error", BEST)[dominated], cells.of("error_se", MAP)[dominated]
+    own = cells.of("error", MAP)[dominated]
     ratio = own / errors.min(axis=1)
-    stated = cells.of("stated_over_actual_all", "map", None)[dominated]
+    stated = cells.of("stated_over_actual_all", MAP, None)[dominated]
     return [
         f"Where more than {_OUTLIERS:.0%} of the likelihood's slopes are outliers ({dominated.sum()} "
         f"cells), map has the smallest R of all arms in {int(np.sum(ratio <= 1))} and is within two "
@@ -188,7 +193,7 @@ def _efficiency_section(cells: _Cells) -> list[str]:
 
 def _calibration_section(cells: _Cells) -> list[str]:
     near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
-    kept = [i for i, arm in enumerate(cells.arms) if arm in ESTIMATOR_ARMS]
+    kept = [i for i, arm in enumerate(cells.arms) if knows_the_spot(arm)]
     rows = [
         "| | " + " | ".join(cells.arms[i] for i in kept) + " |",
         "|---|" + "---|" * len(kept),

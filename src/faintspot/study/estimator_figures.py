@@ -10,9 +10,9 @@ import numpy as np
 
 from faintspot.report.drawing import GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
-from faintspot.study.baselines import ARM_NAMES
-from faintspot.study.cell_numbers import numbers_of, parameter_in_words, parameters_of
-from faintspot.study.specification import BEST, CORRECTED, ESTIMATOR_ARMS
+from faintspot.study.arms import is_estimator, knows_the_spot, label_of, style_of
+from faintspot.study.cell_table import parameter_in_words, parameters_of, table_of_cells
+from faintspot.study.specification import BEST, CORRECTED
 from faintspot.study.sweep import PARAMETERS
 
 if TYPE_CHECKING:
@@ -23,18 +23,6 @@ if TYPE_CHECKING:
 _ROW_HEIGHT = 4.4
 _COLUMNS = 2
 _FEWEST_POINTS = 3
-# Okabe & Ito (2008) and two greys; arms that know the spot are solid, the others dashed.
-_STYLES = {
-    "plain": ("#000000", "o"),
-    "tv": ("#D55E00", "s"),
-    "gaussian": ("#E69F00", "D"),
-    "thresholded": ("#9a9a9a", "X"),
-    "weighted": ("#009E73", "^"),
-    "matched": ("#CC79A7", "v"),
-    "ml": ("#0072B2", "P"),
-    "map": ("#56B4E9", "*"),
-    "trained": ("#6b3fa0", "h"),
-}
 
 
 @dataclass(frozen=True)
@@ -183,7 +171,7 @@ def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
     for panel, part in zip(axes, group.panels, strict=False):
         _lines(panel, dataset, part, "corrected_rms", mode, "d_over_r0")
         values = dataset["corrected_rms"].sel(mode=mode).isel(cell=part.cells)
-        drawn = values.sel(arm=[arm for arm in dataset["arm"].values if arm in _STYLES])
+        drawn = values.sel(arm=_drawn_arms(dataset))
         best = drawn.min("arm").values
         x = dataset["d_over_r0"].values[part.cells]
         panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
@@ -208,7 +196,7 @@ def _with_data(
     """Return a figure with its title and the numbers of the group's cells."""
     title = f"{subject}: {group.words}"
     figure.suptitle(title, fontsize=14)
-    numbers = numbers_of(dataset, group.cells)
+    numbers = table_of_cells(dataset, group.cells)
     return FigureWithData(f"{kind}-{group.name}", title, caption, figure, *numbers)
 
 
@@ -226,23 +214,28 @@ def _grid(group: _Group) -> tuple[Figure, list[Axes]]:
 def _lines(panel: Axes, dataset: xarray.Dataset, part: _Panel, name: str, mode: str, axis: str) -> None:
     """Draw a variable of every arm."""
     x = dataset[axis].values[part.cells]
-    for arm, (colour, marker) in _STYLES.items():
-        if arm not in dataset["arm"].values:
-            continue
+    for arm in _drawn_arms(dataset):
         chosen = dataset.sel(arm=arm, mode=mode).isel(cell=part.cells)
         se_name = f"{name}_se"
         se = chosen[se_name].values if se_name in dataset else None
-        style = "-" if arm in ESTIMATOR_ARMS else "--"
-        size = 8 if marker == "*" else 5.5
-        bars: dict[str, Any] = {
-            "color": colour,
-            "marker": marker,
-            "ms": size,
-            "lw": 1.8,
-            "elinewidth": 1,
-            "ls": style,
-        }
-        panel.errorbar(x, chosen[name].values, se, label=ARM_NAMES[arm], zorder=3, **bars)
+        panel.errorbar(x, chosen[name].values, se, elinewidth=1, zorder=3, **_line_of(arm))
+
+
+def _drawn_arms(dataset: xarray.Dataset) -> list[str]:
+    return [str(arm) for arm in dataset["arm"].values if is_estimator(str(arm))]
+
+
+def _line_of(arm: str) -> dict[str, Any]:
+    """How an arm is drawn: solid where it knows the spot, dashed where it does not."""
+    style = style_of(arm)
+    return {
+        "label": label_of(arm),
+        "color": style.colour,
+        "marker": style.marker,
+        "ms": 8 if style.marker == "*" else 5.5,
+        "lw": 1.8,
+        "ls": "-" if knows_the_spot(arm) else "--",
+    }
 
 
 def _label(axes: list[Axes], group: _Group, y: str, *, flux: bool = True) -> None:
@@ -264,20 +257,7 @@ def _flux_axis(panel: Axes) -> None:
 def _legend(figure: Figure, dataset: xarray.Dataset, *, bound: bool) -> None:
     from matplotlib.lines import Line2D
 
-    arms = {str(arm) for arm in dataset["arm"].values}
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=colour,
-            marker=marker,
-            lw=1.8,
-            ls="-" if arm in ESTIMATOR_ARMS else "--",
-            label=ARM_NAMES[arm],
-        )
-        for arm, (colour, marker) in _STYLES.items()
-        if arm in arms
-    ]
+    handles = [Line2D([], [], **_line_of(arm)) for arm in _drawn_arms(dataset)]
     if bound:
         handles.append(Line2D([], [], color="black", lw=3, alpha=0.35, label="Cramer-Rao bound"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)

@@ -5,12 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from faintspot.study.specification import ARMS, StudySpecification, Sweep
+from faintspot.estimators.matched import Matched
+from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
+from faintspot.estimators.maximum_likelihood import MaximumLikelihood
+from faintspot.estimators.trained import Trained
+from faintspot.estimators.weighted import Weighted
+from faintspot.study.arms import DEFAULT_ARMS
+from faintspot.study.specification import StudySpecification, Sweep
 
 if TYPE_CHECKING:
     import xarray
 
 NAME = "estimators"
+ARMS = (
+    *DEFAULT_ARMS,
+    *(kind.name for kind in (Weighted, Matched, MaximumLikelihood, MaximumAPosteriori, Trained)),
+)
 REALISATIONS = 10_000
 QUICK_REALISATIONS = 2_000
 

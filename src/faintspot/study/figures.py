@@ -10,16 +10,16 @@ import numpy as np
 
 from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
-from faintspot.study.baselines import ARM_NAMES
-from faintspot.study.cell_numbers import (
+from faintspot.study.arms import knows_the_spot, label_of, style_of
+from faintspot.study.cell_table import (
     mode_in_words,
-    numbers_of,
     parameter_in_words,
     parameters_of,
+    table_of_cells,
 )
 from faintspot.study.claims import BEST_MODE, fixed_mode
 from faintspot.study.kept_pixels import kept_panels
-from faintspot.study.specification import BRIGHTEST_ARMS
+from faintspot.study.paper import NO_TV, TV
 from faintspot.study.sweep import PARAMETERS
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ _ROW_HEIGHT = 4.7
 _FEW_LINES = 5  # in a panel; with more it is made higher
 _LARGEST_RATIO = 1.6  # of R to R without denoising; what is above is cut off
 _MARKERS = "osD^vPX<>*"
-_COLOURS = (*ARM_COLOURS, "#E69F00", "#56B4E9")  # Okabe & Ito (2008)
 _AXIS_NAMES = {
     "flux_e": "signal (photo-electrons per spot)",
     "read_noise_e": "read noise (e-)",
@@ -99,7 +98,7 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
         "Bars: one standard error of R. Dotted: R of always answering the centre, half of the positions’ "
         f"range. The same in all panels: {', '.join(fixed) or 'nothing'}."
     )
-    return FigureWithData(name, title, caption, figure, *numbers_of(dataset, cells))
+    return FigureWithData(name, title, caption, figure, *table_of_cells(dataset, cells))
 
 
 @styled
@@ -108,7 +107,7 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
     profiles = sorted({str(p) for p in dataset["profile"].values[dataset["done"].values]})
     panels = [(profile, kept_panels(dataset, profile)) for profile in profiles]
     panels = [(profile, found) for profile, found in panels if found]
-    if not panels or not {"plain", "tv"} <= set(dataset["arm"].values):
+    if not panels or not {NO_TV, TV} <= set(dataset["arm"].values):
         return None
     figure = new_figure(WIDTH * 1.25, _ROW_HEIGHT * len(panels) * 1.1)
     axes = figure.subplots(len(panels), 3, squeeze=False)
@@ -143,24 +142,23 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
 def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | None:
     """Draw R of every arm over R without denoising, for the main read noises; None without cells."""
     cells = _main_cells(dataset, profile)
-    arms = [str(arm) for arm in dataset["arm"].values if arm in BRIGHTEST_ARMS]
-    if not cells or "plain" not in arms or len(arms) < 2:
+    arms = [str(arm) for arm in dataset["arm"].values if not knows_the_spot(str(arm))]
+    if not cells or NO_TV not in arms or len(arms) < 2:
         return None
     modes = _modes(dataset)
     figure = new_figure(WIDTH, _ROW_HEIGHT * len(cells) + 0.8)
     axes = figure.subplots(len(cells), len(modes), squeeze=False, sharey="row")
-    colours = dict(zip(ARM_NAMES, _COLOURS, strict=False))
     reach = float(dataset["position_range_px"].values[next(iter(cells.values()))[0]])
     for panels, (noise, indices) in zip(axes, cells.items(), strict=True):
         lowest = 0.6
         for panel, mode in zip(panels, modes, strict=True):
             _limit(panel, "flux_e", dataset["flux_e"].values[indices])
-            for marker, arm in zip(_MARKERS, arms, strict=False):
+            for arm in arms:
                 flux, ratio, se = _ratio(dataset, indices, arm, mode)
                 lowest = min([lowest, *(0.95 * ratio)])
-                style = "--" if arm == "plain" else "-"
-                bars = {"color": colours[arm], "marker": marker, "ms": 5, "lw": 2, "elinewidth": 1}
-                panel.errorbar(flux, ratio, se, label=ARM_NAMES[arm], ls=style, **bars)
+                style = style_of(arm)
+                bars = {"color": style.colour, "marker": style.marker, "ms": 5, "lw": 2, "elinewidth": 1}
+                panel.errorbar(flux, ratio, se, label=label_of(arm), ls=style.line, **bars)
             panel.set_title(f"{mode_in_words(mode)}: {noise:g} e- read noise")
             _label(panel, "flux_e", log_y=False)
         panels[0].set_ylim(lowest, _LARGEST_RATIO)
@@ -175,7 +173,7 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
         f"{_LARGEST_RATIO:g} is cut off; the numbers are in the data. Bars: one paired standard error."
     )
     every = [cell for part in cells.values() for cell in part]
-    return FigureWithData(f"baselines-{profile}", title, caption, figure, *numbers_of(dataset, every))
+    return FigureWithData(f"baselines-{profile}", title, caption, figure, *table_of_cells(dataset, every))
 
 
 def _axis_of(table: list[dict[str, Any]]) -> str:
@@ -221,7 +219,7 @@ def _draw_lines(
 ) -> None:
     for line in lines:
         colour, marker = styles[line.label]
-        for arm, style, face in (("tv", "-", colour), ("plain", "--", "white")):
+        for arm, style, face in ((TV, "-", colour), (NO_TV, "--", "white")):
             if arm not in dataset["arm"].values:
                 continue
             part = dataset[["error", "error_se"]].sel(arm=arm, mode=mode).isel(cell=line.cells)
@@ -273,11 +271,11 @@ def _draw_over_k(panel: Axes, dataset: xarray.Dataset, cell: int, label: str, co
     rows = []
     k = dataset["k"].values
     parameters = parameters_of(dataset, [cell])[0]
-    for arm, style in (("tv", "-"), ("plain", "--")):
+    for arm, style in ((TV, "-"), (NO_TV, "--")):
         part = dataset.sel(arm=arm).isel(cell=cell)
         y, se = part["error_at_k"].values, part["error_at_k_se"].values
         known = np.isfinite(y)
-        panel.plot(k[known], y[known], ls=style, color=colour, lw=1.9, label=label if arm == "tv" else None)
+        panel.plot(k[known], y[known], ls=style, color=colour, lw=1.9, label=label if arm == TV else None)
         panel.fill_between(k[known], (y - se)[known], (y + se)[known], color=colour, alpha=0.25, lw=0)
         chosen = float(part["chosen_k"].sel(mode=BEST_MODE))
         if np.isfinite(chosen):
@@ -310,12 +308,12 @@ def _main_cells(dataset: xarray.Dataset, profile: str) -> dict[float, list[int]]
 def _ratio(
     dataset: xarray.Dataset, cells: Sequence[int], arm: str, mode: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return flux, R over R of the plain arm, and its paired standard error, by the delta method."""
+    """Return flux, R over R without denoising, and its paired standard error, by the delta method."""
     part = dataset.isel(cell=list(cells)).sel(mode=mode)
-    error, plain = part["error"].sel(arm=arm).values, part["error"].sel(arm="plain").values
+    error, plain = part["error"].sel(arm=arm).values, part["error"].sel(arm=NO_TV).values
     covariance = part["error_covariance"]
     own, its, both = (
-        covariance.sel(arm=a, arm2=b).values for a, b in ((arm, arm), ("plain", "plain"), (arm, "plain"))
+        covariance.sel(arm=a, arm2=b).values for a, b in ((arm, arm), (NO_TV, NO_TV), (arm, NO_TV))
     )
     ratio = error / plain
     variance = (own + ratio**2 * its - 2 * ratio * both) / plain**2

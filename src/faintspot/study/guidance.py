@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintspot.study.baselines import ARM_NAMES, AgainstTV, against_tv
+from faintspot.compare.curves import Curve, Gain, gain_at_error
+from faintspot.study.arms import label_of
+from faintspot.study.baselines import AgainstTV, against_tv
 from faintspot.study.claims import BEST_MODE, fixed_mode
-from faintspot.study.curves import Configuration, Curve, Gain, gain_at_error, study_curves
+from faintspot.study.curves import Configuration, study_curves
 from faintspot.study.judges import LEVEL_PX
+from faintspot.study.paper import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 
 if TYPE_CHECKING:
     import xarray
@@ -35,16 +38,16 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
     Parameters
     ----------
     dataset : xarray.Dataset
-        A study with the arms "plain" and "tv"; otherwise the only paragraph says so.
+        A study with TV and brightest pixels; otherwise the only paragraph says so.
     seed : int
         Of the bootstraps.
     """
     arms = {str(arm) for arm in dataset["arm"].values}
-    if not {"plain", "tv"} <= arms:
+    if not {NO_TV, TV} <= arms:
         return ["This study does not compare TV with brightest pixels alone, so it gives no advice on TV."]
     rng = np.random.default_rng(seed)
     curves = study_curves(dataset, BEST_MODE)
-    best = _compared(curves, rng, "gaussian" in arms)
+    best = _compared(curves, rng, SMOOTHING in arms)
     if not best:
         return [
             f"No configuration of this study has curves that reach R = {LEVEL_PX} px, so flux gains cannot "
@@ -64,10 +67,10 @@ def _compared(
 ) -> list[_Compared]:
     found = []
     for key, curve in sorted(curves.items()):
-        gain = gain_at_error(curve, LEVEL_PX, rng)
+        gain = gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV)
         if gain is None or not np.isfinite(gain.log_se):
             continue
-        over = gain_at_error(curve, LEVEL_PX, rng, reference="gaussian") if gaussian else None
+        over = gain_at_error(curve, LEVEL_PX, rng, method=TV, reference=SMOOTHING) if gaussian else None
         known = over is not None and np.isfinite(over.log_se)
         found.append(_Compared(key, gain, over if known else None))
     return found
@@ -150,7 +153,7 @@ def _choosing_k(
     ratios = []
     for key, curve in best.items():
         if key in fixed:
-            error, other = curve.of("plain"), fixed[key].of("plain")
+            error, other = curve.of(NO_TV), fixed[key].of(NO_TV)
             known = np.isfinite(error) & np.isfinite(other) & (other < 0.8 * key.prior_error_px)
             ratios += (other[known] / error[known]).tolist()
     if not ratios:
@@ -189,9 +192,7 @@ def _against_baselines(dataset: xarray.Dataset) -> list[str]:
     lines = []
     for profile, rows in _by_profile(against_tv(dataset, BEST_MODE)).items():
         ahead = [
-            f"{ARM_NAMES[row.arm]} ({row.smaller} to {row.larger})"
-            for row in rows
-            if row.smaller > row.larger
+            f"{label_of(row.arm)} ({row.smaller} to {row.larger})" for row in rows if row.smaller > row.larger
         ]
         verdict = (
             f"ahead of TV more often than behind: {', '.join(ahead)}"

@@ -1,6 +1,6 @@
 """How each claim of Basden et al. 2015 (arXiv:1503.06043) is decided by the numbers of a study.
 
-All intervals are of 95 %. The two arms are "plain" (brightest pixels without denoising) and "tv". Where
+All intervals are of 95 %. The two arms are brightest pixels without denoising and TV denoising. Where
 nothing is left of a spot every estimator answers about the centre, so that flux gains mean nothing: they are
 taken only where R without TV is below INFORMATIVE times that of an estimator that always answers the centre.
 """
@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintspot.study.curves import Configuration, Curve, Gain, gain_at_error, gain_at_flux, study_curves
+from faintspot.compare.curves import Curve, Gain, gain_at_error, gain_at_flux
+from faintspot.study.curves import Configuration, study_curves
 from faintspot.study.kept_pixels import KEPT_RANGE, kept_panels, spread
+from faintspot.study.paper import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.study.verdicts import Case, Outcome, judged, with_error
 
 if TYPE_CHECKING:
@@ -49,27 +51,29 @@ def selected(curves: Curves, **wanted: float | str) -> list[tuple[Configuration,
     ]
 
 
-def largest_gain(curve: Curve, rng: np.random.Generator, *, method: str = "tv") -> tuple[float, Gain] | None:
-    """Return the flux of the plain arm with the largest gain, by the interval's lower end, and that gain.
+def largest_gain(
+    configuration: Configuration, curve: Curve, rng: np.random.Generator
+) -> tuple[float, Gain] | None:
+    """Return the flux without TV with the largest gain, by the interval's lower end, and that gain.
 
-    Where the method reaches the error below the lowest flux of the study, its gain is not known.
+    Where TV reaches the error below the lowest flux of the study, its gain is not known.
     """
-    limit = INFORMATIVE * curve.configuration.prior_error_px
+    limit = INFORMATIVE * configuration.prior_error_px
     gains = []
-    for flux, error in zip(curve.flux_e, curve.of("plain"), strict=True):
+    for flux, error in zip(curve.flux_e, curve.of(NO_TV), strict=True):
         if np.isfinite(error) and error <= limit:
-            gain = gain_at_flux(curve, float(flux), rng, method=method)
+            gain = gain_at_flux(curve, float(flux), rng, **TV_OVER_NO_TV)
             if gain is not None and gain.is_bounded:
                 gains.append((float(flux), gain))
     return max(gains, key=lambda item: item[1].low, default=None)
 
 
 def thirty_equal_eighty(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> list[Case]:
-    """Compare TV at 30 e- with the plain arm at 80 e-."""
+    """Compare TV at 30 e- with none at 80 e-."""
     cases = []
     for key, curve in selected(study_curves(dataset, mode), read_noise_e=0.1):
-        with_tv, without = curve.at(30, "tv"), curve.at(80, "plain")
-        gain = gain_at_flux(curve, 80, rng)
+        with_tv, without = curve.at(30, TV), curve.at(80, NO_TV)
+        gain = gain_at_flux(curve, 80, rng, **TV_OVER_NO_TV)
         if with_tv is None or without is None or gain is None:
             continue
         finding = (
@@ -84,7 +88,7 @@ def two_to_three(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -
     """Look for the largest flux gain of every Nyquist-sampled configuration."""
     cases = []
     for key, curve in selected(study_curves(dataset, mode)):
-        found = largest_gain(curve, rng)
+        found = largest_gain(key, curve, rng)
         if found is None:
             continue
         flux, gain = found
@@ -119,7 +123,7 @@ def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Gen
     for group in _grouped(curves, "pixels"):
         (small_key, small), (large_key, large) = group[0], group[-1]
         for flux in np.intersect1d(small.flux_e, large.flux_e):
-            changes = [_log_change(small, large, float(flux), arm) for arm in ("tv", "plain")]
+            changes = [_log_change(small, large, float(flux), arm) for arm in (TV, NO_TV)]
             if any(change is None for change in changes):
                 continue
             (tv, tv_error), (plain, plain_error) = (change for change in changes if change is not None)
@@ -146,7 +150,7 @@ def less_dependence_on_k(dataset: xarray.Dataset, mode: str, rng: np.random.Gene
     for profile in _profiles(dataset):
         for panel in kept_panels(dataset, profile):
             for label, cell in panel.cells:
-                found = [spread(dataset, cell, arm) for arm in ("plain", "tv")]
+                found = [spread(dataset, cell, arm) for arm in (NO_TV, TV)]
                 if any(item is None for item in found):
                     continue
                 (plain, plain_error), (tv, tv_error) = (item for item in found if item is not None)
@@ -168,7 +172,7 @@ def _less_dependence_on_fixed_k(dataset: xarray.Dataset) -> list[Case]:
     for profile in _profiles(dataset) if len(modes) > 1 else []:
         for panel in kept_panels(dataset, profile):
             for label, cell in panel.cells:
-                part = dataset.isel(cell=cell).sel(mode=modes, arm=["plain", "tv"]).transpose("arm", ...)
+                part = dataset.isel(cell=cell).sel(mode=modes, arm=[NO_TV, TV]).transpose("arm", ...)
                 error = part["error"].transpose("arm", "mode").values
                 relative = part["error_se"].transpose("arm", "mode").values / error
                 if not np.all(np.isfinite(error)):
@@ -220,7 +224,7 @@ def one_magnitude(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) 
     """Look for the largest gain at 16 e-."""
     cases = []
     for key, curve in selected(study_curves(dataset, mode), read_noise_e=16.0, size="any"):
-        gains = [(level, gain_at_error(curve, level, rng)) for level in _LEVELS_PX]
+        gains = [(level, gain_at_error(curve, level, rng, **TV_OVER_NO_TV)) for level in _LEVELS_PX]
         known = [(level, gain) for level, gain in gains if gain is not None and gain.is_bounded]
         if not known:
             continue
@@ -235,14 +239,14 @@ def never_worse(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) ->
     from scipy.stats import norm
 
     curves = study_curves(dataset, mode)
-    total = sum(int(np.isfinite(curve.difference("tv", "plain")[0]).sum()) for curve in curves.values())
+    total = sum(int(np.isfinite(curve.difference(TV, NO_TV)[0]).sum()) for curve in curves.values())
     limit = float(norm.isf(_FAMILY_FALSE_ALARM / max(total, 1)))
     cases = []
     for profile in _profiles(dataset):
         changes: list[tuple[float, float, str]] = []
         for key, curve in selected(curves, profile=profile, **dict.fromkeys(_FREE, "any")):
-            difference, error = curve.difference("tv", "plain")
-            plain = curve.of("plain")
+            difference, error = curve.difference(TV, NO_TV)
+            plain = curve.of(NO_TV)
             changes += [
                 (d / p, e / p, f"{flux:g} e-, {key.in_words()}")
                 for d, e, p, flux in zip(difference, error, plain, curve.flux_e, strict=True)
@@ -311,7 +315,7 @@ def _slope_with_noise(gains: list[tuple[Configuration, Gain]]) -> tuple[float, f
 def _level_gains(
     group: Iterable[tuple[Configuration, Curve]], rng: np.random.Generator
 ) -> list[tuple[Configuration, Gain]]:
-    gains = [(key, gain_at_error(curve, LEVEL_PX, rng)) for key, curve in group]
+    gains = [(key, gain_at_error(curve, LEVEL_PX, rng, **TV_OVER_NO_TV)) for key, curve in group]
     return [(key, gain) for key, gain in gains if gain is not None and gain.is_bounded]
 
 

@@ -1,6 +1,6 @@
-"""A cell of a study on a GPU: images drawn and measured there, by all arms that know nothing of the spot.
+"""A cell of a study on a GPU: images drawn there, and measured there by the arms that it has kernels for.
 
-Estimators measure the same images on the CPU. Images that turbulence has speckled and those of
+The others measure the same images on the CPU. Images that turbulence has speckled and those of
 electron-multiplying detectors are drawn on the CPU.
 """
 
@@ -15,19 +15,30 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from faintspot import presets
 from faintspot.cuda import every_k
 from faintspot.cuda.drawing import drawing_kernel, profile_tables
 from faintspot.cuda.fused import FEWEST_BLOCKS
 from faintspot.cuda.strips import WARP
-from faintspot.kernels import scoring
-from faintspot.study.arms import FLUX_FLOOR, Images
+from faintspot.estimators.base import Estimator
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.thresholded import Thresholded
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.study.arms import Images
+from faintspot.study.simple_denoisers import BrightestAsTheyAre, MedianFiltered
 from faintspot.study.sweep import Cell
-from faintspot.study.tables import Block, Floats, Scored, with_truth
+from faintspot.study.tables import RULES, Block, Floats, HostTables, Scored, with_truth
 
 _BLOCK_PIXELS = 1 << 22  # of images on the GPU at a time; their positions for every k take twice that
 _GAUSSIAN_REACH = 4.0  # standard deviations, as scipy.ndimage.gaussian_filter
-_BEFORE = {"tv": every_k.DENOISE, "gaussian": every_k.SMOOTH, "median": every_k.MEDIAN}
+_BEFORE: dict[type[Estimator], int] = {
+    BrightestPixels: every_k.NOTHING,
+    BrightestAsTheyAre: every_k.NOTHING,
+    TotalVariation: every_k.DENOISE,
+    Smoothed: every_k.SMOOTH,
+    MedianFiltered: every_k.MEDIAN,
+}
+"""What the kernel does before it sorts the pixels."""
 
 
 class DeviceBlock:
@@ -107,60 +118,68 @@ class DeviceTables:
 
     Parameters
     ----------
-    cell : Cell
     search_range_px : float
         Positions beyond plus or minus this become it, on each axis.
-
-    Raises
-    ------
-    InputError
-        When the images are too large for a warp.
     """
 
-    def __init__(self, cell: Cell, search_range_px: float) -> None:
-        self._cell, self._search_range_px = cell, search_range_px
+    def __init__(self, search_range_px: float = math.inf) -> None:
+        self._search_range_px, self._host = search_range_px, HostTables(search_range_px)
         self._memory: dict[tuple[int, int], tuple[Any, Any]] = {}  # used again: to get some takes long
 
+    def takes(self, kind: type[Estimator]) -> bool:
+        """See `Tables`."""
+        return kind is Thresholded or self._host.takes(kind)
+
     def sums(
-        self, arm: str, candidates: Sequence[float], block: DeviceBlock, *, moments: bool
+        self, estimators: Sequence[Any], block: DeviceBlock, *, moments: bool
     ) -> tuple[Floats, Floats | None]:
         """See `Tables`."""
-        every = [self._sums(self._positions(arm, c, block)[0], block) for c in candidates]
+        if not self._has_kernel(estimators[0]):
+            return self._host.sums(estimators, Block(block.images, block.truth), moments=moments)
+        every = [self._sums(self._positions(each, block)[0], block) for each in estimators]
         found = np.stack([sums.copy_to_host() for sums in every], axis=1)
         if not moments:
             return found[every_k.ERROR], None
-        parts = [with_truth(found[every_k.X :, c], block.truth) for c in range(len(candidates))]
+        parts = [with_truth(found[every_k.X :, c], block.truth) for c in range(len(estimators))]
         return found[every_k.ERROR], np.stack(parts, axis=1)
 
-    def scored(self, arm: str, candidate: float, block: DeviceBlock, columns: Sequence[int]) -> Scored:
+    def scored(self, estimator: Any, block: DeviceBlock, columns: Sequence[int]) -> Scored:
         """See `Tables`."""
-        positions, valid = self._positions(arm, candidate, block)
+        if not self._has_kernel(estimator):
+            return self._host.scored(estimator, Block(block.images, block.truth), columns)
+        positions, valid = self._positions(estimator, block)
         sums = self._sums(positions, block).copy_to_host()
         chosen = np.stack([positions[column].copy_to_host() for column in columns], axis=1)
         lit = np.stack([valid[column].copy_to_host() for column in columns], axis=1)
         errors = sums[[every_k.ERROR, every_k.ERROR_SQUARED]]
         return Scored(chosen.astype(np.float64), lit.astype(bool), errors)
 
-    def _positions(self, arm: str, candidate: float, block: DeviceBlock) -> tuple[Any, Any]:
+    def _has_kernel(self, estimator: Estimator) -> bool:
+        return type(estimator) in _BEFORE or isinstance(estimator, Thresholded)
+
+    def _positions(self, estimator: Any, block: DeviceBlock) -> tuple[Any, Any]:
         """Positions (K, n, 2) and validity (K, n) on the GPU, which the next call may overwrite."""
-        side, n = self._cell.pixels, len(block.on_device)
-        k = 1 if arm == "thresholded" else side**2 - 1
-        positions, valid = self._tables_of(k, n)
+        side, n = block.on_device.shape[-1], len(block.on_device)
         launched = max(n, FEWEST_BLOCKS), WARP
-        level = np.float32(0.0 if math.isnan(candidate) else candidate * self._cell.pixel_noise_e)
-        limits = np.float64(FLUX_FLOOR), np.float64(self._search_range_px)
-        if arm == "thresholded":
+        limits = np.float64(estimator.flux_floor), np.float64(self._search_range_px)
+        if isinstance(estimator, Thresholded):
+            positions, valid = self._tables_of(1, n)
             kernel = every_k.thresholded_kernel(side)[launched]
-            kernel(block.on_device, level, *limits, positions, valid)
+            kernel(block.on_device, np.float32(estimator.threshold_e), *limits, positions, valid)
             return positions, valid
-        rule = scoring.THRESHOLD if arm == "threshold" else scoring.SUBTRACT_NEXT
-        taps = gaussian_taps(candidate) if arm == "gaussian" else np.zeros((2, 1), np.float32)
-        solver = presets.of_denoising("accurate")
-        every_k.positions_kernel(side, _BEFORE.get(arm, every_k.NOTHING), rule)[launched](
+        positions, valid = self._tables_of(side**2 - 1, n)
+
+        def option(name: str) -> Any:
+            return estimator.values(name, 1, side**2)[0]
+
+        before = _BEFORE[type(estimator)]
+        denoises, smooths = before == every_k.DENOISE, before == every_k.SMOOTH
+        taps = gaussian_taps(float(option("smoothing_px"))) if smooths else np.zeros((2, 1), np.float32)
+        every_k.positions_kernel(side, before, RULES[estimator.rule])[launched](
             block.on_device,
-            level,
-            np.float32(solver["tolerance"]),
-            np.int32(solver["max_iterations"]),
+            np.float32(option("noise_std") if denoises else 0.0),
+            np.float32(option("tolerance") if denoises else 0.0),
+            np.int32(option("max_iterations") if denoises else 0),
             cuda.to_device(taps),
             *limits,
             positions,

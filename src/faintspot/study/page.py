@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from faintspot.errors import InputError
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Page, Section, configuration_section, html_of, write_page
-from faintspot.study.cell_numbers import mode_in_words
+from faintspot.study.cell_table import mode_in_words
 from faintspot.study.claims import fixed_mode, verdicts
 from faintspot.study.efficiency import compares_estimators, findings
 from faintspot.study.estimator_figures import estimator_figures

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from faintspot.compare.curves import Gain, gain_at_error
 from faintspot.report.figure_data import csv_text
 from faintspot.report.page import Badge, Cell, Section, Table
-from faintspot.study.baselines import ARM_NAMES, against_tv
-from faintspot.study.cell_numbers import mode_in_words
+from faintspot.study.arms import label_of
+from faintspot.study.baselines import against_tv
+from faintspot.study.cell_table import mode_in_words
 from faintspot.study.claims import fixed_mode
-from faintspot.study.gains import gains_by_mode
+from faintspot.study.curves import Configuration, study_curves
+from faintspot.study.judges import LEVEL_PX
+from faintspot.study.paper import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.study.verdicts import Finding, Outcome, Verdict
 
 if TYPE_CHECKING:
@@ -24,7 +30,7 @@ def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
     """Return the section of the verdicts; `fixed` names the mode of a fixed number of pixels."""
     title = "Verdicts on the claims of Basden et al. 2015"
     if not judged:
-        return Section("verdicts", title, missing="No verdicts: they need the arms “plain” and “tv”.")
+        return Section("verdicts", title, missing=f"No verdicts: they need the arms “{NO_TV}” and “{TV}”.")
     text = (
         f"{_summary(judged, fixed)}. Decided by the rules stated under each claim, from the numbers of this "
         "study. “Best k”: each arm keeps its own best number of brightest pixels. "
@@ -77,7 +83,7 @@ def baselines_section(dataset: xarray.Dataset) -> Section:
     modes = [mode for mode in ("best", fixed_mode(dataset)) if mode in dataset["mode"].values]
     rows = [
         [
-            ARM_NAMES[row.arm],
+            label_of(row.arm),
             row.profile,
             mode_in_words(mode),
             str(row.cells),
@@ -123,6 +129,33 @@ def gains_section(dataset: xarray.Dataset) -> Section:
     )
     header = ["Configuration", *(mode_in_words(mode) for mode in modes)]
     return Section("gains", title, tables=[Table(header, rows, caption)])
+
+
+def gains_by_mode(
+    dataset: xarray.Dataset, level_px: float = LEVEL_PX
+) -> dict[Configuration, dict[str, Gain | None]]:
+    """Return the flux gain of TV over no denoising at one R, by configuration and mode.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of a study.
+    level_px : float
+        R at which the flux that both arms need is compared, px.
+
+    Returns
+    -------
+    dict
+        Configurations that have a gain in at least one mode; None where a mode has none, as when the error
+        without denoising does not come down to that level.
+    """
+    rng = np.random.default_rng(0)  # of the bootstrap: the same study gives the same page
+    table: dict[Configuration, dict[str, Gain | None]] = {}
+    for mode in dataset["mode"].values:
+        for configuration, curve in study_curves(dataset, str(mode)).items():
+            gain = gain_at_error(curve, level_px, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
+            table.setdefault(configuration, {})[str(mode)] = gain
+    return {key: gains for key, gains in table.items() if any(gain is not None for gain in gains.values())}
 
 
 def _summary(judged: list[Verdict], fixed: str) -> str:

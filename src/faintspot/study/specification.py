@@ -2,41 +2,26 @@
 
 from __future__ import annotations
 
-import difflib
-import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import tomlkit
-from tomlkit.exceptions import TOMLKitError
 
-from faintspot import __version__
 from faintspot.checks import number_between, one_of
+from faintspot.compare.store import fingerprint_of
 from faintspot.errors import InputError
+from faintspot.study.arms import DEFAULT_ARMS, kind_of, knows_the_spot
 from faintspot.study.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
+from faintspot.toml_files import check_keys, checked_table, parse_file, parse_text
 
-__all__ = ["ARMS", "ESTIMATOR_ARMS", "PROFILES", "StudySpecification", "Sweep"]
+__all__ = ["BEST", "CORRECTED", "PROFILES", "StudySpecification", "Sweep"]
 
-KEEPING_ARMS = ("plain", "tv", "threshold", "gaussian", "median")
-"""Arms that keep the k brightest pixels."""
-BRIGHTEST_ARMS = (*KEEPING_ARMS, "thresholded")
-"""Arms that know nothing of the spot."""
-ESTIMATOR_ARMS = ("weighted", "matched", "ml", "map", "trained")
-"""Arms that do: estimators of `faintspot.estimators`."""
-ARMS = (*BRIGHTEST_ARMS, *ESTIMATOR_ARMS)
-_WITH_PSF = ("matched", "ml", "map")
 BEST, CORRECTED = "best", "corrected"
 DEVICES = ("cpu", "cuda")
-_CANDIDATES = {
-    "tv": "strengths",
-    "gaussian": "widths",
-    "thresholded": "thresholds",
-    "weighted": "weight_widths",
-}
 _CANDIDATE_RANGES = {
     "strengths": Range("1", 0.0, 10.0, low_open=True),
     "widths": Range("px", 0.0, 10.0, low_open=True),
@@ -46,20 +31,6 @@ _CANDIDATE_RANGES = {
     "model_errors": Range("1", 0.0, 10.0),
 }
 _RANGE_KEYS = ("from", "to", "points", "spacing")
-_FORMAT = 2  # of the results: raised when the same specification gives other numbers or another layout
-
-
-class Robustness(NamedTuple):
-    """How an arm with a PSF allows for spots that are unlike it."""
-
-    blur_px: float
-    """Standard deviation of the Gaussian that the PSF is blurred with."""
-    model_error: float
-    """`faintspot.Settings.model_error`."""
-
-
-Candidate = float | Robustness
-"""What an arm may choose; NaN for an arm with nothing but k to choose."""
 
 
 @dataclass(frozen=True)
@@ -77,20 +48,22 @@ class StudySpecification:
         Simulated images of each cell, at least 20. Settings are chosen on the first half of them and scored
         on the second.
     arms : sequence of str
-        What is compared, of `ARMS`; those that know nothing of the spot by default.
+        What is compared: names of estimators (`faintspot.estimators.estimators()`), "threshold", "median".
+        Default: the built-in ones that know nothing of the spot.
     strengths : sequence of float
-        Strengths of "tv" to choose from, as fractions of the noise of a mean pixel.
+        Strengths of the denoising (option `noise_std`) to choose from, as fractions of the noise of a mean
+        pixel.
     widths : sequence of float
-        Widths (standard deviations, px) of "gaussian" to choose from.
+        Widths of the smoothing (option `smoothing_px`) to choose from.
     thresholds : sequence of float
-        Thresholds of "thresholded" to choose from, in units of the noise of a mean pixel.
+        Thresholds (option `threshold_e`) to choose from, in units of the noise of a mean pixel.
     weight_widths : sequence of float
-        Widths of the weight of "weighted" to choose from, as fractions of the spot's.
+        Widths of the weight (option `weight_fwhm_px`) to choose from, as fractions of the spot's.
     blurs : sequence of float
-        Standard deviations (px) of the Gaussian that blurs the PSF of "matched", "ml" and "map" to choose
-        from for spots that turbulence has speckled. Other spots are not blurred.
+        Standard deviations of the Gaussian that blurs the PSF (option `blur_px`) to choose from for spots
+        that turbulence has speckled. Other spots are not blurred.
     model_errors : sequence of float
-        `Settings.model_error` of "ml" and "map" to choose from, together with the blur, for the same spots.
+        Values of the option `model_error` to choose from, together with the blur, for the same spots.
     fixed_k : sequence of int
         Numbers of kept pixels of the modes in which all arms keep the same number.
     corrected : bool
@@ -113,7 +86,7 @@ class StudySpecification:
     sweeps: Sequence[Sweep]
     seed: int = 1
     realisations: int = 10_000
-    arms: Sequence[str] = BRIGHTEST_ARMS
+    arms: Sequence[str] = DEFAULT_ARMS
     strengths: Sequence[float] = (0.3, 0.5, 0.7, 0.85, 1.0)
     widths: Sequence[float] = (0.4, 0.6, 0.8, 1.0, 1.3)
     thresholds: Sequence[float] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
@@ -125,6 +98,16 @@ class StudySpecification:
     search_range_px: float | None = None
     device: str = DEVICES[0]
 
+    LISTED: ClassVar[Mapping[str, tuple[str, bool]]] = {
+        "noise_std": ("strengths", False),
+        "smoothing_px": ("widths", False),
+        "threshold_e": ("thresholds", False),
+        "weight_fwhm_px": ("weight_widths", False),
+        "blur_px": ("blurs", True),
+        "model_error": ("model_errors", True),
+    }
+    """By option of an estimator, which field lists its values, and whether only for speckled spots."""
+
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"name: expected a text, got {self.name!r}")
@@ -132,7 +115,7 @@ class StudySpecification:
         number = number_between("realisations", self.realisations, 20, 10_000_000, integer=True)
         self._set("realisations", int(number))
         self._set("sweeps", _checked_sweeps(self.sweeps))
-        self._set("arms", tuple(one_of("arms", arm, ARMS) for arm in _checked_list("arms", self.arms)))
+        self._set("arms", tuple(dict.fromkeys(kind_of(arm).name for arm in _checked_list("arms", self.arms))))
         for name, bounds in _CANDIDATE_RANGES.items():
             items = _checked_list(name, getattr(self, name))
             self._set(name, tuple(checked_numbers(name, items, bounds)))
@@ -172,22 +155,11 @@ class StudySpecification:
         fixed = {f"fixed{k}": k for k in self.fixed_k if k < cell.pixels**2}
         return {mode: fixed.get(mode) for mode in self.modes if mode in (BEST, CORRECTED, *fixed)}
 
-    def candidates(self, arm: str, cell: Cell) -> tuple[Candidate, ...]:
-        """Return what an arm chooses from in a cell."""
-        if arm in _CANDIDATES:
-            return tuple(getattr(self, _CANDIDATES[arm]))
-        if arm not in _WITH_PSF:
-            return (float("nan"),)
-        if cell.d_over_r0 == 0:
-            return (Robustness(0.0, 0.0),)
-        model_errors = (0.0,) if arm == "matched" else self.model_errors
-        return tuple(Robustness(blur, error) for blur in self.blurs for error in model_errors)
-
     def search_range_of(self, cell: Cell) -> float:
         """Return the largest position of all arms in a cell, px; infinite where there is none."""
         if self.search_range_px is not None:
             return self.search_range_px
-        return cell.position_range_px if set(self.arms) & set(ESTIMATOR_ARMS) else math.inf
+        return cell.position_range_px if any(map(knows_the_spot, self.arms)) else math.inf
 
     def cells(self) -> list[Cell]:
         """Return all cells, each once, in the order of the sweeps."""
@@ -201,8 +173,7 @@ class StudySpecification:
     @property
     def fingerprint(self) -> str:
         """A text that differs whenever the results could."""
-        text = f"{_FORMAT}\n{__version__}\n{self.to_text()}"
-        return hashlib.sha256(text.encode()).hexdigest()[:32]
+        return fingerprint_of(self.to_text())
 
     def to_text(self) -> str:
         """Return the specification as TOML with every value written out."""
@@ -228,10 +199,7 @@ class StudySpecification:
         InputError
             When it is not TOML, has an unknown key, lacks one or has a bad value.
         """
-        try:
-            document: dict[str, Any] = tomlkit.parse(text).unwrap()
-        except TOMLKitError as error:
-            raise InputError(f"{where}: not a TOML file: {str(error).splitlines()[0]}") from None
+        document: dict[str, Any] = parse_text(text, where).unwrap()
         try:
             return _build(document)
         except InputError as error:
@@ -246,16 +214,8 @@ class StudySpecification:
         InputError
             As `from_text`, and when the file cannot be read.
         """
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except UnicodeDecodeError:
-            raise InputError(f"{path}: not a TOML file: it is not UTF-8 text") from None
-        return cls.from_text(text, str(path))
+        document = parse_file(path)
+        return cls.from_text(tomlkit.dumps(document), str(path))
 
 
 def _checked_list(name: str, given: Any) -> list[Any]:
@@ -283,11 +243,7 @@ def _checked_sweeps(given: Any) -> tuple[Sweep, ...]:
 
 def _build(document: dict[str, Any]) -> StudySpecification:
     known = [field.name for field in fields(StudySpecification)]
-    for key in document:
-        _check_known("", key, known)
-    for key in ("name", "sweeps"):
-        if key not in document:
-            raise InputError(f"{key}: expected a value, found none")
+    check_keys("", document, known, required=("name", "sweeps"))
     tables = document["sweeps"]
     if not isinstance(tables, dict) or not tables:
         raise InputError("sweeps: expected at least one table, such as [sweeps.signal]")
@@ -296,10 +252,7 @@ def _build(document: dict[str, Any]) -> StudySpecification:
 
 
 def _sweep(name: str, table: Any) -> Sweep:
-    if not isinstance(table, dict):
-        raise InputError(f"sweeps.{name}: expected a table, got {table!r}")
-    for key in table:
-        _check_known(f"sweeps.{name}.", key, PARAMETERS)
+    check_keys(f"sweeps.{name}.", checked_table(f"sweeps.{name}", table), PARAMETERS)
     values = {
         key: _spread(f"sweeps.{name}.{key}", key, value) if isinstance(value, dict) else value
         for key, value in table.items()
@@ -309,11 +262,7 @@ def _sweep(name: str, table: Any) -> Sweep:
 
 def _spread(where: str, parameter: str, table: dict[str, Any]) -> list[float]:
     """Return the numbers of { from = 10, to = 1000, points = 9, spacing = "log" }."""
-    for key in table:
-        _check_known(f"{where}.", key, _RANGE_KEYS)
-    for key in ("from", "to", "points"):
-        if key not in table:
-            raise InputError(f"{where}.{key}: expected a value, found none")
+    check_keys(f"{where}.", table, _RANGE_KEYS, required=("from", "to", "points"))
     if parameter not in RANGES:
         raise InputError(f"{where}: expected a text or a list of texts, got a range")
     spacing = one_of(f"{where}.spacing", table.get("spacing", "linear"), ("linear", "log"))
@@ -325,10 +274,3 @@ def _spread(where: str, parameter: str, table: dict[str, Any]) -> list[float]:
     points = int(number_between(f"{where}.points", table["points"], 2, 10_000, integer=True))
     numbers = (np.geomspace if spacing == "log" else np.linspace)(low, high, points)
     return [float(f"{number:.4g}") for number in numbers]
-
-
-def _check_known(prefix: str, key: str, known: Sequence[str]) -> None:
-    if key not in known:
-        close = difflib.get_close_matches(key, known, 1)
-        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
-        raise InputError(f"{prefix}{key}: unknown key; {hint}")

@@ -1,25 +1,18 @@
-"""The results of a study: a dataset, in memory or in a Zarr store (format 3) with one chunk a cell.
-
-In a store, all variables of a cell are written first, then its `done`. However the program ends, a cell that
-is done is whole; the others are measured again.
-"""
+"""The results of a study: a dataset, in memory or in a Zarr store; see `faintspot.compare.store`."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from faintspot import __version__
+from faintspot.compare.statistics import OUTLIER_PX
+from faintspot.compare.store import DONE, OWN_ATTRIBUTES, UnitStore, ZarrStore, is_former
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.locations import one_line
-from faintspot.io.slopes_format import output_errors
-from faintspot.study.metric import OUTLIER_PX
 from faintspot.study.specification import StudySpecification
 from faintspot.study.stored_results import study_attributes
 from faintspot.study.sweep import PARAMETERS, RANGES
@@ -37,10 +30,10 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "chosen_k": (("cell", "arm", "mode"), "px", "number of kept pixels"),
     "chosen_candidate": (
         ("cell", "arm", "mode"),
-        "tv, thresholded: noise of a mean pixel; gaussian, matched, ml, map: px; weighted: width of the spot",
-        "strength, width, threshold or blur chosen",
+        "strength, threshold: noise of a mean pixel; smoothing, blur: px; weight: width of the spot",
+        "value of the arm's first option that is chosen",
     ),
-    "chosen_model_error": (("cell", "arm", "mode"), "1", "model error chosen by an arm with a PSF"),
+    "chosen_model_error": (("cell", "arm", "mode"), "1", "model error chosen"),
     "error_at_k": (("cell", "arm", "k"), "px", "R for every number of kept pixels, candidate as in best"),
     "error_at_k_se": (("cell", "arm", "k"), "px", "standard error of R for every number of kept pixels"),
     "invalid_fraction": (("cell", "arm", "mode"), "1", "fraction of positions without light, taken as 0"),
@@ -68,7 +61,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 }
 """Dimensions, units and description of every variable but `done`."""
 
-_DONE = "done"
+KIND = "study"
 
 
 def new_dataset(specification: StudySpecification) -> xarray.Dataset:
@@ -89,7 +82,7 @@ def new_dataset(specification: StudySpecification) -> xarray.Dataset:
         )
         for name, (dims, units, description) in VARIABLES.items()
     }
-    variables[_DONE] = (("cell",), np.zeros(len(cells), bool), {"long_name": "whether the cell is measured"})
+    variables[DONE] = (("cell",), np.zeros(len(cells), bool), {"long_name": "whether the cell is measured"})
     coordinates: dict[str, Any] = {
         "arm": np.array(specification.arms),
         "arm2": np.array(specification.arms),
@@ -119,8 +112,12 @@ def open_study(path: str | Path) -> xarray.Dataset:
         When there is no study, or the store is damaged.
     """
     path = Path(path)
-    if study_attributes(path) is None:
-        raise InputError(f"{path}: expected the Zarr store of a study, found {_what_is_at(path)}")
+    attributes = study_attributes(path)
+    if attributes is None:
+        found = "something else" if path.exists() else "nothing"
+        raise InputError(f"{path}: expected the Zarr store of a study, found {found}")
+    if is_former(attributes):
+        raise InputError(f"{path}: of faintspot 0.1, whose arms had other names: measure it again")
     try:
         dataset: xarray.Dataset = xarray.open_zarr(path, chunks=None, consolidated=False).load()
     except Exception as error:  # a broken chunk makes each codec raise its own kind
@@ -131,123 +128,34 @@ def open_study(path: str | Path) -> xarray.Dataset:
     for name, coordinate in dataset.coords.items():
         if coordinate.dtype.kind == "T":  # as in memory: Zarr's texts have a type of their own
             dataset[name] = (coordinate.dims, np.array(coordinate.values.tolist()), coordinate.attrs)
+    for name in OWN_ATTRIBUTES:
+        dataset.attrs.pop(name, None)
     return dataset
 
 
-class MemoryResults:
-    """Results in memory."""
-
-    def __init__(self, specification: StudySpecification) -> None:
-        self._dataset = new_dataset(specification)
-
-    def done(self) -> NDArray[np.bool_]:
-        """Return which cells are measured."""
-        return np.asarray(self._dataset[_DONE].values)
-
-    def write(self, index: int, results: Mapping[str, NDArray[Any]]) -> None:
-        """Add a cell."""
-        for name, values in results.items():
-            _place(self._dataset[name].values, index, values)
-        self._dataset[_DONE].values[index] = True
-
-    def dataset(self) -> xarray.Dataset:
-        """Return the results."""
-        return self._dataset
-
-
-class StoredResults:
-    """Results in a Zarr store, made or gone on with.
-
-    Parameters
-    ----------
-    path : Path
-    specification : StudySpecification
-    overwrite : bool
-        Replace the store of another study.
+def stored_units(specification: StudySpecification, path: Path, *, overwrite: bool = False) -> ZarrStore:
+    """Return the store of a study's cells, made or gone on with.
 
     Raises
     ------
     InputError
         When there is something else than a store of this study, or it cannot be written.
     """
-
-    def __init__(self, path: Path, specification: StudySpecification, *, overwrite: bool = False) -> None:
-        self._path = path
-        _check_target(path, specification, overwrite=overwrite)
-        with output_errors(path):
-            if overwrite and path.exists():
-                shutil.rmtree(path)
-            if not path.exists():
-                _create(path, specification)
-            for remains in path.rglob("*.partial"):  # of a program that was killed while it wrote
-                remains.unlink(missing_ok=True)
-        import zarr
-
-        try:
-            group: Any = zarr.open_group(str(path), mode="r+")
-            self._arrays: dict[str, Any] = {name: group[name] for name in (*VARIABLES, _DONE)}
-            self._done = np.asarray(self._arrays[_DONE][:]).astype(bool)
-        except Exception as error:  # broken metadata makes zarr raise many things
-            raise InputError(
-                f"{path}: damaged, it cannot be resumed: delete it ({one_line(error)})"
-            ) from None
-
-    def done(self) -> NDArray[np.bool_]:
-        """Return which cells are measured."""
-        return self._done.copy()
-
-    def write(self, index: int, results: Mapping[str, NDArray[Any]]) -> None:
-        """Write a cell, each variable as one chunk, and then that it is done."""
-        with output_errors(self._path):
-            for name, values in results.items():
-                array = self._arrays[name]
-                chunk = np.full((1, *array.shape[1:]), np.nan)
-                _place(chunk, 0, values)
-                array[index : index + 1] = chunk
-            self._arrays[_DONE][index] = 1
-        self._done[index] = True
-
-    def dataset(self) -> xarray.Dataset:
-        """Return the results."""
-        return open_study(self._path)
+    keys = [str(index) for index in range(len(specification.cells()))]
+    template = new_dataset(specification)
+    return ZarrStore(path, KIND, specification.fingerprint, keys, template=template, overwrite=overwrite)
 
 
-def _place(target: NDArray[Any], index: int, values: NDArray[Any]) -> None:
-    """Write a cell's values; a smaller window has fewer k."""
-    if values.ndim:
-        target[index][..., : values.shape[-1]] = values
-    else:
-        target[index] = values
-
-
-def _create(path: Path, specification: StudySpecification) -> None:
-    """Create the store under a hidden name and rename it, so that it is never seen half made."""
-    hidden = path.with_name(f".{path.name}.new")
-    shutil.rmtree(hidden, ignore_errors=True)
+def dataset_of(specification: StudySpecification, units: UnitStore) -> xarray.Dataset:
+    """Return the results of cells that are in memory; a smaller window has fewer k."""
     dataset = new_dataset(specification)
-    encoding = {name: {"chunks": (1, *dataset[name].shape[1:])} for name in dataset.data_vars}
-    # Zarr's format 3 knows texts of any length, but not NumPy's of a fixed one.
-    texts = {name: c.astype(object) for name, c in dataset.coords.items() if c.dtype.kind == "U"}
-    stored = dataset.assign_coords(texts)
-    stored.to_zarr(hidden, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-    hidden.rename(path)
-
-
-def _what_is_at(path: Path) -> str:
-    return "something else" if path.exists() else "nothing"
-
-
-def _check_target(path: Path, specification: StudySpecification, *, overwrite: bool) -> None:
-    """Refuse to write where there is anything but this study, or where `overwrite` another one."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist: create it or choose another")
-    if not path.exists():
-        return
-    attributes = study_attributes(path)
-    if attributes is None:
-        raise InputError(f"{path}: exists already and is not the store of a study: choose another name")
-    if attributes["fingerprint"] != specification.fingerprint and not overwrite:
-        raise InputError(
-            f"{path}: belongs to another study ({attributes.get('name', 'without a name')!r}, or other "
-            f"settings or another version): choose another name, or --overwrite"
-        )
+    for index in range(dataset.sizes["cell"]):
+        if units.done(str(index)):
+            for name, values in units.read(str(index)).items():
+                target = dataset[name].values
+                if values.ndim:
+                    target[index][..., : values.shape[-1]] = values
+                else:
+                    target[index] = values
+            dataset[DONE].values[index] = True
+    return dataset

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+from faintspot.compare.store import store_attributes
+
 
 def study_attributes(path: Path) -> dict[str, Any] | None:
-    """Return the attributes of the store of a study; None when it is something else."""
-    try:
-        text = (path / "zarr.json").read_text(encoding="utf-8")
-        attributes: dict[str, Any] = json.loads(text)["attributes"]
-    except (OSError, ValueError, KeyError):
-        return None
-    return attributes if {"fingerprint", "specification"} <= attributes.keys() else None
+    """Return the attributes of the store of a study, also of version 0.1; None for something else."""
+    attributes = store_attributes(path)
+    return attributes if attributes is not None and "specification" in attributes else None

@@ -1,4 +1,4 @@
-"""The cells of a study: their parameters in words, and their numbers as a table."""
+"""The cells of a study: their parameters in words, and what they measured as a table."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def parameter_in_words(name: str, value: Any) -> str:
     return without.get((name, value)) or words[name].format(value)
 
 
-def numbers_of(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
+def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
     """Return a table of all arms and modes of cells."""
     header = [
         *PARAMETERS,

@@ -1,0 +1,136 @@
+"""What is compared: estimators with their options, and what they are told of spots and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+from faintspot.estimators.base import Estimator, Need, Style
+from faintspot.estimators.scene import Scene
+from faintspot.options import AUTO
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.settings import Settings
+
+
+class Knowledge(IntEnum):
+    """What an estimator has to know beside the noise; more is larger."""
+
+    NOISE = 0
+    WIDTH = 1
+    SPOT = 2
+
+    @classmethod
+    def of(cls, estimator: Estimator | type[Estimator]) -> Knowledge:
+        """Return what follows from an estimator's needs."""
+        if estimator.needs & {Need.PSF, Need.SCORE}:
+            return cls.SPOT
+        return cls.WIDTH if Need.WIDTH in estimator.needs else cls.NOISE
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """One way to measure slopes, compared with others on the same images.
+
+    Parameters
+    ----------
+    settings : Settings
+        With the estimator and its options.
+    psf, score : PSF, TrainedScore, optional
+        What the estimator knows.
+    title : str
+        What tables and figures call it. Default: the estimator's label.
+    """
+
+    settings: Settings
+    psf: PSF | None = None
+    score: TrainedScore | None = None
+    title: str = ""
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator with its options."""
+        return self.settings.estimator
+
+    @property
+    def name(self) -> str:
+        """The estimator's name."""
+        return self.estimator.name
+
+    @property
+    def label(self) -> str:
+        """What tables and figures call it."""
+        return self.title or self.estimator.label
+
+    @property
+    def style(self) -> Style:
+        """How figures draw it."""
+        return self.estimator.style
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """What it has to know."""
+        return Knowledge.of(self.estimator)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What a pipeline is given beside settings and calibration."""
+        return {"psf": self.psf, "score": self.score}
+
+    def with_options(self, changes: Mapping[str, Any]) -> Arm:
+        """Return the same with some options changed."""
+        return replace(self, settings=self.settings.replace(**changes)) if changes else self
+
+
+def arm_for_scene(
+    kind: type[Estimator],
+    scene: Scene,
+    *,
+    psf: PSF | None = None,
+    score: TrainedScore | None = None,
+) -> Arm:
+    """Return an estimator with the options that a scene asks for, before any are tuned.
+
+    Parameters
+    ----------
+    kind : type of Estimator
+    scene : Scene
+        Its range of positions is the search range.
+    psf, score : PSF, TrainedScore, optional
+        Only what the estimator needs is kept.
+
+    Raises
+    ------
+    InputError
+        When an option that it cannot do without is neither automatic nor found in the scene.
+    """
+    automatic = {name: AUTO for name, option in kind.declared().items() if option.automatic}
+    estimator = kind(**automatic).for_scene(scene)
+    usual = {name: values[0] for name, values in estimator.tuned(scene).items()}
+    width = {"spot_fwhm_px": scene.seen_fwhm_px} if Need.WIDTH in kind.needs else {}
+    settings = Settings(estimator.replaced(usual), search_range_px=scene.position_range_px, **_rounded(width))
+    return Arm(
+        settings,
+        psf if Need.PSF in kind.needs else None,
+        score if Need.SCORE in kind.needs else None,
+    )
+
+
+def tuned_options(arm: Arm, scene: Scene) -> dict[str, list[Any]]:
+    """Return what an arm may choose from in a scene; the usual value of each option is the first."""
+    return {
+        name: list(dict.fromkeys(_rounded(dict(enumerate(values))).values()))
+        for name, values in arm.estimator.tuned(scene).items()
+    }
+
+
+def _rounded(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return numbers to three digits: what is written is what was measured."""
+    return {
+        key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in values.items()
+    }
+
+
+__all__ = ["Arm", "Knowledge", "arm_for_scene", "tuned_options"]
