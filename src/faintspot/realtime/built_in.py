@@ -53,7 +53,8 @@ class BuiltIn:
         if isinstance(prepared, GravityPrepared):
             self.denoises = denoise and prepared.before != gravity.NOTHING
             kernel, task = prepared.part(task, denoise=denoise, background=background)
-        self._kernel = Direct(kernel)
+        # Trials and images come as float32, a camera's frames perhaps as uint16.
+        self._kernels = {kind: Direct(kernel) for kind in ("uint16", "float32")}
         self._task, self._pipeline = task, pipeline
         self.settings: NDArray[np.float32] = task.settings[0]
         """Rows as in `faintspot.kernels.groups`, and those of the estimator's kernel."""
@@ -71,5 +72,6 @@ class BuiltIn:
         """Measure a frame or images; return the images after every step: (STAGE_ROWS, n, ny, nx)."""
         frames = np.ascontiguousarray(images).reshape(1, *self._pipeline.layout.frame_shape)
         source = self._pipeline.source(frames, frames.dtype)._replace(saturation=saturation)
-        self._kernel(source, self._task, 0, self._groups, self._scratch, self._results, self._stages)
+        kernel = self._kernels[frames.dtype.name]
+        kernel(source, self._task, 0, self._groups, self._scratch, self._results, self._stages)
         return self._images
