@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.study.metric import Estimate, absolute_errors
+from faintspot.compare.statistics import Estimate, absolute_errors
 from faintspot.study.sweep import Cell
 
 SEED = 2604

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
+from faintspot.compare.statistics import absolute_errors
 from faintspot.estimate.noise import suggested_strength
 from faintspot.io import open_frames
-from faintspot.study.metric import absolute_errors
 
 KEPT = (6, 8, 10, 12, 16, 20, 25, 30, 40, 50, 60, 80)
 FIXED = 40

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import faintspot as fs
+from faintspot.compare.statistics import slope_statistics
 from faintspot.estimate.automatic import automatic_kept_pixels, automatic_strength
 from faintspot.simulate import Detector, subapertures
 from faintspot.study.arms import position_table
-from faintspot.study.metric import slope_statistics
 from faintspot.study.sweep import Cell
 
 SIDE = 16
@@ -164,7 +164,7 @@ def moments(positions: Floats, truth: Floats, groups: int = 1) -> Floats:
 def quantities(sums: Floats, n: int) -> Floats:
     """Return R and the gain-corrected rms (2, ...) from `moments` (8, ...) of n slopes.
 
-    As `faintspot.study.metric.slope_statistics` defines them.
+    As `faintspot.compare.statistics.slope_statistics` defines them.
     """
     absolute, ex, ey, tx, ty, ee, et, tt = sums
     ee, et, tt = ee - (ex**2 + ey**2) / n, et - (ex * tx + ey * ty) / n, tt - (tx**2 + ty**2) / n

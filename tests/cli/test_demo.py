@@ -12,7 +12,7 @@ from faintspot import SlopePipeline
 from faintspot.cli.demo import comparison_table
 from faintspot.io import read_slopes
 from faintspot.settings import Settings
-from faintspot.study.demonstration import FLUXES_E, Arm, Comparison
+from faintspot.study.demonstration import FLUXES_E, Comparison, Scored
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -52,8 +52,8 @@ def test_bad_options(folder: Path, run: Commands) -> None:
 
 
 def test_a_gain_that_is_not_reached_is_said_in_words() -> None:
-    def arms(error: float) -> list[Arm]:
-        return [Arm(Settings(noise_std=1.0), np.full(20, error / flux)) for flux in FLUXES_E]
+    def arms(error: float) -> list[Scored]:
+        return [Scored(Settings("tv", noise_std=1.0), np.full(20, error / flux)) for flux in FLUXES_E]
 
     table = comparison_table(Comparison("best k", arms(1.0), arms(1e3)), np.random.default_rng(1))
     assert "nan" not in str(table.caption)

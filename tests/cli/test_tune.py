@@ -7,7 +7,7 @@ import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
 
 from faintspot import Calibration, SlopePipeline
-from faintspot.planner import choosing
+from faintspot.planner import tuning
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
 
@@ -15,7 +15,7 @@ KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few spots and fluxes."""
-    monkeypatch.setattr(choosing, "tune", functools.partial(choosing.tune, realisations=256, steps=1))
+    monkeypatch.setattr(tuning, "tune", functools.partial(tuning.tune, realisations=256, steps=1))
 
 
 def test_answer_configuration_and_picture(

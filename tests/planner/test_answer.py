@@ -8,11 +8,11 @@ import pytest
 from tests.planner.planner_cases import answered
 
 from faintspot import Calibration, Layout, Settings, SlopePipeline
-from faintspot.planner import wording
+from faintspot.compare.statistics import Estimate, slope_error
+from faintspot.estimators import estimators
+from faintspot.planner import answer_text
 from faintspot.planner.answer import Answer
-from faintspot.planner.arms import ARMS
 from faintspot.simulate import Detector, sensor_frames
-from faintspot.study.metric import Estimate, slope_error
 
 LAYOUT = Layout.grid((4, 4), pixels=12)
 
@@ -22,7 +22,7 @@ def with_layout(answer: Answer, name: str) -> Answer:
     return dataclasses.replace(answer, question=question, equal=(name,))
 
 
-@pytest.mark.parametrize("name", [arm.name for arm in ARMS])
+@pytest.mark.parametrize("name", list(estimators()))
 def test_the_configuration_gives_the_error_that_was_promised(name: str, tmp_path: Path) -> None:
     answer = with_layout(answered(), name)
     answer.save(tmp_path / "faintspot.toml")
@@ -68,37 +68,52 @@ def test_magnitudes_are_relative_without_photometry() -> None:
 
 def test_the_recommendation_in_words() -> None:
     answer = with_layout(answered(budget="0.1"), "ml")
-    lines = wording.recommendation(answer)
+    lines = answer_text.recommendation(answer)
     assert lines[0].startswith('Recommended: maximum likelihood (estimator "ml"')
     text = " ".join(lines)
     assert "over brightest pixels" in text
     assert "TV denoising" in text
     assert "need not know" in text
     assert "limiting flux for R = 0.1 px" in text
-    assert "assumed profile" in " ".join(wording.foundations(answer))
+    assert "assumed profile" in " ".join(answer_text.foundations(answer))
 
 
 def test_a_star_that_is_too_faint_is_called_so() -> None:
     answer = answered(read_noise_e=30.0, flux_e=20.0)
     assert answer.is_hopeless
-    assert "too faint" in " ".join(wording.recommendation(answer))
+    assert "too faint" in " ".join(answer_text.recommendation(answer))
 
 
 def test_gains_beyond_the_range_are_said_to_be_so() -> None:
     answer = answered()
     beyond = Estimate(float("inf"), float("nan"))
-    assert wording.gain_in_words(answer, beyond) == "more than 0.8 mag"
-    assert wording.short_gain(answer, Estimate(-float("inf"), float("nan"))) == "<-0.8"
-    assert wording.short_gain(answer, Estimate(0.12345, 0.0123)) == "+0.12±0.01"
+    assert answer_text.gain_in_words(answer, beyond) == "more than 0.8 mag"
+    assert answer_text.short_gain(answer, Estimate(-float("inf"), float("nan"))) == "<-0.8"
+    assert answer_text.short_gain(answer, Estimate(0.12345, 0.0123)) == "+0.12±0.01"
 
 
-def test_settings_in_words_name_what_matters() -> None:
-    tv = wording.settings_in_words(Settings(noise_std=1.5, keep_brightest=12, max_iterations=25))
-    assert tv == 'estimator "cog", noise_std 1.5, max_iterations 25, keep_brightest 12'
-    fast = wording.settings_in_words(Settings(noise_std=1.5, keep_brightest=12, preset="fast"))
-    assert fast == 'estimator "cog", preset "fast", noise_std 1.5, keep_brightest 12'
-    plain = wording.settings_in_words(Settings(denoise=False, keep_brightest=9))
-    assert plain == 'estimator "cog", denoise false, keep_brightest 9'
+def test_settings_in_words_name_what_is_not_the_default() -> None:
+    tv = answer_text.settings_in_words(Settings("tv", noise_std=1.5, keep_brightest=12, preset="fast"))
+    assert tv == 'estimator "tv", keep_brightest 12, noise_std 1.5, preset "fast"'
+    assert answer_text.settings_in_words(Settings("brightest")) == 'estimator "brightest"'
+
+
+def test_the_limit_is_sought_beyond_the_plot() -> None:
+    answer = answered(budget="0.02")
+    limit = answer.best.limiting_flux_e
+    assert limit is not None
+    assert 0 < limit.value < np.inf
+    assert answer.flux_e[-1] > 10 ** (0.4 * 0.75) * 200 * 1.01
+    assert answer.flux_e[answer.at_star] == pytest.approx(200.0)
+    assert "all that was tried" not in " ".join(answer_text.recommendation(answer))
+    # R of the recommended arm at its limit is the budget: straight line in log-log between the points.
+    found = np.exp(np.interp(np.log(limit.value), np.log(answer.flux_e), np.log(answer.best.error_px)))
+    assert found == pytest.approx(0.02, rel=0.05)
+
+
+def test_a_budget_that_no_star_is_too_faint_for() -> None:
+    answer = answered(budget="0.9")
+    assert "fainter than all that was tried" in " ".join(answer_text.recommendation(answer))
 
 
 def test_the_figure_shows_every_arm_and_the_limit() -> None:

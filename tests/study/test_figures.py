@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faintspot.study.cell_table import mode_in_words
 from tests.study.study_cases import ARMS, MODES, cells, dataset, power_law
 
+from faintspot.study.cell_table import mode_in_words
 from faintspot.study.figures import baselines_figure, kept_pixels_figure, sweep_figure
 from faintspot.study.kept_pixels import kept_panels, spread
 from faintspot.study.triple_picture import triple_images, triple_picture

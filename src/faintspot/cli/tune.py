@@ -17,8 +17,9 @@ from rich.table import Table
 from faintspot import configuration
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import write_atomically
 from faintspot.io.frames import open_frames
-from faintspot.planner import wording
+from faintspot.planner import answer_text
 from faintspot.planner.camera_file import TABLES, read_camera
 from faintspot.planner.photometry import (
     DEFAULT_BAND,
@@ -121,9 +122,8 @@ def command(
 ) -> None:
     """Say which estimator and settings suit a camera and a star.
 
-    Simulates spots as the camera sees them and tries every estimator on them: brightest pixels, thresholding,
-    Gaussian smoothing, TV denoising, weighted centre of gravity, matched filter, maximum likelihood and a
-    posteriori, trained score. Prints the slope error of each, says how many magnitudes it saves, draws it
+    Simulates spots as the camera sees them and tries every estimator on them, those of installed packages
+    included. Prints the slope error of each, says how many magnitudes it saves, draws it
     against the star's magnitude, and writes a configuration with the best one's settings.
 
     What is not known is left out; recorded frames (and darks) tell most of it.
@@ -141,18 +141,18 @@ def command(
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
     with progress_bar("tuning", "steps") as advance:
         question = _question(frames, dark, key, given)
-        from faintspot.planner.choosing import tune
+        from faintspot.planner.tuning import tune
 
         answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
     console = Console(highlight=False)
-    for line in _wrapped([wording.situation(answer)], console):
+    for line in _wrapped([answer_text.situation(answer)], console):
         click.echo(line)
     console.print(answer_table(answer))
-    heading, *rest = wording.recommendation(answer)
+    heading, *rest = answer_text.recommendation(answer)
     for line in [*_wrapped([heading], console), *_wrapped(rest, console, "  ")]:
         click.echo(line)
     click.echo("This rests on")
-    for line in _wrapped(wording.foundations(answer), console, "  "):
+    for line in _wrapped(answer_text.foundations(answer), console, "  "):
         click.echo(line)
     _write(answer, target, picture, frames)
 
@@ -164,18 +164,18 @@ def answer_table(answer: Answer) -> Table:
     for heading in ("R (px)", "gain", "rms/gain", "outliers", "cost", "mag saved"):
         table.add_column(heading, justify="right", no_wrap=True)
     for result in answer.results:
-        found = result.statistics
+        found, is_reference = result.statistics, result.arm.name == answer_text.BRIGHTEST
         table.add_row(
             result.arm.label,
             f"{found.error.value:.4f}±{found.error.standard_error:.4f}",
             f"{found.gain.value:.2f}",
             f"{found.corrected_rms.value:.4f}",
             f"{100 * found.outlier_fraction.value:.1f} %",
-            f"{result.arm.cost:.2f}",
-            "" if result.arm.name == "plain" else wording.short_gain(answer, result.over_plain),
+            f"{result.arm.estimator.cost:.2f}",
+            "" if is_reference else answer_text.short_gain(answer, result.over_brightest),
             style="bold" if result is answer.best else None,
         )
-    bound = float(answer.bound_px[len(answer.flux_e) // 2])
+    bound = float(answer.bound_px[answer.at_star])
     table.add_row("Cramer-Rao bound", f"{bound:.4f}       ", "", "", "", "", "", style="dim")
     table.caption = (
         "R: mean |error| per axis. rms/gain: rms after correcting gain and offset. outliers: error above "
@@ -284,14 +284,12 @@ def _write(answer: Answer, target: Path, picture: str | None, frames: tuple[str,
     try:
         from faintspot.report.drawing import png
 
-        path.write_bytes(png(answer.figure()))
+        write_atomically(path, png(answer.figure()))
         click.echo(f"{path}: picture")
     except MissingExtraError as error:
         if picture is not None:
             raise
         click.echo(f"no picture: {error}")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
     if answer.question.layout is None:
         pixels = answer.question.pixels
         click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")

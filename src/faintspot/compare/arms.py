@@ -110,7 +110,11 @@ def arm_for_scene(
     estimator = kind(**automatic).for_scene(scene)
     usual = {name: values[0] for name, values in estimator.tuned(scene).items()}
     width = {"spot_fwhm_px": scene.seen_fwhm_px} if Need.WIDTH in kind.needs else {}
-    settings = Settings(estimator.replaced(usual), search_range_px=scene.position_range_px, **_rounded(width))
+    settings = Settings(
+        estimator.replaced(_rounded({**estimator.chosen(), **usual})),
+        search_range_px=scene.position_range_px,
+        **_rounded(width),
+    )
     return Arm(
         settings,
         psf if Need.PSF in kind.needs else None,

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot import configuration
-from faintspot.planner.arms import SPOT, Arm
-from faintspot.planner.curves import Curve
+from faintspot.compare.arms import Arm, Knowledge
+from faintspot.compare.curves import Curve
+from faintspot.compare.statistics import Estimate, SlopeStatistics
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.settings import Settings
-from faintspot.study.metric import Estimate, SlopeStatistics
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,18 +31,32 @@ class ArmResult:
     """One arm at the star's flux, with its best settings."""
 
     arm: Arm
-    settings: Settings
     statistics: SlopeStatistics
-    curve: Curve
-    """R at every flux, the settings chosen anew at each."""
-    over_plain: Estimate
+    error_px: Floats
+    """(m,) R at every flux, the settings chosen anew at each."""
+    standard_error_px: Floats
+    """(m,) of R."""
+    over_brightest: Estimate
     """Magnitudes of guide star gained over brightest pixels, by R."""
     over_thresholded: Estimate
     """The same over thresholding."""
     limiting_flux_e: Estimate | None = None
-    """Flux at which R equals the budget: 0 below and infinity above the range; None without a budget."""
-    psf: PSF | None = None
-    score: TrainedScore | None = None
+    """Flux at which R equals the budget: 0 below and infinity above all that was tried; None without one."""
+
+    @property
+    def settings(self) -> Settings:
+        """The best settings."""
+        return self.arm.settings
+
+    @property
+    def psf(self) -> PSF | None:
+        """What the arm knows of the spot."""
+        return self.arm.psf
+
+    @property
+    def score(self) -> TrainedScore | None:
+        """What the arm has learnt."""
+        return self.arm.score
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +64,27 @@ class Answer:
     """What `faintspot.planner.tune` found."""
 
     question: Question
-    flux_e: Floats
-    """(m,) fluxes of the curves, the star's in the middle."""
+    curve: Curve
+    """R of all arms at m fluxes."""
     results: tuple[ArmResult, ...]
     equal: tuple[str, ...]
     """Names of the arms that are as good as the best within the errors; the first is recommended."""
     bound_px: Floats
     """(m,) R of an estimator at the Cramer-Rao bound, for spots without speckles."""
+    realisations: int
+    """Spots that were scored at each flux."""
     left_out: dict[str, str]
     """Arms that were not tried, and why."""
+
+    @property
+    def flux_e(self) -> Floats:
+        """(m,) fluxes of the curves; the star's is one of them."""
+        return self.curve.flux_e
+
+    @property
+    def at_star(self) -> int:
+        """Which of them is the star's."""
+        return int(np.argmin(np.abs(np.log(self.flux_e / self.question.star_flux_e))))
 
     @property
     def best(self) -> ArmResult:
@@ -68,7 +94,7 @@ class Answer:
     @property
     def best_without_psf(self) -> ArmResult:
         """The best arm of those that need not know the spot."""
-        free = [result for result in self.results if result.arm.knowledge < SPOT]
+        free = [result for result in self.results if result.arm.knowledge < Knowledge.SPOT]
         if self.best in free:
             return self.best
         return min(free, key=lambda result: _finite(result.statistics.corrected_rms.value))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
-import tomllib
 from pathlib import Path
 from typing import Any
 
-from faintspot import configuration
-from faintspot.errors import InputError
-from faintspot.sensor.layout import Layout
+from faintspot.sensor.layout import GRID_KEYS, Layout
+from faintspot.toml_files import check_keys, checked_table, parse_file
+
+_LAYOUT = "layout"
 
 TABLES = {
     "camera": ("read_noise_e", "gain_e_per_adu", "em_gain", "background_e", "pixels"),
@@ -38,41 +37,21 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     InputError
         When the file cannot be read or is not TOML, or has an unknown table or key.
     """
-    path = Path(path)
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from None
+    document = parse_file(path).unwrap()
+    check_keys(f"{path}: ", document, [*TABLES, _LAYOUT], what="table")
     values: dict[str, Any] = {}
     for table, content in document.items():
-        if table == "layout":
-            values["layout"] = _layout(path, content)
+        found = checked_table(f"{path}: {table}", content)
+        if table == _LAYOUT:
+            values[_LAYOUT] = _layout(path, found)
             continue
-        _known(f"{path}: ", table, [*TABLES, "layout"], "table")
-        if not isinstance(content, dict):
-            raise InputError(f"{path}: {table}: expected a table, got {content!r}")
-        for key, value in content.items():
-            _known(f"{path}: {table}.", key, list(TABLES[table]), "key")
-            values[key] = value
+        check_keys(f"{path}: {table}.", found, TABLES[table])
+        values |= found
     return values
 
 
-def _layout(path: Path, content: Any) -> Layout:
-    grid = content.get("grid") if isinstance(content, dict) else None
-    if not isinstance(grid, dict):
-        raise InputError(f"{path}: layout: expected a table [layout.grid]")
-    for key in grid:
-        _known(f"{path}: layout.grid.", key, list(configuration.GRID_KEYS), "key")
-    for key in ("shape", "pixels"):
-        if key not in grid:
-            raise InputError(f"{path}: layout.grid.{key}: expected a value, found none")
+def _layout(path: str | Path, content: dict[str, Any]) -> Layout:
+    check_keys(f"{path}: layout.", content, ["grid"], required=["grid"])
+    grid = checked_table(f"{path}: layout.grid", content["grid"])
+    check_keys(f"{path}: layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
     return Layout.grid(**grid)
-
-
-def _known(prefix: str, name: str, known: list[str], what: str) -> None:
-    if name not in known:
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
-        raise InputError(f"{prefix}{name}: unknown {what}; {hint}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.report.drawing import ARM_COLOURS, GREY, LIGHT_GREY, new_figure, plain_ticks, styled
+from faintspot.report.drawing import GREY, LIGHT_GREY, new_figure, plain_ticks, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,18 +18,6 @@ if TYPE_CHECKING:
 
 _WIDTH, _HEIGHT = 10.5, 6.6
 _TICKS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5)
-# Okabe & Ito (2008); arms of one colour differ in line and marker.
-_LOOKS = {
-    "plain": (GREY, "--", "o"),
-    "thresholded": (GREY, ":", "s"),
-    "smoothed": (ARM_COLOURS[2], "-", "^"),
-    "tv": (ARM_COLOURS[0], "-", "D"),
-    "weighted": (ARM_COLOURS[2], "--", "v"),
-    "matched": (ARM_COLOURS[1], "--", "P"),
-    "ml": (ARM_COLOURS[1], "-", "X"),
-    "map": ("#56B4E9", "-", "<"),
-    "trained": (ARM_COLOURS[3], "-", ">"),
-}
 
 
 @styled
@@ -45,7 +33,7 @@ def tune_figure(answer: Answer) -> Figure:
     axes.plot(place, bound, color="black", lw=1.3, label="Cramér-Rao bound", zorder=6)
     axes.axhline(saturated, color=GREY, lw=1, ls=(0, (1, 4)), label="always the reference")
     axes.set_yscale("log")
-    _limits(axes, answer, saturated)
+    _axis_limits(axes, answer, saturated)
     _mark_star(axes, answer)
     _mark_budget(axes, answer)
     _electrons_above(axes, answer)
@@ -58,15 +46,15 @@ def tune_figure(answer: Answer) -> Figure:
 
 
 def _draw_arm(axes: Axes, answer: Answer, result: ArmResult, place: NDArray[np.float64]) -> None:
-    colour, style, marker = _LOOKS[result.arm.name]
+    style = result.arm.style
     best = result is answer.best
     axes.errorbar(
         place,
-        result.curve.error_px,
-        result.curve.standard_error_px,
-        color=colour,
-        ls=style,
-        marker=marker,
+        result.error_px,
+        result.standard_error_px,
+        color=style.colour,
+        ls=style.line,
+        marker=style.marker,
         ms=7 if best else 5,
         lw=3 if best else 1.6,
         elinewidth=1,
@@ -75,8 +63,8 @@ def _draw_arm(axes: Axes, answer: Answer, result: ArmResult, place: NDArray[np.f
     )
 
 
-def _limits(axes: Axes, answer: Answer, saturated: float) -> None:
-    drawn = [result.curve.error_px for result in answer.results]
+def _axis_limits(axes: Axes, answer: Answer, saturated: float) -> None:
+    drawn = [result.error_px for result in answer.results]
     lowest = min(float(np.min(drawn)), float(answer.bound_px.min()))
     highest = min(float(np.max(drawn)), 2.5 * saturated)
     budget = answer.question.budget_px

@@ -9,6 +9,7 @@ from typing import Any
 
 from faintspot.checks import number_between, one_of
 from faintspot.errors import InputError
+from faintspot.estimators.scene import Scene
 from faintspot.planner.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
@@ -21,15 +22,15 @@ from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.simulate.detector import Detector
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
 from faintspot.simulate.turbulence import LARGEST_D_OVER_R0
 
-PROFILES = ("diffraction", "gaussian")
+PROFILES = tuple(FWHM_OF_SIZE_1_PX)
 SPECKLED_ABOVE = 0.7
 """Side of a sub-aperture in r0 above which spots count as speckled."""
 SEEING_WAVELENGTH_NM = 500.0
 """Wavelength at which r0 is given."""
 
-_FWHM_OF_SIZE_1 = {"diffraction": 1.772, "gaussian": 2.0}  # px
 _ARCSEC = math.pi / 180 / 3600
 _SMALLEST_RANGE_PX = 1.0
 _POSITIVE: tuple[str, ...] = (
@@ -148,7 +149,7 @@ class Question:
     @property
     def size(self) -> float:
         """Size of the profile, see `faintspot.simulate.spots`."""
-        return float(self.fwhm_px / _FWHM_OF_SIZE_1[self.profile])
+        return float(self.fwhm_px / FWHM_OF_SIZE_1_PX[self.profile])
 
     @property
     def d_over_r0(self) -> float:
@@ -167,6 +168,22 @@ class Question:
     def read_noise_photoelectrons(self) -> float:
         """Read noise divided by the multiplication gain."""
         return float(self.read_noise_e / self.em_gain)
+
+    def scene(self, flux_e: float) -> Scene:
+        """Return what estimators are told of spots of this light."""
+        return Scene(
+            flux_e=flux_e,
+            read_noise_e=self.read_noise_photoelectrons,
+            window=self.shape,
+            spot_fwhm_px=self.fwhm_px,
+            position_range_px=self.search_range_px,
+            excess_noise=self.detector.excess_noise_factor,
+            background_e=self.background_e,
+            d_over_r0=self.d_over_r0,
+            diffraction_px=2 * self.size,
+            profile=self.profile,
+            learnt=self.psf is not None,
+        )
 
     @property
     def photometry(self) -> Photometry | None:
@@ -245,7 +262,7 @@ class Question:
                     "spot: expected fwhm_px, or lenslet_m, wavelength_nm and pixel_scale_arcsec together"
                 )
             width = self.wavelength_nm * 1e-9 / self.lenslet_m / (self.pixel_scale_arcsec * _ARCSEC)
-            self._put("fwhm_px", width * _FWHM_OF_SIZE_1["diffraction"] / 2)
+            self._put("fwhm_px", width * FWHM_OF_SIZE_1_PX["diffraction"] / 2)
             self._put("profile", "diffraction")
         low, high = 0.3, float(min(self.shape))
         if not low <= self.fwhm_px <= high:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.compare.arms import Arm
 from faintspot.pipeline import SlopePipeline
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.settings import Settings
 from faintspot.simulate.generators import spawn
 from faintspot.simulate.spots import spots
 from faintspot.simulate.turbulence import speckled_spots
@@ -37,7 +36,7 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class SimulatedSpots:
     """Noiseless spots, to be exposed at any flux: the same positions and speckles at every one."""
 
     question: Question
@@ -47,7 +46,7 @@ class Scene:
     scoring: tuple[Floats, Floats]
 
     @classmethod
-    def of(cls, question: Question, realisations: int, rng: np.random.Generator) -> Scene:
+    def of(cls, question: Question, realisations: int, rng: np.random.Generator) -> SimulatedSpots:
         """Simulate `realisations` spots to score on, and half as many to choose on (whole frames)."""
         first, second = spawn(rng, 2)
         n_frames = max(2, -(-realisations // SPOTS_PER_FRAME))
@@ -79,32 +78,30 @@ class Scene:
     def _pipelines(self) -> dict[str, SlopePipeline]:
         return {}
 
-    def measure(
-        self, sample: Sample, settings: Settings, psf: PSF | None = None, score: TrainedScore | None = None
-    ) -> Slopes:
+    def measure(self, sample: Sample, arm: Arm) -> Slopes:
         """Measure the spots of a sample as the user's own frames would be."""
         # What knows the spot takes time to prepare, and often has the same settings at every flux.
-        key = f"{settings} {id(psf)} {id(score)}"
+        key = f"{arm.settings} {id(arm.psf)} {id(arm.score)}"
         if key not in self._pipelines:
-            self._pipelines[key] = SlopePipeline(
-                self.layout, settings, self.calibration, psf=psf, score=score
-            )
+            self._pipelines[key] = SlopePipeline(self.layout, arm.settings, self.calibration, **arm.parts)
         return self._pipelines[key](sample.frames)
 
     def measure_each(
-        self, sample: Sample, settings: Settings, name: str, values: list[Any], **parts: Any
-    ) -> list[tuple[Floats, Floats]]:
-        """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of the settings.
+        self, sample: Sample, arm: Arm, name: str, values: Sequence[Any]
+    ) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """Return x and y, (n_frames, SPOTS_PER_FRAME), for each value of one of an arm's options.
 
-        The values share one pipeline, each having sub-apertures of its own.
+        Where sub-apertures may have values of their own, the values share one pipeline.
         """
+        if not arm.estimator.declared()[name].per_subaperture:
+            slopes = [self.measure(sample, arm.with_options({name: value})) for value in values]
+            return [(each.x, each.y) for each in slopes]
         count = len(values)
         layout = Layout.grid((count * SPOTS_PER_FRAME, 1), pixels=self.layout.window)
-        each = settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
-        slopes = SlopePipeline(layout, each, self.calibration, **parts)(np.tile(sample.frames, (1, count, 1)))
-        x, y = (
-            part.reshape(len(part), count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (slopes.x, slopes.y)
-        )
+        each = arm.settings.replace(**{name: np.repeat(values, SPOTS_PER_FRAME)})
+        pipeline = SlopePipeline(layout, each, self.calibration, **arm.parts)
+        found = pipeline(np.tile(sample.frames, (1, count, 1)))
+        x, y = (part.reshape(len(part), count, SPOTS_PER_FRAME).swapaxes(0, 1) for part in (found.x, found.y))
         return list(zip(x, y, strict=True))
 
 

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 from typing import Any
 
+from faintspot.compare.arms import Knowledge
+from faintspot.compare.statistics import Estimate
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.planner.answer import Answer, ArmResult
-from faintspot.planner.arms import SPOT
 from faintspot.settings import Settings
-from faintspot.study.metric import Estimate
 
-_SHOWN: tuple[str, ...] = (
-    "noise_std",
-    "tolerance",
-    "max_iterations",
-    "keep_brightest",
-    "threshold_e",
-    "smoothing_px",
-)
-_SHOWN += ("spot_fwhm_px", "weight_fwhm_px", "model_error", "weight_floor", "prior_std_px", "search_range_px")
-_ONLY_OF_TV = ("tolerance", "max_iterations")
+BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
+
 _HELPS_ABOVE_MAG = 0.02
 _LOW_GAIN = 0.9
 _SMALLEST_ERROR_MAG = 0.01  # that is shown
@@ -42,18 +35,10 @@ def situation(answer: Answer) -> str:
 
 
 def settings_in_words(settings: Settings) -> str:
-    """Return the settings that matter as `name value` pairs."""
-    defaults = {item.name: item.default for item in fields(Settings)}
-    denoises = settings.estimator == "cog" and settings.denoise
-    pairs = [f'estimator "{settings.estimator}"']
-    if settings.estimator == "cog" and not settings.denoise:
-        pairs.append("denoise false")
-    if denoises and settings.preset != "accurate":
-        pairs.append(f'preset "{settings.preset}"')
-    for name in _SHOWN:
-        value = getattr(settings, name)
-        if value is not None and (denoises if name in _ONLY_OF_TV else value != defaults[name]):
-            pairs.append(f"{name} {value:g}")
+    """Return the settings that are not at their defaults as `name value` pairs."""
+    pairs = [f'estimator "{settings.estimator.name}"']
+    for name, value in settings.chosen().items():
+        pairs.append(f'{name} "{value}"' if isinstance(value, str) else f"{name} {value:g}")
     return ", ".join(pairs)
 
 
@@ -67,9 +52,9 @@ def recommendation(answer: Answer) -> list[str]:
             f"{best.statistics.corrected_rms.value:.2f} px, is not below "
             f"that of the spots' own motion, {answer.prior_rms_px:.2f} px"
         )
-    if best.arm.name != "plain":
+    if best.arm.name != BRIGHTEST:
         lines.append(
-            f"saves {gain_in_words(answer, best.over_plain)} over brightest pixels and "
+            f"saves {gain_in_words(answer, best.over_brightest)} over brightest pixels and "
             f"{gain_in_words(answer, best.over_thresholded)} over thresholding"
         )
     others = [answer[name].arm.label for name in answer.equal[1:]]
@@ -83,20 +68,19 @@ def recommendation(answer: Answer) -> list[str]:
     if gain < _LOW_GAIN:
         lines.append(f"its gain is {gain:.2f} at this flux: divide the slopes by it, or raise the loop gain")
     alternative = answer.best_without_psf
-    if best.arm.knowledge == SPOT:
+    if best.arm.knowledge == Knowledge.SPOT:
         lines.append(
             f"the best that need not know the spot's shape: {alternative.arm.label} "
             f"({settings_in_words(alternative.settings)}), "
-            f"{gain_in_words(answer, alternative.over_plain)} over brightest pixels"
+            f"{gain_in_words(answer, alternative.over_brightest)} over brightest pixels"
         )
-    return lines + _limits(answer)
+    return lines + _limiting(answer)
 
 
 def foundations(answer: Answer) -> list[str]:
     """Say what the answer rests on."""
     question = answer.question
-    n = answer.best.curve.errors_px.shape[1]
-    spots = f"{n} simulated spots at each of {len(answer.flux_e)} fluxes"
+    spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
     lines = list(question.facts)
     if question.psf is None:
         lines.append(
@@ -148,11 +132,11 @@ def _span(answer: Answer) -> float:
 
 def _about_tv(answer: Answer) -> list[str]:
     """Say whether TV pays, where it is not what is recommended."""
-    tv, best = answer["tv"], answer.best
+    tv, best = answer[TV], answer.best
     if tv is best:
         return []
-    times = tv.arm.cost / best.arm.cost
-    gain = tv.over_plain
+    times = tv.arm.estimator.cost / best.arm.estimator.cost
+    gain = tv.over_brightest
     if not math.isfinite(gain.value):
         helps = gain.value > 0
     else:
@@ -165,24 +149,24 @@ def _about_tv(answer: Answer) -> list[str]:
     ]
 
 
-def _limits(answer: Answer) -> list[str]:
-    """Return the limiting magnitudes of the recommended and of the plain arm."""
+def _limiting(answer: Answer) -> list[str]:
+    """Return the limiting magnitudes of the recommended arm and of brightest pixels."""
     budget = answer.question.budget_px
     if budget is None:
         return []
-    plain = answer["plain"]
+    brightest = answer[BRIGHTEST]
     text = f"for R = {budget:.3g} px: {_limit(answer, answer.best)}"
-    if answer.best is not plain:
-        text += f"; with brightest pixels {_limit(answer, plain)}"
+    if answer.best is not brightest:
+        text += f"; with brightest pixels {_limit(answer, brightest)}"
     return [f"limiting {'magnitude' if answer.question.photometry else 'flux'} {text}"]
 
 
 def _limit(answer: Answer, result: ArmResult) -> str:
     limit: Any = result.limiting_flux_e
     if limit.value == 0:
-        return f"fainter than the plotted range ({_place(answer, answer.flux_e[0])})"
+        return f"fainter than all that was tried ({_place(answer, answer.flux_e[0])})"
     if math.isinf(limit.value):
-        return f"brighter than the plotted range ({_place(answer, answer.flux_e[-1])})"
+        return f"brighter than all that was tried ({_place(answer, answer.flux_e[-1])})"
     if answer.question.photometry is None:
         return f"{plain_number(limit.value)} ± {plain_number(limit.standard_error, 1)} electrons"
     error = 2.5 / math.log(10) * limit.standard_error / limit.value
