@@ -66,13 +66,17 @@ class BestFit:
         left, size, _ = np.linalg.svd(columns.astype(np.float64), full_matrices=False)
         return cls(left[:, size > 1e-6 * size[0]].astype(np.float32), weight)
 
+    def fitted(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return what the mirror can make of a wavefront (points, points); 0 outside the pupil."""
+        seen = self.basis @ (self.basis.T @ (wavefront.ravel() * self.weight))
+        inside = self.weight > 0
+        fitted = np.where(inside, seen / np.where(inside, self.weight, 1), 0)
+        return fitted.reshape(wavefront.shape).astype(np.float32)
+
     def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return a wavefront (points, points) without what the mirror can take off; 0 outside the pupil."""
-        seen = wavefront.ravel() * self.weight
-        left = seen - self.basis @ (self.basis.T @ seen)
-        inside = self.weight > 0
-        residual = np.where(inside, left / np.where(inside, self.weight, 1), 0)
-        return residual.reshape(wavefront.shape).astype(np.float32)
+        inside = (self.weight > 0).reshape(wavefront.shape)
+        return np.where(inside, wavefront - self.fitted(wavefront), 0).astype(np.float32)
 
 
 def make_mirror(configuration: LoopConfiguration, pupil: Pupil) -> DeformableMirror:
