@@ -1,4 +1,4 @@
-"""The slope error R and the flux gain against what is known in closed form."""
+"""The slope error R and what else describes slopes, against what is known in closed form."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from faintspot.errors import InputError
-from faintspot.study import metric
-from faintspot.study.metric import (
+from faintspot.compare.statistics import (
+    Estimate,
     absolute_errors,
-    flux_gain,
-    flux_gain_with_error,
     magnitudes,
+    mean_by_blocks,
+    of_draws,
+    paired_mean,
     slope_error,
     slope_statistics,
 )
-
-FLUX = np.array([10.0, 20.0, 40.0, 80.0, 160.0])
+from faintspot.errors import InputError
 
 
 def test_slope_error_is_the_mean_of_both_axes() -> None:
@@ -64,88 +61,6 @@ def test_standard_error_of_r_covers_the_truth() -> None:
     estimates = [slope_error(e[:, 0], e[:, 1], np.zeros((200, 2))) for e in errors]
     deviations = np.array([(e.value - np.sqrt(2 / np.pi)) / e.standard_error for e in estimates])
     assert abs(np.mean(np.abs(deviations) < 1) - 0.683) < 0.061
-
-
-@given(st.floats(1.0, 1.9), st.floats(0.3, 1.0), st.floats(25.0, 150.0))
-def test_flux_gain_of_power_laws(ratio: float, power: float, at: float) -> None:
-    """R = a * flux^-power is a straight line in log-log, reproduced to the 1e-9 that makes curves fall."""
-    plain = 2.0 * FLUX**-power
-    assert flux_gain(FLUX, plain, 2.0 * (ratio * FLUX) ** -power, at) == pytest.approx(ratio, rel=1e-7)
-
-
-def test_flux_gain_below_one_where_the_method_is_worse() -> None:
-    assert flux_gain(FLUX, 1 / FLUX, 1.25 / FLUX, 40.0) == pytest.approx(0.8, rel=1e-7)
-
-
-@pytest.mark.parametrize("at", [10.0, 25.0, 55.0, 160.0])
-@pytest.mark.parametrize("curve", [[0.5, 0.49, 0.3, 0.1, 0.09], [0.5, 0.3, 0.3, 0.31, 0.1]])
-def test_flux_gain_of_equal_curves_is_one_whatever_their_shape(curve: list[float], at: float) -> None:
-    assert flux_gain(FLUX, curve, curve, at) == pytest.approx(1.0, rel=1e-3)
-
-
-def test_flux_gain_is_nan_where_the_method_does_not_reach_the_error() -> None:
-    assert np.isnan(flux_gain(FLUX, 1 / FLUX, 10 / FLUX, 40.0))
-    assert np.isnan(flux_gain(FLUX, 1 / FLUX, 0.1 / FLUX, 40.0))  # better than that at its faintest flux
-
-
-def test_flux_gain_of_noisy_and_flat_curves_is_finite() -> None:
-    assert np.isfinite(flux_gain(FLUX, [0.5, 0.52, 0.3, 0.31, 0.1], [0.5, 0.4, 0.4, 0.4, 0.1], 40.0))
-
-
-@pytest.mark.parametrize(
-    ("flux", "plain", "method", "at", "words"),
-    [
-        (FLUX[::-1], 1 / FLUX, 1 / FLUX, 40.0, "flux_e: expected at least two increasing"),
-        ([10.0], [0.1], [0.1], 10.0, "flux_e: expected at least two increasing"),
-        ([0.0, 1.0], [0.1, 0.1], [0.1, 0.1], 1.0, "flux_e = 0"),
-        (FLUX, 1 / FLUX, 1 / FLUX, 5.0, "at_flux_e = 5: expected a number from 10 to 160"),
-        (FLUX, 1 / FLUX, 1 / FLUX, np.nan, "at_flux_e"),
-        (FLUX, 0 * FLUX, 1 / FLUX, 40.0, "errors_plain = 0"),
-        (FLUX, 1 / FLUX, np.full(5, np.nan), 40.0, "errors_method: expected finite"),
-        (FLUX, 1 / FLUX, [0.1, 0.2], 40.0, "errors_method: expected shape (5,), got (2,)"),
-    ],
-)
-def test_bad_curves(flux: Any, plain: Any, method: Any, at: float, words: str) -> None:
-    with pytest.raises(InputError) as error:
-        flux_gain(flux, plain, method, at)
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_standard_error_of_the_flux_gain_covers_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """60 experiments with a true gain of 1.5, half of the errors' variance shared by both methods.
-
-    Within two standard errors: binomial with p = 0.95, fewer than 47 of 60 in 1e-6 of the runs; within half
-    of one: p = 0.383, more than 42 of 60 in 1e-6. Too small and too large standard errors are both found.
-    """
-    monkeypatch.setattr(metric, "_RESAMPLES", 80)
-    rng = np.random.default_rng(3)
-    deviations = []
-    for _ in range(60):
-        shared, plain, method = np.abs(rng.normal(size=(3, 5, 150)))
-        gain = flux_gain_with_error(
-            FLUX, (shared + plain) / FLUX[:, None], (shared + method) / (1.5 * FLUX[:, None]), 40.0, rng
-        )
-        deviations.append(abs(gain.value - 1.5) / gain.standard_error)
-    assert sum(deviation < 2 for deviation in deviations) >= 47
-    assert sum(deviation < 0.5 for deviation in deviations) <= 42
-
-
-def test_flux_gain_with_error_where_it_is_not_reached() -> None:
-    errors = np.ones((5, 20)) / FLUX[:, None]
-    gain = flux_gain_with_error(FLUX, errors, 100 * errors, 40.0, np.random.default_rng(4))
-    assert np.isnan(gain.value)
-    assert np.isnan(gain.standard_error)
-    with pytest.raises(InputError, match="one shape"):
-        flux_gain_with_error(FLUX, errors, errors[:, :3], 40.0)
-
-
-def test_flux_gain_with_error_is_reproducible_and_leaves_its_input_alone() -> None:
-    plain, method = errors = np.abs(np.random.default_rng(5).normal(size=(2, 5, 50))) / FLUX[:, None]
-    before = errors.copy()
-    one, two = (flux_gain_with_error(FLUX, plain, method, 40.0, np.random.default_rng(6)) for _ in range(2))
-    assert one == two
-    np.testing.assert_array_equal(errors, before)
 
 
 def test_magnitudes() -> None:
@@ -229,3 +144,43 @@ def test_bad_statistics(options: dict[str, Any], words: str) -> None:
     assert words in str(error.value)
     with pytest.raises(InputError, match="at least one value"):
         slope_statistics([], [], np.ones((0, 2)))
+
+
+def test_an_estimate_has_an_interval() -> None:
+    estimate = Estimate(1.0, 0.5)
+    np.testing.assert_allclose([estimate.low, estimate.high], [0.02, 1.98], atol=1e-3)
+    assert estimate.decided == 1
+    assert Estimate(-1.0, 0.4).decided == -1
+    assert Estimate(1.0, 0.6).decided == 0
+    assert np.isnan(Estimate(1.0).low)
+    assert Estimate(1.0).decided == 0
+
+
+def test_interval_of_a_mean_is_student_s() -> None:
+    values = np.random.default_rng(5).normal(0.3, 1, 6)
+    found = paired_mean([*values, np.nan])
+    half = 2.5706 * values.std(ddof=1) / np.sqrt(6)  # t of 5 degrees of freedom
+    assert found.value == pytest.approx(values.mean())
+    assert found.standard_error == pytest.approx(values.std(ddof=1) / np.sqrt(6))
+    assert (found.low, found.high) == pytest.approx((values.mean() - half, values.mean() + half), rel=1e-4)
+    assert found.count == 6
+    wider = paired_mean(values, comparisons=10)
+    assert wider.low < found.low < found.high < wider.high
+    assert np.isnan(paired_mean([]).value)
+    assert np.isnan(paired_mean([1.0]).low)
+
+
+def test_blocks_widen_the_interval_of_a_slow_series() -> None:
+    slow = np.repeat(np.random.default_rng(6).normal(size=300), 10)
+    by_value, by_block = mean_by_blocks(slow), mean_by_blocks(slow, 10)
+    assert by_block.standard_error > 2 * by_value.standard_error
+    # 10 neighbours are one value; blocks that begin within one share it, which narrows by up to a fifth.
+    assert by_block.standard_error == pytest.approx(slow[::10].std(ddof=1) / np.sqrt(300), rel=0.25)
+    assert np.isnan(mean_by_blocks([1.0, 2.0]).low)
+
+
+def test_draws_that_leave_what_is_measured_leave_the_interval_open() -> None:
+    drawn = np.concatenate([np.random.default_rng(7).normal(size=900), np.full(100, np.inf)])
+    found = of_draws(0.0, drawn, 1000)
+    assert found.high == np.inf
+    assert np.isfinite([found.low, found.standard_error]).all()

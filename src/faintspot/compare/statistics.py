@@ -1,0 +1,279 @@
+"""Statistics of what is compared: slope errors with and without their gain, means of differences."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between
+from faintspot.errors import InputError
+
+Floats = NDArray[np.float64]
+
+OUTLIER_PX = 1.0
+"""An error beyond this on either axis is an outlier: half the width of a Nyquist-sampled spot. It does not
+scale with the errors' own spread, which would forgive a worse estimator more."""
+FEWEST_PIECES = 3  # of fewer blocks or realisations, drawing again says nothing
+DRAWS = 2000
+SEED = 20150611  # of the resampling, when no generator is given: the same numbers give the same interval
+_LEVEL = 0.95
+_NORMAL = 1.959964
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its standard error and its 95 % interval; NaN where there is none."""
+
+    value: float
+    standard_error: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    """Default: 1.96 standard errors on each side of the value."""
+    count: int = 0
+    """Independent pieces that it comes from, where that is known."""
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.low) and math.isnan(self.high) and math.isfinite(self.standard_error):
+            object.__setattr__(self, "low", self.value - _NORMAL * self.standard_error)
+            object.__setattr__(self, "high", self.value + _NORMAL * self.standard_error)
+
+    @classmethod
+    def of_mean(cls, samples: Floats) -> Estimate:
+        """Return the mean of many independent samples with its standard error."""
+        return cls(float(samples.mean()), float(samples.std() / np.sqrt(samples.size)), count=samples.size)
+
+    @property
+    def decided(self) -> int:
+        """1 when the whole interval is above 0, -1 when it is below, else 0."""
+        return int(self.low > 0) - int(self.high < 0)
+
+
+# Slope errors -------------------------------------------------------------------------------------------
+
+
+def absolute_errors(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> NDArray[np.float64]:
+    """Return (|dx| + |dy|) / 2 of every slope: the terms whose mean is R.
+
+    Parameters
+    ----------
+    x, y : (...) array, px
+    truth : (..., 2) array, px
+
+    Raises
+    ------
+    InputError
+        When the shapes do not fit.
+    """
+    estimates = np.stack([finite_array("x", x), finite_array("y", y)], axis=-1).astype(np.float64)
+    true_positions = finite_array("truth", truth)
+    if estimates.shape != true_positions.shape:
+        raise InputError(f"truth: expected shape {estimates.shape}, got {true_positions.shape}")
+    return np.mean(np.abs(estimates - true_positions), axis=-1)  # type: ignore[no-any-return]
+
+
+def slope_error(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> Estimate:
+    """Return R = mean of |estimate - truth| per axis, x and y averaged (Basden et al. 2015), in px."""
+    errors = absolute_errors(x, y, truth)
+    return Estimate.of_mean(errors)
+
+
+@dataclass(frozen=True)
+class SlopeStatistics:
+    """How good slopes are. R alone flatters an estimator that falls back to the reference."""
+
+    error: Estimate
+    """Slope error R, the mean of (|dx| + |dy|) / 2, px."""
+    gain: Estimate
+    """Slope of the estimate against the truth, x and y pooled; 1 where nothing is lost. NaN where the truth
+    does not vary."""
+    rms: Estimate
+    """Root of the mean of (dx^2 + dy^2) / 2, px."""
+    corrected_rms: Estimate
+    """rms after offset and gain are taken off: of (estimate - offset) / gain - truth, px. What a control loop
+    of the right gain is left with. Infinite where the gain is not above 0, NaN where it is not defined."""
+    outlier_fraction: Estimate
+    """Fraction of slopes with an error beyond `outlier_px` on either axis."""
+    invalid_fraction: Estimate
+    """Fraction of slopes that are not valid; they count as they are in everything else."""
+
+
+def slope_statistics(
+    x: ArrayLike,
+    y: ArrayLike,
+    truth: ArrayLike,
+    *,
+    valid: ArrayLike | None = None,
+    outlier_px: float = OUTLIER_PX,
+) -> SlopeStatistics:
+    """Return error, gain, rms and outliers of slopes whose truth is known.
+
+    Gain and offset are those of a linear regression of the estimate on the truth: an offset for each axis,
+    one gain for both. Standard errors are those of independent pairs (x, y), to first order.
+
+    Parameters
+    ----------
+    x, y : (...) array, px
+    truth : (..., 2) array, px
+    valid : (...) array of bool, optional
+        Which slopes were measured. Default: all.
+    outlier_px : float
+        Error on either axis beyond which a slope is an outlier.
+
+    Raises
+    ------
+    InputError
+        When the shapes do not fit, there are no slopes, or the limit is not above 0.
+    """
+    outlier_px = number_between("outlier_px", outlier_px, 0.0, low_open=True)
+    estimate = np.stack([finite_array("x", x), finite_array("y", y)], axis=-1).astype(np.float64)
+    error = absolute_errors(x, y, truth).ravel()
+    measured = np.ones(estimate.shape[:-1], bool) if valid is None else np.asarray(valid, dtype=bool)
+    if measured.shape != estimate.shape[:-1]:
+        raise InputError(f"valid: expected shape {estimate.shape[:-1]}, got {measured.shape}")
+    estimate = estimate.reshape(-1, 2)
+    true = np.asarray(truth, dtype=np.float64).reshape(-1, 2)
+    gain, corrected_rms = _gain_and_corrected_rms(estimate, true)
+    outlier = np.any(np.abs(estimate - true) > outlier_px, axis=1)
+    return SlopeStatistics(
+        Estimate.of_mean(error),
+        gain,
+        _root(Estimate.of_mean(np.mean(np.square(estimate - true), axis=1))),
+        corrected_rms,
+        Estimate.of_mean(outlier.astype(np.float64)),
+        Estimate.of_mean(1.0 - measured.ravel()),
+    )
+
+
+def _root(mean_square: Estimate) -> Estimate:
+    """Root of a mean square, with its standard error to first order."""
+    root = float(np.sqrt(mean_square.value))
+    return Estimate(root, mean_square.standard_error / (2 * root) if root > 0 else 0.0)
+
+
+def _gain_and_corrected_rms(
+    estimate: NDArray[np.float64], truth: NDArray[np.float64]
+) -> tuple[Estimate, Estimate]:
+    """Regression of (n, 2) estimates on the truth: its gain, and the rms of its residuals over the gain."""
+    undefined = Estimate(float("nan"), float("nan"))
+    centred = truth - truth.mean(axis=0)
+    spread = float(np.mean(np.square(centred)))
+    if spread == 0.0:
+        return undefined, undefined
+    deviation = estimate - estimate.mean(axis=0)
+    gain = float(np.mean(deviation * centred)) / spread
+    residual = deviation - gain * centred
+    moves_gain = np.mean(residual * centred, axis=1) / spread  # what each slope adds to the gain, times n
+    root_n = np.sqrt(len(truth))
+    gain_estimate = Estimate(gain, float(moves_gain.std() / root_n))
+    if gain <= 0:
+        return gain_estimate, Estimate(float("inf"), float("inf"))
+    squares = np.mean(np.square(residual), axis=1)
+    mean_square = float(squares.mean())
+    if mean_square == 0.0:
+        return gain_estimate, Estimate(0.0, 0.0)
+    # Influence of each slope on the logarithm of mean_square / gain^2.
+    influence = squares / mean_square - 2 * moves_gain / gain
+    rms = float(np.sqrt(mean_square)) / gain
+    return gain_estimate, Estimate(rms, rms / 2 * float(influence.std() / root_n))
+
+
+# Means of differences ------------------------------------------------------------------------------------
+
+
+def paired_mean(differences: ArrayLike, comparisons: int = 1) -> Estimate:
+    """Return the mean of independent differences, as of realisations, with its interval by Student's t.
+
+    Parameters
+    ----------
+    differences : (R,) array
+        NaN, of what is not measured yet, are left out.
+    comparisons : int
+        Number of such intervals that are looked at together: all of them hold with 95 % (Bonferroni).
+    """
+    values = np.asarray(differences, np.float64).ravel()
+    values = values[np.isfinite(values)]
+    count = len(values)
+    if count == 0:
+        return Estimate(math.nan)
+    mean = float(values.mean())
+    if count < 2:
+        return Estimate(mean, count=count)
+    error = float(values.std(ddof=1)) / math.sqrt(count)
+    half = student(count - 1, comparisons) * error
+    return Estimate(mean, error, mean - half, mean + half, count)
+
+
+def mean_by_blocks(
+    values: ArrayLike,
+    block_length: int = 1,
+    rng: np.random.Generator | None = None,
+    comparisons: int = 1,
+) -> Estimate:
+    """Return the mean of a series with its interval by a moving-block bootstrap.
+
+    Kuensch 1989 (Annals of Statistics 17, 1217): blocks of neighbouring values are drawn, so that values
+    that resemble their neighbours do not make the interval too narrow. It is widened for the small number of
+    blocks, as Student's t is against the normal distribution.
+
+    Parameters
+    ----------
+    values : (n,) array
+        In the order of time.
+    block_length : int
+        Neighbouring values drawn together.
+    rng : numpy.random.Generator, optional
+    comparisons : int
+        Number of such intervals that are looked at together: all of them hold with 95 % (Bonferroni).
+
+    Raises
+    ------
+    InputError
+        When a value is not finite.
+    """
+    series = finite_array("values", values).astype(np.float64).ravel()
+    count = len(series)
+    length = int(number_between("block_length", block_length, 1, integer=True))
+    length = min(length, max(1, count // FEWEST_PIECES))
+    blocks = math.ceil(count / length)
+    value = float(series.mean())
+    if blocks < FEWEST_PIECES:
+        return Estimate(value, count=blocks)
+    rng = np.random.default_rng(SEED) if rng is None else rng
+    starts = rng.integers(0, count - length + 1, (DRAWS, blocks))
+    drawn = series[starts[:, :, None] + np.arange(length)].reshape(DRAWS, -1)[:, :count].mean(axis=1)
+    return of_draws(value, drawn, blocks, comparisons)
+
+
+def of_draws(value: float, drawn: Floats, pieces: int, comparisons: int = 1) -> Estimate:
+    """Return a value with the standard error and the interval that bootstrap draws give it.
+
+    Both are widened for few pieces: a bootstrap of n pieces has sqrt((n - 1) / n) of the scatter, and knows
+    nothing of Student's t. The interval is infinite where more than 2.5 % of the draws are.
+    """
+    tail = 50 * (1 - _LEVEL)
+    low, high = np.percentile(drawn, [tail, 100 - tail], method="nearest")
+    known = drawn[np.isfinite(drawn)]
+    widened = math.sqrt(pieces / (pieces - 1))
+    factor = widened * student(pieces - 1, comparisons) / 1.96
+    return Estimate(
+        value,
+        widened * float(known.std()) if len(known) > 1 else math.nan,
+        float(value + factor * (low - value)),
+        float(value + factor * (high - value)),
+        pieces,
+    )
+
+
+def student(degrees: int, comparisons: int = 1) -> float:
+    """Return how many standard errors a 95 % interval reaches, for so many degrees of freedom."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(degrees, 1 - (1 - _LEVEL) / 2 / comparisons))
+
+
+def magnitudes(flux_ratio: float) -> float:
+    """Return a flux ratio in magnitudes."""
+    return float(2.5 * np.log10(flux_ratio))
