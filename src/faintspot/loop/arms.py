@@ -87,6 +87,10 @@ class LoopArm:
             number_between("arm.window_pixels", self.window_pixels, 4, 64, integer=True)
 
 
+Arm = LoopArm
+"""Its name in version 0.1."""
+
+
 @dataclass(frozen=True)
 class Tunable:
     """Something of an arm that is tuned."""

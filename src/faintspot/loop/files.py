@@ -32,8 +32,12 @@ class Stored:
         InputError
             When it cannot be written.
         """
+        save_arrays(path, self.arrays())
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what is in the file."""
         values = {item.name: np.asarray(getattr(self, item.name)) for item in fields(self)}
-        save_arrays(path, {"format": np.asarray(self.FORMAT), **values})
+        return {"format": np.asarray(self.FORMAT), **values}
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -186,7 +186,9 @@ class _Loop:
         self.seed, self.realisation = seed, realisation
         self.optics = optics = prepare(configuration)
         self.air = _air(_without_light(configuration), seed, realisation)
-        self.best_fit = BestFit.of(optics.mirror, optics.pupil) if idealised.correctable else None
+        self.best_fit = (
+            BestFit.of(optics.mirror, optics.pupil, piston=False) if idealised.correctable else None
+        )
         camera = make_detector(configuration)
         self.detector: Exposing = NoiselessDetector(camera) if idealised.noiseless else camera
         self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
