@@ -8,7 +8,7 @@ import faintspot as fs
 from faintspot.loop import LoopArm, LoopConfiguration
 from faintspot.loop.configuration import Camera
 
-PLAIN = fs.Settings(denoise=False, keep_brightest=80)
+PLAIN = fs.Settings("brightest", keep_brightest=80)
 
 
 def quiet() -> LoopConfiguration:

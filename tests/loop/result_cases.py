@@ -34,7 +34,7 @@ def small_interleaved() -> InterleavedResult:
     schedule = np.tile(np.repeat(np.arange(len(STRENGTHS)), BLOCK), CYCLES)
     configuration = configuration.replace("run", frames=len(schedule), settle_frames=20)
     arms = [
-        LoopArm("no TV", fs.Settings(denoise=False, keep_brightest=80))
+        LoopArm("no TV", fs.Settings("brightest", keep_brightest=80))
         if np.isnan(strength)
         else LoopArm(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
         for strength in STRENGTHS
@@ -71,7 +71,7 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
         ]
     )
     shape = (len(LABELS), 5)
-    settings = np.full(shape, to_text(fs.Settings(denoise=False, keep_brightest=50)))
+    settings = np.full(shape, to_text(fs.Settings("brightest", keep_brightest=50)))
     axis = np.hypot(*np.meshgrid(np.arange(-32, 33), np.arange(-32, 33)))
     psf = np.broadcast_to(np.exp(-axis / 8), (*shape, 65, 65)).astype(np.float32)
     return MagnitudeResult(

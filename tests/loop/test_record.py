@@ -65,4 +65,4 @@ def test_a_place_that_cannot_be_written_is_named(record: LoopRecord, tmp_path: P
 )
 def test_bad_arms_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"arm\."):
-        LoopArm(**{"label": "a", "settings": fs.Settings(denoise=False), **values})
+        LoopArm(**{"label": "a", "settings": fs.Settings("brightest"), **values})

@@ -129,7 +129,7 @@ def test_without_correction_the_strehl_is_that_of_theory() -> None:
 
 def test_open_loop_control() -> None:
     loop = load_loop("open_loop").replace("run", frames=160, settle_frames=40)
-    settings = fs.Settings(denoise=False, keep_brightest=150)
+    settings = fs.Settings("brightest", keep_brightest=150)
     bright = loop.replace("camera", photons_per_subaperture=2000.0)
     corrected = simulate_loop(bright, [LoopArm("corrected", settings)])
     not_corrected = simulate_loop(bright, [LoopArm("not", settings, correct_gain=False)])
@@ -145,7 +145,7 @@ def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
     for photons, noise, kept in ((1e5, 0.0, 255), (200.0, 1.0, 80), (200.0, 3.0, 20)):
         camera = {"photons_per_subaperture": photons, "read_noise_e": noise}
         case = loop.replace("camera", **camera)
-        arm = LoopArm("k", fs.Settings(denoise=False, keep_brightest=kept))
+        arm = LoopArm("k", fs.Settings("brightest", keep_brightest=kept))
         pipeline = make_pipeline(case, prepare(case).sensor, arm)
         gains.append(measure_gains(case, [pipeline], seed=1)[0])
     assert gains[0] == pytest.approx(0.93, abs=0.06)  # wings beyond the window
@@ -154,7 +154,7 @@ def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
 
 def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     loop = faint().replace("camera", read_noise_e=3.0, photons_per_subaperture=400.0)
-    settings = fs.Settings(denoise=False, keep_brightest=80)
+    settings = fs.Settings("brightest", keep_brightest=80)
     corrected, not_corrected = (
         simulate_loop(loop, [LoopArm("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
     )
@@ -171,7 +171,7 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
         LoopArm("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
         LoopArm("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
         LoopArm("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
-        LoopArm("window", fs.Settings(denoise=False, keep_brightest=50), window_pixels=10),
+        LoopArm("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
         LoopArm("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
     ],
     ids=lambda arm: arm.label,

@@ -112,20 +112,21 @@ class Variant:
 
 
 VARIANTS = {
-    "predicted": Variant(
+    "_predicted": Variant(
         "predicted",
         "the estimator's prior, or where it starts, is what the loop predicts",
         # What stays near the prediction has no gain of its own, and is measured without one.
         {"predict_prior": True, "correct_gain": False},
     ),
-    "weighted": Variant(
+    "_weighted": Variant(
         "weighted reconstructor", "slopes count by their standard errors", {"weighted_reconstructor": True}
     ),
-    "uncorrected": Variant(
+    "_uncorrected": Variant(
         "gain not corrected", "slopes are not divided by the centroid gain", {"correct_gain": False}
     ),
 }
 """By what follows the estimator's name in that of an arm: "map_predicted_weighted"."""
+_PREDICTED = "_predicted"
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class ArmKind:
     @property
     def name(self) -> str:
         """What command lines and results call it."""
-        return "_".join([self.estimator.name, *self.variants])
+        return "".join([self.estimator.name, *self.variants])
 
     @property
     def label(self) -> str:
@@ -151,7 +152,7 @@ class ArmKind:
         estimator = self._untuned(configuration)
         options = dict(estimator.tuned(configuration.scene))
         if _PRIOR in estimator.declared():
-            reach = configuration.position_range_px(predicted="predicted" in self.variants)
+            reach = configuration.position_range_px(predicted=_PREDICTED in self.variants)
             options[_PRIOR] = [part * reach for part in _PRIORS]
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
         for number, (name, values) in enumerate(options.items()):
@@ -190,23 +191,26 @@ class ArmKind:
 
 
 def arm_kind(name: str) -> ArmKind:
-    """Return an arm by its name: that of an estimator, and of variants after it: "ml", "ml_weighted".
+    """Return an arm by its name: that of an estimator and of variants, as "ml_weighted".
 
     Raises
     ------
     InputError
         For an unknown estimator, or a prediction for one that takes none.
     """
-    base, variants = name, []
-    while base not in estimators() and "_" in base and base.rpartition("_")[2] in VARIANTS:
-        base, _, variant = base.rpartition("_")
-        variants.append(variant)
+    base, variants = name, set()
+    while base not in estimators():
+        ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
+        if ending is None:
+            break
+        base = base.removesuffix(ending)
+        variants.add(ending)
     try:
         estimator = estimator_named(base)
     except InputError as error:
         text = str(error).removeprefix("estimator")
-        raise InputError(f"arm{text}, or with _{', _'.join(VARIANTS)} after it") from None
-    if "predicted" in variants and not estimator.takes_prior:
+        raise InputError(f"arm{text}, and what may follow it: {', '.join(VARIANTS)}") from None
+    if _PREDICTED in variants and not estimator.takes_prior:
         raise InputError(f"arm = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
     return ArmKind(estimator, tuple(variant for variant in VARIANTS if variant in variants))
 
@@ -224,7 +228,7 @@ def default_arms(configuration: LoopConfiguration) -> list[str]:
         if Need.SCORE in kind.needs and configuration.sensor.spot_elongation > 1:
             continue
         names.append(name)
-        predicted = f"{name}_predicted" if kind.takes_prior else name
+        predicted = f"{name}{_PREDICTED}" if kind.takes_prior else name
         names += [predicted] if kind.takes_prior else []
         names += [f"{predicted}_weighted"] if Need.READ_NOISE in kind.needs else []
         if configuration.control.mode != CLOSED and not kind.needs:

@@ -187,7 +187,7 @@ def _arm_style(name: str) -> dict[str, Any]:
     known = estimators()
     base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in known), "")
     style = known[base].style if base else Style("#666666")
-    variants = [ending for ending in VARIANTS if f"_{ending}" in name[len(base) :]]
+    variants = [ending for ending in VARIANTS if ending in name[len(base) :]]
     return {
         "color": style.colour,
         "marker": style.marker,

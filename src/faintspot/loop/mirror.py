@@ -72,12 +72,15 @@ class BestFit:
         inside = self.weight > 0
         inverse = np.where(inside, 1 / np.where(inside, self.weight, 1), 0)
         seen = self.basis.T @ (self.weight * wavefront.ravel())
-        return (inverse * (self.basis @ seen)).reshape(wavefront.shape).astype(np.float32)
+        fitted: NDArray[np.float32] = (inverse * (self.basis @ seen)).reshape(wavefront.shape)
+        return fitted.astype(np.float32)
 
     def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return a wavefront (points, points) without what the mirror can take off; 0 outside the pupil."""
-        inside = (self.weight > 0).reshape(wavefront.shape)
-        return np.where(inside, wavefront - self.fitted(wavefront), 0).astype(np.float32)
+        left: NDArray[np.float32] = np.where(
+            self.weight.reshape(wavefront.shape) > 0, wavefront - self.fitted(wavefront), 0
+        )
+        return left.astype(np.float32)
 
 
 def make_mirror(configuration: LoopConfiguration, pupil: Pupil) -> DeformableMirror:

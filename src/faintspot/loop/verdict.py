@@ -100,10 +100,10 @@ def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
     """Return what arms of a pair differ by, the arm with it and the one without, for each of `VARIANTS`."""
     names = result.names
     return [
-        (variant.label, arm, names.index(name.replace(f"_{ending}", "")))
+        (variant.label, arm, names.index(name.replace(ending, "")))
         for ending, variant in VARIANTS.items()
         for arm, name in enumerate(names)
-        if f"_{ending}" in name and name.replace(f"_{ending}", "") in names
+        if ending in name and name.replace(ending, "") in names
     ]
 
 
