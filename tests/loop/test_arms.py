@@ -71,7 +71,7 @@ def peak() -> Iterator[type[Estimator]]:
         label: ClassVar[str] = "power of the light"
 
         def tuned(self, scene: Any) -> dict[str, list[float]]:
-            return {"power": [2.0, 1.0, 1.5, 3.0, 4.0, 5.0]}
+            return {"power": [2.0, 1.5, 3.0, 4.0, 5.0]}
 
         def locate(self, images: Any, sensor: Any, prior: Any) -> Any:
             light = np.maximum(images, 0.0).astype(float) ** self.power + 1e-9
@@ -87,8 +87,9 @@ def test_an_estimator_of_ones_own_is_an_arm(peak: type[Estimator]) -> None:
     assert "peak" in default_arms(small())
     kind = arm_kind("peak_uncorrected")
     tuned = kind.tuned(BRIGHT)
-    assert tuned["power"].values == (1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
-    assert tuned["power"].first == (1.5, 3.0, 4.0)
+    # Two steps beyond each end, as far as the option goes.
+    assert tuned["power"].values == pytest.approx((1.125, 1.5, 2.0, 3.0, 4.0, 5.0, 6.25, 7.8125))
+    assert tuned["power"].first == pytest.approx((1.5, 4.0, 6.25))
     record = simulate_loop(BRIGHT, [kind.arm(BRIGHT, {LOOP_GAIN: 0.3, "power": 2.0})])
     assert record.mean_strehl() > 0.35
 

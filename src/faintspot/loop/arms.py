@@ -15,7 +15,7 @@ from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.registry import estimator_named, estimators
 from faintspot.loop.camera import make_detector
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
-from faintspot.options import AUTO
+from faintspot.options import AUTO, Option
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.settings import Settings
@@ -29,6 +29,8 @@ _FIRST_LOOP_GAINS = (0.2, 0.4, 0.7)
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
 _PRIOR = "prior_std_px"
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
+_STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
+_FEWEST_TO_WIDEN = 4
 _FIRST_VALUES = (3, 2)  # of an arm's first option, and of each further one
 _TRAINING_SPOTS = 8000
 _TRAINING_SEED = 4
@@ -150,8 +152,12 @@ class ArmKind:
     def tuned(self, configuration: LoopConfiguration) -> dict[str, Tunable]:
         """Return what is tuned for a configuration's light: the loop gain and options of the estimator."""
         estimator = self._untuned(configuration)
-        options = dict(estimator.tuned(configuration.scene))
-        if _PRIOR in estimator.declared():
+        declared = estimator.declared()
+        options = {
+            name: _wider(values, declared[name])
+            for name, values in estimator.tuned(configuration.scene).items()
+        }
+        if _PRIOR in declared:
             reach = configuration.position_range_px(predicted=_PREDICTED in self.variants)
             options[_PRIOR] = [part * reach for part in _PRIORS]
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
@@ -234,6 +240,17 @@ def default_arms(configuration: LoopConfiguration) -> list[str]:
         if configuration.control.mode != CLOSED and not kind.needs:
             names.append(f"{name}_uncorrected")
     return names
+
+
+def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:
+    """Return values with some beyond both ends: in loops the best may be beyond."""
+    if option.choices or option.whole or len(values) < _FEWEST_TO_WIDEN or min(values) <= 0:
+        return values
+    low, below, *_ = ordered = sorted(set(values))
+    *_, above, high = ordered
+    for step in range(1, _STEPS_BEYOND + 1):
+        ordered += [low * (low / below) ** step, high * (high / above) ** step]
+    return [value for value in ordered if option.low < value <= option.high]
 
 
 def _spread(values: Sequence[Any], count: int) -> Tunable:
