@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
-from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.calibration import make_detector, make_pipeline
+from faintspot.loop.calibration import make_pipeline
+from faintspot.loop.camera import make_detector
 from faintspot.loop.control import Integrator
 from faintspot.loop.simulation import LoopOptics, prepare
 from faintspot.loop.telescope import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0
 FRAMES = 400
-PLAIN = fs.Settings("brightest", keep_brightest=80)
-TV = fs.Settings(noise_std=0.3, keep_brightest=80)
+BRIGHTEST = fs.Settings("brightest", keep_brightest=80)
+TV = fs.Settings("tv", noise_std=0.3, keep_brightest=80)
 
 Wavefront = NDArray[np.float32]
 
@@ -133,8 +134,8 @@ def parts_table(configuration: LoopConfiguration) -> Table:
     light = optics.sensor.frame(optics.sensor.spots(wavefront)) * configuration.photons
     frame = detector.expose(light, np.random.default_rng(1))
     pipelines = {
-        name: make_pipeline(configuration, optics.sensor, Arm(name, settings))
-        for name, settings in (("plain", PLAIN), ("TV", TV))
+        name: make_pipeline(configuration, optics.sensor, LoopArm(name, settings))
+        for name, settings in (("brightest", BRIGHTEST), ("TV", TV))
     }
     field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
     commands, slopes = np.ones(optics.mirror.commands), np.ones(2 * len(optics.sensor.layout))
@@ -143,7 +144,7 @@ def parts_table(configuration: LoopConfiguration) -> Table:
         "mirror": lambda: optics.mirror.wavefront_nm(commands),
         "spots": lambda: optics.sensor.spots(wavefront),
         "detector": lambda: detector.expose(light, np.random.default_rng(1)),
-        "pipeline, plain": lambda: pipelines["plain"](frame),
+        "pipeline, brightest": lambda: pipelines["brightest"](frame),
         "pipeline, TV": lambda: pipelines["TV"](frame),
         "reconstructor": lambda: optics.reconstructor(slopes),
         "weighted reconstructor": lambda: optics.reconstructor.weighted(slopes, slopes),
@@ -160,10 +161,10 @@ def run() -> list[Table]:
     """Time the loop."""
     configuration = load_loop("emccd")
     short = replace(configuration, run=replace(configuration.run, frames=FRAMES))
-    simulate_loop(short, [Arm("plain", PLAIN)])  # makes screens and calibration, compiles
-    arms = {"plain": Arm("plain", PLAIN), "TV": Arm("TV", TV)}
+    simulate_loop(short, [LoopArm("brightest", BRIGHTEST)])  # makes screens and calibration, compiles
+    arms = {"brightest": LoopArm("brightest", BRIGHTEST), "TV": LoopArm("TV", TV)}
 
-    def runs(arm: Arm) -> Any:
+    def runs(arm: LoopArm) -> Any:
         return lambda: simulate_loop(short, [arm])
 
     with pinned():

@@ -20,7 +20,8 @@ def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(interleaved, "QUICK_PLAN", PLAN)
     monkeypatch.setattr(magnitude, "QUICK", SEARCH)
     monkeypatch.setattr(budget, "QUICK", SEARCH)
-    monkeypatch.setattr(budget, "TERMS", ("nothing", "slope error"))
+    terms = {name: budget.TERMS[name] for name in ("nothing", "slope error")}
+    monkeypatch.setattr(budget, "TERMS", terms)
     monkeypatch.chdir(tmp_path)
     faint = small().replace("camera", em_gain=100.0).replace("run", photons_per_subaperture=(40.0, 400.0))
     Path("small.toml").write_text(faint.to_text(), encoding="utf-8")
@@ -56,7 +57,7 @@ def test_magnitude(run: Commands) -> None:
 
 
 def test_budget(run: Commands) -> None:
-    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--arms", "cog")
+    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--arms", "centroid")
     assert result.code == 0, result.err
     lines = result.out.splitlines()
     assert lines[0].split() == ["without", "centre", "of", "gravity"]
@@ -67,7 +68,7 @@ def test_budget(run: Commands) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["run", "nowhere.toml"], "nowhere.toml: no such file, and none of the shipped configurations"),
+        (["run", "nowhere.toml"], "nowhere.toml: no such file; none of the shipped configurations"),
         (["show", "nowhere"], "nowhere: no such file"),
         (["magnitude", "small.toml", "--arms", "kog"], "arm = 'kog': expected one of"),
         (["magnitude", "small.toml", "--photons", "1,x"], "--photons: expected numbers with commas, got 'x'"),

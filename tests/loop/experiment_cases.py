@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from faintspot.compare.running import Workplace
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.interleaved import ObservingPlan
-from faintspot.loop.running import Workplace
 from faintspot.loop.tuning import Search
 
 SEARCH = Search(coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, rounds=1)
@@ -59,6 +60,18 @@ class StopsAfter:
         self._calls -= 1
         if self._calls < 0:
             raise KeyboardInterrupt
+
+
+def assert_same_units(one: Path, other: Path) -> None:
+    """The stores of two folders hold the same results, bit for bit."""
+    zarr = pytest.importorskip("zarr")
+    names = sorted(path.name for path in (one / "units").glob("*.zarr"))
+    assert names
+    assert names == sorted(path.name for path in (other / "units").glob("*.zarr"))
+    for name in names:
+        first, second = (zarr.open_group(str(folder / "units" / name), mode="r") for folder in (one, other))
+        for key, array in first.arrays():
+            np.testing.assert_array_equal(array[:], second[key][:])
 
 
 def assert_same_files(one: Path, other: Path, pattern: str) -> None:

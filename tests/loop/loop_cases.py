@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 import faintspot as fs
-from faintspot.loop import Arm, LoopConfiguration
+from faintspot.loop import LoopArm, LoopConfiguration
 from faintspot.loop.configuration import Camera
 
-PLAIN = fs.Settings(denoise=False, keep_brightest=80)
+PLAIN = fs.Settings("brightest", keep_brightest=80)
 
 
 def quiet() -> LoopConfiguration:
@@ -23,9 +23,9 @@ def faint() -> LoopConfiguration:
     return quiet().replace("camera", photons_per_subaperture=200.0, read_noise_e=1.0)
 
 
-def plain(label: str = "plain") -> Arm:
+def plain(label: str = "plain") -> LoopArm:
     """Brightest pixels and centre of gravity."""
-    return Arm(label, PLAIN)
+    return LoopArm(label, PLAIN)
 
 
 def expected_variance(amplitude: np.ndarray, spacing_m: float, r0_m: float, outer_scale_m: float) -> float:

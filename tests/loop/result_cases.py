@@ -9,13 +9,14 @@ import numpy as np
 
 import faintspot as fs
 from faintspot.configuration import to_text
-from faintspot.loop import Arm, LoopConfiguration, simulate_loop
+from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
 from faintspot.loop.configuration import Camera
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
 
 STRENGTHS = (np.nan, 0.0, 0.8)
 BLOCK = 60
 CYCLES = 3
+NAMES = ("brightest", "tv", "ml", "ml_weighted")
 LABELS = (
     "brightest pixels",
     "TV denoising",
@@ -33,9 +34,9 @@ def small_interleaved() -> InterleavedResult:
     schedule = np.tile(np.repeat(np.arange(len(STRENGTHS)), BLOCK), CYCLES)
     configuration = configuration.replace("run", frames=len(schedule), settle_frames=20)
     arms = [
-        Arm("no TV", fs.Settings(denoise=False, keep_brightest=80))
+        LoopArm("no TV", fs.Settings("brightest", keep_brightest=80))
         if np.isnan(strength)
-        else Arm(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
+        else LoopArm(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
         for strength in STRENGTHS
     ]
     records = tuple(simulate_loop(configuration, arms, schedule, realisation=number) for number in range(2))
@@ -70,10 +71,11 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
         ]
     )
     shape = (len(LABELS), 5)
-    settings = np.full(shape, to_text(fs.Settings(denoise=False, keep_brightest=50)))
+    settings = np.full(shape, to_text(fs.Settings("brightest", keep_brightest=50)))
     axis = np.hypot(*np.meshgrid(np.arange(-32, 33), np.arange(-32, 33)))
     psf = np.broadcast_to(np.exp(-axis / 8), (*shape, 65, 65)).astype(np.float32)
     return MagnitudeResult(
+        NAMES,
         LABELS,
         100 * 10 ** (-0.4 * (magnitudes - 10)),
         magnitudes,
@@ -89,4 +91,4 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
 def made_up_budget() -> BudgetResult:
     """Two arms, three terms, five realisations."""
     strehl = np.array([0.4, 0.5, 0.6])[None, :, None] + np.random.default_rng(1).normal(0, 0.01, (2, 3, 5))
-    return BudgetResult(TERMS, LABELS[:2], strehl, 100 / strehl)
+    return BudgetResult(NAMES[:2], TERMS, LABELS[:2], strehl, 100 / strehl)

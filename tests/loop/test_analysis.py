@@ -101,8 +101,8 @@ def test_gains_in_magnitude_are_those_of_the_curves() -> None:
     assert [gain.strehl for gain in gains][:2] == [0.05, 0.1]
     middle = next(gain for gain in gains if gain.strehl == 0.3)
     # Straight pieces between points 1 mag apart stand for a curve: a tenth of a magnitude.
-    assert middle.gain == pytest.approx(0.3, abs=0.1)
-    assert middle.decided == 1
+    assert middle.gain.value == pytest.approx(0.3, abs=0.1)
+    assert middle.gain.decided == 1
 
 
 def test_differences_by_flux_are_paired() -> None:

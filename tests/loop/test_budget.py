@@ -7,27 +7,27 @@ import numpy as np
 import pytest
 from tests.loop.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_files, small
 
+from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
-from faintspot.loop.arms import arm_named
+from faintspot.loop.arms import LOOP_GAIN, arm_kind
 from faintspot.loop.budget import TERMS, budget_run, run_budget
 from faintspot.loop.results import BUDGET_FILE, BudgetResult
-from faintspot.loop.running import Workplace
 from faintspot.loop.simulation import simulate_loop
 
 pytest.importorskip("hcipy")
-CHOICE = {"gain": 0.5, "kept": 0.25}
-
+KIND = arm_kind("brightest")
+CHOICE = {LOOP_GAIN: 0.5, "keep_brightest": 16}
 
 FAINT = small().replace("camera", photons_per_subaperture=40.0).replace("run", frames=300, settle_frames=40)
 
 
 @functools.cache
 def strehl(term: str) -> float:
-    return float(budget_run("brightest", FAINT, CHOICE, term, 0, lambda frames: None)["strehl"])
+    return float(budget_run(KIND, FAINT, CHOICE, term, 0, lambda frames: None)["strehl"])
 
 
 def test_without_nothing_it_is_the_loop_itself() -> None:
-    record = simulate_loop(FAINT, [arm_named("brightest", FAINT, CHOICE)])
+    record = simulate_loop(FAINT, [KIND.arm(FAINT, CHOICE)])
     assert strehl("nothing") == pytest.approx(record.mean_strehl(), abs=1e-12)
 
 
@@ -58,7 +58,7 @@ def test_experiment_and_resume(tmp_path: Path) -> None:
 
     whole, again = tmp_path / "whole", tmp_path / "again"
     result = run(whole, HERE)
-    assert result.terms == TERMS
+    assert result.terms == tuple(TERMS)
     assert result.strehl.shape == result.residual_nm.shape == (1, len(TERMS), 2)
     assert np.isfinite(result.strehl).all()
     with pytest.raises(KeyboardInterrupt):

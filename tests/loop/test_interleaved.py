@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.loop.experiment_cases import HERE, PLAN, StopsAfter, assert_same_files, small
+from tests.loop.experiment_cases import HERE, PLAN, StopsAfter, assert_same_files, assert_same_units, small
 
+from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
 from faintspot.loop.interleaved import QUICK_PLAN, ObservingPlan, run_interleaved
 from faintspot.loop.results import InterleavedResult
-from faintspot.loop.running import Workplace
 
 pytest.importorskip("hcipy")
 CAMERA = small().replace("camera", em_gain=100.0, read_noise_e=20.0)
@@ -56,7 +56,7 @@ def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) 
         run_interleaved(CAMERA, tmp_path, plan=PLAN, place=Workplace(0, progress=StopsAfter(calls)))
     run_interleaved(CAMERA, tmp_path, plan=PLAN, place=HERE)
     assert_same_files(tmp_path, whole, "set-*.npz")
-    assert_same_files(tmp_path / "units", whole / "units", "*.npz")
+    assert_same_units(tmp_path, whole)
 
 
 def test_nothing_is_done_twice(whole: Path) -> None:
@@ -66,7 +66,7 @@ def test_nothing_is_done_twice(whole: Path) -> None:
 def test_other_plan_is_refused_or_replaces(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
     shorter = replace(PLAN, block_frames=50, strengths=(2,), em_fractions=(1.0,), repeats=(1,))
-    with pytest.raises(InputError, match="another configuration"):
+    with pytest.raises(InputError, match="belongs to another loop"):
         run_interleaved(CAMERA, folder, plan=shorter, place=HERE)
     result = run_interleaved(CAMERA, folder, plan=shorter, place=HERE, overwrite=True)
     assert [record.frames for record in result.records] == [150]

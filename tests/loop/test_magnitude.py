@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.loop.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_files, small
+from tests.loop.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_files, assert_same_units, small
 
+from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
 from faintspot.loop.magnitude import quick_run, run_magnitude
 from faintspot.loop.results import MAGNITUDE_FILE, MagnitudeResult
-from faintspot.loop.running import Workplace
 
 pytest.importorskip("hcipy")
-ARMS = ("cog", "brightest")
+ARMS = ("centroid", "brightest")
 PHOTONS = (400.0, 40.0)
 
 
@@ -49,21 +49,29 @@ def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) 
         run(tmp_path, Workplace(0, progress=StopsAfter(calls)))
     run(tmp_path, HERE)
     assert_same_files(tmp_path, whole, "*.npz")
-    assert_same_files(tmp_path / "units", whole / "units", "*.npz")
+    assert_same_units(tmp_path, whole)
 
 
 def test_arms_can_be_added(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
-    for tuned in folder.glob("units/*-brightest-*"):
-        tuned.unlink()
-    one = run(folder, Workplace(0, progress=StopsAfter(0)), ("cog",))  # nothing is left to do
+    one = run(folder, Workplace(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do
     assert one.labels == ("centre of gravity",)
     both = run(folder, HERE)
     np.testing.assert_array_equal(both.strehl, MagnitudeResult.load(whole / MAGNITUDE_FILE).strehl)
+    three = run(folder, HERE, (*ARMS, "ml"))
+    assert three.names == ("centroid", "brightest", "ml")
+    np.testing.assert_array_equal(three.strehl[:2], both.strehl)
+
+
+def test_folders_of_earlier_versions_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "units").mkdir()
+    (tmp_path / "units" / "magnitude.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"faintspot 0\.1"):
+        run(tmp_path, HERE)
 
 
 def test_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="arm = 'kog'"):
+    with pytest.raises(InputError, match=r"^arm = 'kog': expected one of 'brightest'"):
         run_magnitude(small(), tmp_path, ("kog",), PHOTONS, place=HERE)
     with pytest.raises(InputError, match="arms: expected at least one"):
         run_magnitude(small(), tmp_path, (), PHOTONS, place=HERE)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from faintspot.errors import InputError
-from faintspot.loop.files import make_folder, write_atomically
+from faintspot.loop.files import make_folder
 from faintspot.loop.results import (
     BUDGET_FILE,
     INTERLEAVED_FILE,
@@ -24,6 +24,7 @@ def magnitude_result() -> MagnitudeResult:
     strehl = rng.uniform(0, 1, (2, 3, 4))
     strehl[1, 2, 3] = np.nan
     return MagnitudeResult(
+        ("ml", "b"),
         ("a", "b"),
         np.array([10.0, 20.0, 40.0]),
         np.array([12.0, 11.2, 10.5]),
@@ -56,7 +57,8 @@ def test_magnitude_is_read_as_written(tmp_path: Path) -> None:
 
 
 def test_budget_is_read_as_written(tmp_path: Path) -> None:
-    result = BudgetResult(("nothing", "noise"), ("a",), np.zeros((1, 2, 3)), np.ones((1, 2, 3)))
+    values = np.zeros((1, 2, 3)), np.ones((1, 2, 3))
+    result = BudgetResult(("brightest",), ("nothing", "noise"), ("a",), *values)
     result.save(tmp_path / BUDGET_FILE)
     assert_equal(BudgetResult.load(tmp_path / BUDGET_FILE), result)
 
@@ -70,7 +72,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         MagnitudeResult.load(path)
     assert "\n" not in str(error.value)
     magnitude_result().save(path)
-    with pytest.raises(InputError, match="not an error budget of format 1"):
+    with pytest.raises(InputError, match="not an error budget of format 2"):
         BudgetResult.load(path)
 
 
@@ -86,11 +88,17 @@ def test_no_interleaved_result(tmp_path: Path) -> None:
         InterleavedResult.load(tmp_path)
 
 
+def test_results_of_earlier_versions_are_recognised(tmp_path: Path) -> None:
+    path = tmp_path / MAGNITUDE_FILE
+    np.savez_compressed(path, format=1, labels=np.array(["brightest pixels"]))
+    with pytest.raises(InputError, match="earlier version of faintspot: measure again") as error:
+        MagnitudeResult.load(path)
+    assert "\n" not in str(error.value)
+
+
 def test_folders_that_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist: create it first"):
         make_folder(tmp_path / "a" / "b")
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be made"):
         make_folder(tmp_path / "file")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_atomically(tmp_path / "a" / "b", b"")

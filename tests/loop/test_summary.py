@@ -17,6 +17,7 @@ def result() -> MagnitudeResult:
     brightest = np.array([0.2, 0.4, 0.6])[:, None] + air
     tv = brightest - 0.01 + 0.002 * np.array([1, -1, 0, 1, -1])
     return MagnitudeResult(
+        ("brightest", "tv"),
         ("brightest pixels", "TV denoising"),
         np.array([10.0, 40.0, 160.0]),
         np.array([13.0, 11.5, 10.0]),
@@ -41,13 +42,24 @@ def test_magnitude(result: MagnitudeResult) -> None:
 
 def test_one_realisation_has_no_error(result: MagnitudeResult) -> None:
     single = replace(result, strehl=result.strehl[:, :, :1], centroid_gain=result.centroid_gain[:, :, :1])
-    assert "±nan" not in magnitude_summary(single)
+    text = magnitude_summary(single)
+    assert "nan" not in text
+    assert "0.100 ±?" in text
+
+
+def test_two_realisations_name_no_gain(result: MagnitudeResult) -> None:
+    """Not a figure of a gain whose error is not known."""
+    few = replace(result, strehl=result.strehl[:, :, :2], centroid_gain=result.centroid_gain[:, :, :2])
+    text = " ".join(magnitude_summary(few).split())
+    assert "gain in limiting magnitude: too few realisations for an interval" in text
+    assert " mag." not in text
 
 
 def test_budget() -> None:
     shape = (1, len(TERMS), 3)
     strehl = np.broadcast_to(np.linspace(0.3, 0.9, len(TERMS))[:, None], shape)
-    text = budget_summary(BudgetResult(TERMS, ("brightest pixels",), strehl, np.full(shape, 150.0)))
-    lines = text.splitlines()
-    assert lines[1].split() == ["nothing", "0.300", "±0.000", "150", "nm"]
+    residual = np.full(shape, 150.0)
+    result = BudgetResult(("brightest",), tuple(TERMS), ("brightest pixels",), strehl, residual)
+    lines = budget_summary(result).splitlines()
+    assert lines[1].split() == ["nothing", "0.300", "±0.000", "150", "±0", "nm"]
     assert "without slope error: slopes are the mean gradients of the wavefront" in lines

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,3 +40,14 @@ def test_recorded_telemetry_is_analysed_without_a_simulation() -> None:
     )
     np.testing.assert_allclose(later.slopes_px, found.slopes_px[delay:])
     assert open_loop_slopes(record).shape == found.slopes_px.shape
+
+
+def test_the_example_of_the_manual_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small_interleaved().save(tmp_path / "canary")
+    monkeypatch.chdir(tmp_path)
+    text = (Path(__file__).resolve().parents[2] / "docs" / "loop.md").read_text(encoding="utf-8")
+    script = re.search(r"```python\n(.*?analyse_telemetry.*?)```", text, re.DOTALL)
+    assert script is not None
+    names: dict[str, Any] = {}
+    exec(script[1], names)
+    assert 0.05 < names["analysis"].seeing.r0_m < 0.5

@@ -8,8 +8,12 @@ from tests.loop.experiment_cases import SEARCH, small
 
 from faintspot.errors import InputError
 from faintspot.loop import tuning
-from faintspot.loop.arms import tuned_parameters
+from faintspot.loop.arms import LOOP_GAIN, arm_kind
 from faintspot.loop.tuning import FIRST_TUNING_REALISATION, Search, stored_choice, tune, tuning_unit
+
+BRIGHTEST = arm_kind("brightest")
+KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
+BEST = KEPT.values[2]
 
 
 class _Record:
@@ -22,13 +26,13 @@ class _Record:
 
 @pytest.fixture
 def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """A loop whose Strehl ratio is highest at gain 0.6 and 16 kept pixels; yields realisations used."""
+    """A loop whose Strehl ratio is highest at gain 0.6 and the best number of pixels; realisations used."""
     used: list[int] = []
 
     def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
         used.append(realisation)
         kept = arms[0].settings.keep_brightest
-        return _Record(1 - (arms[0].gain - 0.6) ** 2 - 0.1 * np.log(kept / 16) ** 2)
+        return _Record(1 - (arms[0].gain - 0.6) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
 
     monkeypatch.setattr(tuning, "simulate_loop", simulate)
     return used
@@ -36,8 +40,8 @@ def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_finds_the_top(hill: list[int]) -> None:
     told: list[int] = []
-    found = tune("brightest", small(), Search(rounds=9), told.append)
-    assert found.choice == {"gain": 0.6, "kept": 0.25}
+    found = tune(BRIGHTEST, small(), Search(rounds=9), told.append)
+    assert found.choice == {LOOP_GAIN: 0.6, "keep_brightest": BEST}
     assert found.strehl == pytest.approx(1)
     assert min(hill) >= FIRST_TUNING_REALISATION
     assert told == sorted(told)
@@ -45,19 +49,20 @@ def test_finds_the_top(hill: list[int]) -> None:
 
 def test_looks_at_no_choice_twice(hill: list[int]) -> None:
     search = Search(rounds=9, realisations=1)
-    found = tune("brightest", small(), search)
-    coarse = np.prod([len(parameter.coarse) for parameter in tuned_parameters("brightest").values()])
+    found = tune(BRIGHTEST, small(), search)
+    coarse = np.prod([len(each.first) for each in BRIGHTEST.tuned(small()).values()])
     assert len(hill) <= found.tried + coarse  # each at most once coarsely and once finely
 
 
 def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
-    found = tune("brightest", small(), tuning.QUICK)
-    assert found.choice == {"gain": 0.7, "kept": 0.35}
+    found = tune(BRIGHTEST, small(), tuning.QUICK)
+    nearest = min(KEPT.first, key=lambda kept: abs(np.log(kept / BEST)))
+    assert found.choice == {LOOP_GAIN: 0.7, "keep_brightest": nearest}
     assert found.tried == 9
 
 
 def test_is_repeatable_and_stored() -> None:
-    one, other = (tuning_unit("cog", small(), SEARCH, lambda frames: None) for _ in range(2))
+    one, other = (tuning_unit(arm_kind("centroid"), small(), SEARCH, lambda frames: None) for _ in range(2))
     assert stored_choice(one) == stored_choice(other)
     np.testing.assert_array_equal(one["strehl"], other["strehl"])
     assert 0 < one["strehl"] < 1

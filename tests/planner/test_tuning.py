@@ -98,7 +98,7 @@ def test_an_estimator_of_somebody_else_takes_part(monkeypatch: pytest.MonkeyPatc
 
     @dataclass(frozen=True, eq=False, kw_only=True)
     class OwnEstimator(Estimator):
-        power: Any = option(1.0, "Of the pixels.", low=0.1, high=10.0, per_subaperture=False)  # noqa: RUF009
+        power: Any = option(1.0, "Of the pixels.", low=0.1, high=10.0, per_subaperture=False)
 
         name: ClassVar[str] = "own"
         label: ClassVar[str] = "somebody's own"

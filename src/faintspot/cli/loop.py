@@ -15,7 +15,7 @@ from faintspot.cli.progress import progress_bar
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from faintspot.loop.running import Workplace
+    from faintspot.compare.running import Workplace
 
 
 def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -128,8 +128,8 @@ def magnitude(
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
     Each method is tuned at each flux, its settings and the loop gain together, on air that is not scored.
-    Methods: cog, thresholded, brightest, smoothed, tv, weighted, ml, ml_weighted, map, map_weighted, trained,
-    trained_predicted, brightest_uncorrected, tv_uncorrected.
+    Methods: every estimator by its name, with _predicted after it (the loop's prediction is its prior),
+    _weighted (slopes count by their standard errors) or _uncorrected (for the centroid gain).
 
     \b
     Examples:
@@ -182,7 +182,7 @@ def budget(
 @contextmanager
 def _workplace(workers: int | None, scheduler: str | None) -> Iterator[Workplace]:
     """Yield where the work is done, with a progress bar."""
-    from faintspot.loop.running import Workplace
+    from faintspot.compare.running import Workplace
 
     with progress_bar("loop") as advance:
         yield Workplace(workers, scheduler, advance, lambda text: click.echo(text, err=True))

@@ -16,17 +16,17 @@ from rich.table import Table
 
 from faintspot import configuration
 from faintspot.cli.progress import progress_bar
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import write_atomically
-from faintspot.io.frames import open_frames
-from faintspot.planner import answer_text
-from faintspot.planner.camera_file import TABLES, read_camera
-from faintspot.planner.photometry import (
+from faintspot.compare.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
     DEFAULT_THROUGHPUT,
     ZERO_POINTS,
 )
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import write_atomically
+from faintspot.io.frames import open_frames
+from faintspot.planner import answer_text
+from faintspot.planner.camera_file import TABLES, read_camera
 from faintspot.planner.question import PROFILES
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout

@@ -109,6 +109,10 @@ class Estimator(Options):
         """Return the same with the options that follow from a scene alone, before any are tuned."""
         return self
 
+    def for_bright_light(self) -> Estimator:
+        """Return what measures the same in images of plenty of light and no noise, as for references."""
+        return self
+
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Return which options are tuned for a scene, and over which values; the first is the usual one."""
         return {}

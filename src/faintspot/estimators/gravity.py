@@ -94,6 +94,10 @@ class KeepingBrightest(Gravity):
         """
         return None
 
+    def for_bright_light(self) -> Estimator:
+        """Keep the usual number of pixels where it follows from the light."""
+        return self.replaced({"keep_brightest": None}) if is_auto(self.keep_brightest) else self
+
     def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
         """Say what is done after the denoising."""
         kept, rule = (self._span(name, n_subapertures, pixels) for name in ("keep_brightest", "rule"))

@@ -51,6 +51,10 @@ class Thresholded(Gravity):
         ]
         return {"threshold_e": list(dict.fromkeys(max(float(f"{e:.3g}"), _SMALLEST_E) for e in levels))}
 
+    def for_bright_light(self) -> Thresholded:
+        """Take nothing off: a level for faint light is none for bright."""
+        return self.replaced({"threshold_e": 0.0})
+
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""
         if np.isnan(self.values("threshold_e", sensor.n, sensor.pixels).astype(float)).any():

@@ -14,7 +14,7 @@ from faintspot.errors import InputError
 from faintspot.estimate.automatic import automatic_strength
 from faintspot.estimate.noise import suggested_strength
 from faintspot.estimate.total_variation import ALGORITHMS, tv_denoise
-from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
+from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import Floats, GravityPrepared, KeepingBrightest
 from faintspot.estimators.registry import register
@@ -93,6 +93,10 @@ class TotalVariation(KeepingBrightest):
     def without_denoising(self) -> BrightestPixels:
         """See `Estimator`."""
         return BrightestPixels(**{name: getattr(self, name) for name in BrightestPixels.declared()})
+
+    def for_bright_light(self) -> Estimator:
+        """Do not denoise: an image without noise has nothing to take off."""
+        return self.without_denoising().for_bright_light()
 
     def default_of(self, name: str, pixels: int) -> Any:
         """See `Options`."""

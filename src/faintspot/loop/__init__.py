@@ -7,18 +7,20 @@ from typing import TYPE_CHECKING
 from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from faintspot.loop.arms import Arm as Arm
+    from faintspot.loop.arms import LoopArm as LoopArm
     from faintspot.loop.budget import run_budget as run_budget
     from faintspot.loop.configuration import LoopConfiguration as LoopConfiguration
     from faintspot.loop.configuration import load_loop as load_loop
     from faintspot.loop.configuration import shipped_loops as shipped_loops
     from faintspot.loop.interleaved import run_interleaved as run_interleaved
     from faintspot.loop.magnitude import run_magnitude as run_magnitude
-    from faintspot.loop.record import Arm as Arm
     from faintspot.loop.record import LoopRecord as LoopRecord
     from faintspot.loop.simulation import simulate_loop as simulate_loop
 
 _HOMES = {
-    "Arm": "faintspot.loop.record",
+    "Arm": "faintspot.loop.arms",
+    "LoopArm": "faintspot.loop.arms",
     "LoopConfiguration": "faintspot.loop.configuration",
     "LoopRecord": "faintspot.loop.record",
     "load_loop": "faintspot.loop.configuration",

@@ -9,18 +9,16 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.compare.statistics import Estimate, mean_by_blocks, paired_mean
 from faintspot.errors import InputError
 from faintspot.loop.record import LoopRecord
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
 from faintspot.loop.seeing import Seeing, mean_r0, r0_of_record
 from faintspot.loop.statistics import (
-    Estimate,
     MagnitudeGain,
     RegressionLine,
     magnitude_gain,
-    mean_by_blocks,
     neighbour_differences,
-    paired_mean,
     regression_line,
 )
 

@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.loop.arms import LoopArm
 from faintspot.loop.atmosphere import MovingLayers
+from faintspot.loop.camera import Exposing, camera_calibration
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.loop.mirror import DeformableMirror
-from faintspot.loop.record import Arm
 from faintspot.loop.wavefront_sensor import ShackHartmann
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.settings import Settings
-from faintspot.simulate.detector import Detector
 
 _BRIGHT_E = 1e6
 _POKE_NM = 20.0
@@ -31,34 +32,7 @@ _SMALLEST_GAIN = 0.05  # less is noise, and dividing by it would make the loop u
 Floats = NDArray[np.float64]
 
 
-def make_detector(configuration: LoopConfiguration) -> Detector:
-    """Return the sensor's camera."""
-    camera = configuration.camera
-    return Detector(
-        camera.read_noise_e,
-        dark_e=camera.dark_e,
-        background_e=camera.background_e,
-        em_gain=camera.em_gain,
-        gain_e_per_adu=camera.gain_e_per_adu,
-        offset_adu=camera.offset_adu,
-        bits=camera.bits,
-    )
-
-
-def camera_calibration(configuration: LoopConfiguration) -> Calibration:
-    """Return what turns the camera's frames into electrons of the star."""
-    camera = configuration.camera
-    background = camera.background_e + camera.dark_e
-    return Calibration(
-        dark=camera.offset_adu + background * camera.em_gain / camera.gain_e_per_adu,
-        gain_e_per_adu=camera.gain_e_per_adu,
-        em_gain=camera.em_gain,
-        read_noise_e=camera.read_noise_e,
-        background_e=background,
-    )
-
-
-def arm_layout(layout: Layout, arm: Arm) -> Layout:
+def arm_layout(layout: Layout, arm: LoopArm) -> Layout:
     """Return the windows that an arm uses: the middle of the sensor's.
 
     Raises
@@ -74,11 +48,11 @@ def arm_layout(layout: Layout, arm: Arm) -> Layout:
     return Layout(layout.frame_shape, (pixels, pixels), corners, layout.centres, layout.cells)
 
 
-def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm) -> SlopePipeline:
+def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: LoopArm) -> SlopePipeline:
     """Return the pipeline of an arm, with the reference slopes of a flat wavefront.
 
-    References are measured with bright frames without noise and with denoising off: at the strength for
-    faint light they would be denoised to nothing.
+    References are measured with bright frames without noise, and without what is for faint light:
+    at its strength of denoising they would be denoised to nothing.
     """
     layout = arm_layout(sensor.layout, arm)
     psf = (
@@ -88,7 +62,7 @@ def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: 
     )
     bright = SlopePipeline(
         layout,
-        _for_bright_light(arm.settings),
+        arm.settings.replace(estimator=arm.settings.estimator.for_bright_light(), flux_e=None),
         Calibration(read_noise_e=1.0),
         psf=psf,
         score=arm.score,
@@ -113,17 +87,6 @@ def _flat_psf(width_px: float, elongation: float) -> PSF:
     return PSF.analytic(size=width_px / 2, elongation=elongation)
 
 
-def _for_bright_light(settings: Settings) -> Settings:
-    """Return settings that do the same to a bright image without noise."""
-    changes: dict[str, Any] = {"denoise": False, "flux_e": None, "prior_std_px": None}
-    for name in ("noise_std", "keep_brightest"):
-        if isinstance(getattr(settings, name), str):  # "auto"
-            changes[name] = None
-    if settings.estimator == "thresholded":
-        changes["threshold_e"] = 0.0
-    return settings.replace(**changes)
-
-
 def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Floats:
     """Return the displacements of the spots for a command of 1 nm of each actuator, (2 n, commands) px.
 
@@ -135,7 +98,7 @@ def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Float
     which sees bright spots with other weights than faint ones (80 to 1000 photons, 700 frames).
     """
     pixels = sensor.layout.pixels
-    settings = Settings(denoise=False, keep_brightest=pixels - 1)
+    settings = Settings(BrightestPixels(keep_brightest=pixels - 1))
     pipeline = SlopePipeline(sensor.layout, settings, threads=1)
 
     def slopes(wavefront: NDArray[np.floating[Any]], displacement_px: float = 0.0) -> Floats:
@@ -185,7 +148,7 @@ def typical_spots(
 def centroid_gain(
     pipeline: SlopePipeline,
     sensor: ShackHartmann,
-    detector: Detector,
+    detector: Exposing,
     photons: float,
     spots: tuple[NDArray[np.float32], NDArray[np.float32]],
     seed: int,

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomlkit
-from tomlkit.exceptions import TOMLKitError
 
 from faintspot.checks import one_of
+from faintspot.compare.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
 from faintspot.errors import InputError
-from faintspot.loop.limits import checked_section
-from faintspot.planner.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
+from faintspot.estimators.scene import Scene
+from faintspot.loop.checked_fields import LIST, NUMBER_OR_LIST, checked_section, number
+from faintspot.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
 
 ARCSEC = math.pi / 180 / 3600
 """Radians in one arcsecond."""
@@ -24,14 +25,16 @@ R0_WAVELENGTH_M = 500e-9
 """Wavelength at which r0 is given."""
 
 CLOSED, OPEN = "closed", "open"
+SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
+_POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
 
 
 @dataclass(frozen=True)
 class Telescope:
     """The telescope's pupil."""
 
-    diameter_m: float = 4.2
-    obstruction: float = 0.29
+    diameter_m: float = number(4.2, 0.05, 100.0)
+    obstruction: float = number(0.29, 0.0, 0.9)
     """Diameter of the central obstruction as a fraction of the pupil's."""
 
 
@@ -39,20 +42,20 @@ class Telescope:
 class Sensor:
     """The Shack-Hartmann sensor."""
 
-    subapertures: int = 7
+    subapertures: int = number(7, 1, 200, whole=True)
     """Sub-apertures across the pupil."""
-    subaperture_m: float | None = None
+    subaperture_m: float | None = number(None, 0.0, 100.0, low_open=True)
     """Side of a sub-aperture in the pupil. Default: the sub-apertures just cover the pupil."""
-    pixels: int = 16
+    pixels: int = number(16, 4, 64, whole=True)
     """Pixels across a sub-aperture's window."""
-    wavelength_m: float = 650e-9
-    pixel_scale_arcsec: float | None = None
+    wavelength_m: float = number(650e-9, 1e-7, 1e-4)
+    pixel_scale_arcsec: float | None = number(None, 0.0, 100.0, low_open=True)
     """Default: two pixels for lambda / d."""
-    least_illumination: float = 0.5
+    least_illumination: float = number(0.5, 0.0, 1.0, low_open=True)
     """Part of its area in the pupil from which a sub-aperture is used."""
-    samples: int = 12
+    samples: int = number(12, 4, 128, whole=True)
     """Points of the phase across a sub-aperture."""
-    spot_elongation: float = 1.0
+    spot_elongation: float = number(1.0, 1.0, 30.0)
     """Full width at half maximum of a spot along x as a multiple of that along y, before the pixels."""
 
 
@@ -60,9 +63,9 @@ class Sensor:
 class Mirror:
     """The deformable mirror."""
 
-    actuators: int | None = None
+    actuators: int | None = number(None, 2, 201, whole=True)
     """Actuators across the pupil, its edges included. Default: one at each corner of the sub-apertures."""
-    crosstalk: float = 0.15
+    crosstalk: float = number(0.15, 0.0, 0.9, low_open=True)
     """Height of an actuator's Gaussian influence function at its neighbour."""
     tip_tilt: bool = True
     """Whether a tip-tilt mirror helps."""
@@ -72,53 +75,53 @@ class Mirror:
 class Atmosphere:
     """Layers of frozen turbulence that the wind moves; the star is on axis and altitudes do not matter."""
 
-    r0_m: float | tuple[float, float] = 0.15
+    r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, several=NUMBER_OR_LIST)
     """Fried parameter at 500 nm; or the two ends between which it drifts."""
-    drift_time_s: float = 60.0
+    drift_time_s: float = number(60.0, 0.0, 1e6, low_open=True)
     """Period of the drift."""
-    outer_scale_m: float = 25.0
-    altitude_m: tuple[float, ...] = (0.0, 2500.0, 4000.0, 13500.0)
-    fraction: tuple[float, ...] = (0.45, 0.25, 0.15, 0.15)
+    outer_scale_m: float = number(25.0, 0.5, 200.0)
+    altitude_m: tuple[float, ...] = number((0.0, 2500.0, 4000.0, 13500.0), 0.0, 1e5, several=LIST)
+    fraction: tuple[float, ...] = number((0.45, 0.25, 0.15, 0.15), 0.0, 1e6, several=LIST)
     """Strength of each layer; their ratios matter."""
-    wind_speed_m_per_s: tuple[float, ...] = (6.0, 9.0, 14.0, 22.0)
-    wind_direction_deg: tuple[float, ...] = (20.0, 80.0, 150.0, 250.0)
+    wind_speed_m_per_s: tuple[float, ...] = number((6.0, 9.0, 14.0, 22.0), 0.0, 200.0, several=LIST)
+    wind_direction_deg: tuple[float, ...] = number((20.0, 80.0, 150.0, 250.0), -360.0, 360.0, several=LIST)
 
 
 @dataclass(frozen=True)
 class Camera:
     """The sensor's camera and the star's light on it; as `faintspot.simulate.Detector`."""
 
-    photons_per_subaperture: float | None = None
+    photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
     """Photo-electrons of a fully lit sub-aperture in a frame; or give the magnitude."""
-    magnitude: float | None = None
+    magnitude: float | None = number(None, -30.0, 60.0)
     band: str = DEFAULT_BAND
-    zero_point: float | None = None
+    zero_point: float | None = number(None, 0.0, 1e20, low_open=True)
     """Photons per second and m^2 of magnitude 0. Default: that of the band."""
-    throughput: float = 0.4
-    quantum_efficiency: float = 0.9
-    read_noise_e: float = 0.1
+    throughput: float = number(0.4, 0.0, 1.0, low_open=True)
+    quantum_efficiency: float = number(0.9, 0.0, 1.0, low_open=True)
+    read_noise_e: float = number(0.1, 0.0, 1e6)
     """At the camera's output, after multiplication."""
-    em_gain: float = 1.0
-    gain_e_per_adu: float = 1.0
-    offset_adu: float = 0.0
-    bits: int | None = None
-    background_e: float = 0.0
-    dark_e: float = 0.0
+    em_gain: float = number(1.0, 1.0, 1e5)
+    gain_e_per_adu: float = number(1.0, 0.0, 1e6, low_open=True)
+    offset_adu: float = number(0.0, -1e6, 1e6)
+    bits: int | None = number(None, 1, 32, whole=True)
+    background_e: float = number(0.0, 0.0, 1e6)
+    dark_e: float = number(0.0, 0.0, 1e6)
 
 
 @dataclass(frozen=True)
 class Control:
     """The loop."""
 
-    frame_rate_hz: float = 250.0
-    delay_frames: int = 2
+    frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
+    delay_frames: int = number(2, 1, 100, whole=True)
     """The command computed from frame k acts first during the exposure of frame k + delay_frames."""
-    gain: float = 0.5
-    leak: float = 0.01
+    gain: float = number(0.5, 0.0, 2.0)
+    leak: float = number(0.01, 0.0, 1.0)
     """Part of the command that is forgotten in every frame, so that a loop that has lost the star returns."""
     mode: str = CLOSED
     """"closed", or "open": the sensor does not see the mirror."""
-    largest_condition: float = 30.0
+    largest_condition: float = number(30.0, 1.0, 1e6)
     """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
 
 
@@ -126,19 +129,19 @@ class Control:
 class Science:
     """Where the Strehl ratio is measured, on axis."""
 
-    wavelength_m: float = 1.65e-6
+    wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
 class Run:
     """How long and how often."""
 
-    frames: int = 1500
-    settle_frames: int = 100
+    frames: int = number(1500, 1, 10_000_000, whole=True)
+    settle_frames: int = number(100, 0, 10_000_000, whole=True)
     """Frames at the beginning that are not scored."""
-    seed: int = 1
-    realisations: int = 5
-    photons_per_subaperture: tuple[float, ...] = ()
+    seed: int = number(1, 0, 2**63 - 1, whole=True)
+    realisations: int = number(5, 1, 100_000, whole=True)
+    photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, several=LIST)
     """Fluxes at which estimators are compared."""
 
 
@@ -181,10 +184,8 @@ class LoopConfiguration:
         InputError
             For an unknown section or key, or a bad value.
         """
-        _check_known("", section, list(SECTIONS), "section")
-        known = [item.name for item in fields(SECTIONS[section])]
-        for key in values:
-            _check_known(f"{section}.", key, known, "key")
+        check_known("", section, SECTIONS, "section")
+        check_keys(f"{section}.", values, _keys(section))
         changed = dataclasses.replace(getattr(self, section), **values)
         return dataclasses.replace(self, **{section: changed})
 
@@ -210,6 +211,33 @@ class LoopConfiguration:
     def spot_width_px(self) -> float:
         """Width of a spot, lambda / d, in pixels."""
         return self.sensor.wavelength_m / self.subaperture_m / self.pixel_scale_rad
+
+    @property
+    def d_over_r0(self) -> float:
+        """Side of a sub-aperture in Fried parameters at the sensor's wavelength, in the worst seeing."""
+        r0_sensing = np.min(self.atmosphere.r0_m) * (self.sensor.wavelength_m / R0_WAVELENGTH_M) ** (6 / 5)
+        return self.subaperture_m / float(r0_sensing)
+
+    def position_range_px(self, *, predicted: bool = False) -> float:
+        """Return how far spots may be from the reference, or from where the loop predicts them."""
+        return _POSITION_RANGE_PX[CLOSED if predicted else self.control.mode]
+
+    @property
+    def scene(self) -> Scene:
+        """What the estimators are told when their options are chosen."""
+        camera, elongation = self.camera, self.sensor.spot_elongation
+        return Scene(
+            flux_e=self.photons,
+            read_noise_e=camera.read_noise_e / camera.em_gain,
+            window=(self.sensor.pixels,) * 2,
+            spot_fwhm_px=SPOT_FWHM * self.spot_width_px * math.sqrt(elongation),
+            position_range_px=self.position_range_px(),
+            elongation=elongation,
+            excess_noise=2.0 if camera.em_gain > 1 else 1.0,
+            background_e=camera.background_e + camera.dark_e,
+            d_over_r0=self.d_over_r0,
+            diffraction_px=self.spot_width_px,
+        )
 
     @property
     def photons(self) -> float:
@@ -253,10 +281,17 @@ class LoopConfiguration:
         InputError
             When it is not TOML, has an unknown table or key, or a bad value.
         """
-        try:
-            document: dict[str, Any] = tomlkit.parse(text).unwrap()
-        except TOMLKitError as error:
-            raise InputError(f"{where}: not a TOML file: {str(error).splitlines()[0]}") from None
+        return cls.from_document(parse_text(text, where).unwrap(), where)
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any], where: str) -> LoopConfiguration:
+        """Make a configuration of the tables of a TOML file.
+
+        Raises
+        ------
+        InputError
+            For an unknown table or key, or a bad value.
+        """
         try:
             return _build(document)
         except InputError as error:
@@ -287,18 +322,12 @@ def load_loop(path: str | Path) -> LoopConfiguration:
     name = path.name.removesuffix(".toml")
     # A folder of that name holds results of an earlier run.
     if not path.is_file() and path.parent == Path() and name in shipped_loops():
-        text = (_shipped() / f"{name}.toml").read_text(encoding="utf-8")
-        return LoopConfiguration.from_text(text, f"{name}.toml")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+        document, where = parse_file(_shipped() / f"{name}.toml"), f"{name}.toml"
+    else:
         shipped = ", ".join(shipped_loops())
-        raise InputError(f"{path}: no such file, and none of the shipped configurations: {shipped}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a TOML file: it is not UTF-8 text") from None
-    return LoopConfiguration.from_text(text, str(path))
+        document = parse_file(path, if_missing=f"none of the shipped configurations either: {shipped}")
+        where = str(path)
+    return LoopConfiguration.from_document(document.unwrap(), where)
 
 
 def shipped_loops() -> list[str]:
@@ -312,27 +341,18 @@ def _shipped() -> Any:
 
 
 def _build(document: dict[str, Any]) -> LoopConfiguration:
-    for key in document:
-        _check_known("", key, ["name", *SECTIONS], "table")
+    check_keys("", document, ["name", *SECTIONS], what="table")
     values: dict[str, Any] = {}
     for name, table in document.items():
-        if name == "name":
-            values[name] = table
-            continue
-        if not isinstance(table, dict):
-            raise InputError(f"{name}: expected a table [{name}], got {table!r}")
-        known = [item.name for item in fields(SECTIONS[name])]
-        for key in table:
-            _check_known(f"{name}.", key, known, "key")
-        values[name] = SECTIONS[name](**table)
+        if name != "name":
+            check_keys(f"{name}.", checked_table(name, table), _keys(name))
+            table = SECTIONS[name](**table)
+        values[name] = table
     return LoopConfiguration(**values)
 
 
-def _check_known(prefix: str, name: str, known: list[str], what: str) -> None:
-    if name not in known:
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}"
-        raise InputError(f"{prefix}{name}: unknown {what}; {hint}")
+def _keys(section: str) -> list[str]:
+    return [item.name for item in fields(SECTIONS[section])]
 
 
 def _check_layers(air: Atmosphere) -> None:
@@ -390,5 +410,5 @@ def field_of_view(whole: LoopConfiguration) -> float:
 
 def blur_px(whole: LoopConfiguration) -> float:
     """Return the standard deviation along x of the source that elongates the spots, px."""
-    width = 0.886 * whole.spot_width_px  # full width at half maximum of sinc^2
+    width = SPOT_FWHM * whole.spot_width_px
     return width * math.sqrt(whole.sensor.spot_elongation**2 - 1) / 2.3548

@@ -8,32 +8,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.compare.statistics import paired_mean
+from faintspot.estimators.base import Style
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.registry import estimators
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.loop.analysis import differences_by_flux
+from faintspot.loop.arms import VARIANTS
 from faintspot.loop.results import BudgetResult, MagnitudeResult
-from faintspot.loop.statistics import paired_mean
 from faintspot.loop.telescope import PSF_SAMPLING
-from faintspot.loop.verdict import REFERENCE
 from faintspot.report.drawing import GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe & Ito (2008), greys and a purple; the shape of the marker tells them apart as well.
-_ARM_STYLES = (
-    ("#000000", "o"),
-    ("#D55E00", "s"),
-    ("#0072B2", "D"),
-    ("#009E73", "^"),
-    ("#CC79A7", "v"),
-    ("#E69F00", "P"),
-    ("#56B4E9", "X"),
-    ("#6b3fa0", "h"),
-    ("#767676", "*"),
-    ("#8c564b", "<"),
-    ("#b8a200", ">"),
-    ("#004d40", "p"),
-)
 _STREHL = "H-band Strehl ratio"
 _DODGE = 0.008  # of the axis, between arms at the same magnitude
 _DECADES = 3  # of intensity in images
@@ -56,9 +45,9 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
     for arm, name in enumerate(result.labels):
         runs = [paired_mean(values) for values in result.strehl[arm]]
         value = np.array([run.value for run in runs])
-        error = np.array([standard_error(values) for values in result.strehl[arm]])
+        error = np.nan_to_num([run.standard_error for run in runs])
         place = result.magnitudes + (arm - len(result.labels) / 2) * shift
-        style = _arm_style(result.labels, arm)
+        style = _arm_style(result.names[arm])
         left.errorbar(result.magnitudes, value, error, label=name, capsize=2, **style)
         differences = differences_by_flux(result, arm, reference)
         low, middle, high = np.array([[d.low, d.value, d.high] for d in differences]).T
@@ -78,7 +67,7 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
                 strict=True,
             )
         ]
-    right.axhline(0, color=_ARM_STYLES[0][0], lw=1)
+    right.axhline(0, color=GREY, lw=1)
     left.set(xlabel="guide-star magnitude", ylabel=label)
     left.set_ylim(bottom=0)
     right.set(
@@ -106,7 +95,7 @@ def gain_figure(result: MagnitudeResult) -> FigureWithData:
     rows = []
     for arm, name in enumerate(result.labels):
         value = np.array([paired_mean(values).value for values in result.centroid_gain[arm]])
-        panel.plot(result.photons, value, label=name, **_arm_style(result.labels, arm))
+        panel.plot(result.photons, value, label=name, **_arm_style(result.names[arm]))
         rows += [[name, p, v] for p, v in zip(result.photons, value, strict=True)]
     panel.axhline(1, color=GREY, lw=1)
     panel.set_xscale("log")
@@ -149,8 +138,9 @@ def psf_figure(images: Sequence[NDArray[Any]], names: Sequence[str], where: str)
         profiles.append(_profile(image))
     colour_bar(panels[: len(images)], shown, "intensity (peak of a flat wavefront = 1)", "bottom")
     radius = np.arange(len(profiles[0])) / PSF_SAMPLING
-    for profile, name, (colour, _), dashes in zip(profiles, names, _ARM_STYLES, ("-", "--"), strict=False):
-        panels[-1].semilogy(radius, profile, dashes, color=colour, label=name)
+    styles = BrightestPixels.style, TotalVariation.style
+    for profile, name, style in zip(profiles, names, styles, strict=True):
+        panels[-1].semilogy(radius, profile, style.line, color=style.colour, label=name)
     panels[-1].set(xlabel="distance from the axis (λ/D)", ylabel="mean intensity", title="Profiles")
     panels[-1].legend(frameon=False)
     caption = f"{where}; the same logarithmic scale in both. Strehl ratio: intensity on the axis."
@@ -168,10 +158,11 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
     panel = figure.subplots()
     rows = []
     for arm, name in enumerate(result.labels):
-        value = np.array([paired_mean(runs).value for runs in result.strehl[arm]])
-        error = np.array([standard_error(runs) for runs in result.strehl[arm]])
+        runs = [paired_mean(values) for values in result.strehl[arm]]
+        value = np.array([run.value for run in runs])
+        error = np.nan_to_num([run.standard_error for run in runs])
         place = np.arange(terms) + (arm - (arms - 1) / 2) * 0.8 / arms
-        colour = _arm_style(result.labels, arm)["color"]
+        colour = _arm_style(result.names[arm])["color"]
         panel.barh(place, value, 0.72 / arms, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
         panel.plot([value[0]] * 2, [-0.5, terms - 0.5], color=colour, lw=0.8, ls=":")
         rows += [[name, t, v, e] for t, v, e in zip(result.terms, value, error, strict=True)]
@@ -187,28 +178,23 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
     return FigureWithData("budget", "Error budget", caption, figure, header, rows)
 
 
-def standard_error(values: Floats) -> float:
-    """Return the standard error of a mean; 0 where it is not known. NaN are left out."""
-    known = values[np.isfinite(values)]
-    return float(known.std(ddof=1) / np.sqrt(len(known))) if len(known) > 1 else 0.0
-
-
 def _switched(term: str) -> str:
     return "whole loop" if term == "nothing" else f"without {term}"
 
 
-def _arm_style(labels: Sequence[str], arm: int) -> dict[str, Any]:
-    """Return an arm's style: the first one for brightest pixels, the second for TV, in every figure."""
-    special = [REFERENCE, next((label for label in labels if label.lower().startswith("tv")), "")]
-    others = [label for label in labels if label not in special]
-    number = special.index(labels[arm]) if labels[arm] in special else 2 + others.index(labels[arm])
-    colour, marker = _ARM_STYLES[number % len(_ARM_STYLES)]
+def _arm_style(name: str) -> dict[str, Any]:
+    """Return the style of an arm's estimator; markers are hollow where the loop does more than the usual."""
+    known = estimators()
+    base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in known), "")
+    style = known[base].style if base else Style("#666666")
+    variants = [ending for ending in VARIANTS if ending in name[len(base) :]]
     return {
-        "color": colour,
-        "marker": marker,
-        "ms": 6,
+        "color": style.colour,
+        "marker": style.marker,
+        "ms": 6 + len(variants),
+        "mfc": "white" if variants else style.colour,
         "lw": 1.3,
-        "ls": "-" if number < len(_ARM_STYLES) else "--",
+        "ls": ":" if len(variants) > 1 else style.line,
     }
 
 

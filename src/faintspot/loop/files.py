@@ -1,64 +1,62 @@
-"""Folders and files of results, which are never seen half written."""
+"""Files of results: a dataclass whose fields are written to one NumPy file, and read again."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import save_arrays
 
-FORMAT = 1
 
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A dataclass of arrays, texts, plain numbers and tuples of texts, that can be kept in a file.
 
-def make_folder(folder: str | Path) -> Path:
-    """Make a folder where it is not there, and return its path.
-
-    Raises
-    ------
-    InputError
-        When it cannot be made.
+    A subclass that changes its fields changes its `FORMAT`: files of another one are refused.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(exist_ok=True)
-    except FileNotFoundError:
-        raise InputError(f"{folder}: the folder {folder.parent} does not exist: create it first") from None
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from None
-    return folder
 
+    WHAT: ClassVar[str]
+    """What messages call it."""
+    FORMAT: ClassVar[int] = 1
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is never seen half written.
+    def save(self, path: str | Path) -> None:
+        """Write everything to a compressed NumPy file (.npz), which is never seen half written.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
-    _written(path, lambda file: file.write(content))
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        save_arrays(path, self.arrays())
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what is in the file."""
+        values = {item.name: np.asarray(getattr(self, item.name)) for item in fields(self)}
+        return {"format": np.asarray(self.FORMAT), **values}
 
-def save_arrays(path: Path, values: dict[str, Any]) -> None:
-    """Write arrays to a compressed NumPy file that is never seen half written.
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
-    _written(path, lambda file: np.savez_compressed(file, **values))
+        Raises
+        ------
+        InputError
+            When it cannot be read, or is something else.
+        """
+        values = load_arrays(Path(path), cls.WHAT)
+        found = values.pop("format", None)
+        if found is not None and found.shape == () and 0 < int(found) < cls.FORMAT:
+            raise InputError(
+                f"{path}: {cls.WHAT} of an earlier version of faintspot: measure again, with --overwrite"
+            )
+        if found != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
+            raise InputError(f"{path}: not {cls.WHAT} of format {cls.FORMAT}")
+        return cls(**{name: _restored(value) for name, value in values.items()})
 
 
 def load_arrays(path: Path, what: str) -> dict[str, NDArray[Any]]:
@@ -78,40 +76,22 @@ def load_arrays(path: Path, what: str) -> dict[str, NDArray[Any]]:
         raise InputError(f"{path}: not {what} ({error})".splitlines()[0]) from None
 
 
-def save_fields(result: Any, path: str | Path) -> None:
-    """Write all fields of a dataclass: arrays, texts, plain numbers and tuples of texts.
+def make_folder(folder: str | Path) -> Path:
+    """Make a folder where it is not there, and return its path.
 
     Raises
     ------
     InputError
-        When it cannot be written.
+        When it cannot be made.
     """
-    values = {item.name: np.asarray(getattr(result, item.name)) for item in fields(result)}
-    save_arrays(Path(path), {"format": np.asarray(FORMAT), **values})
-
-
-def load_fields(kind: type[Any], path: str | Path, what: str) -> dict[str, Any]:
-    """Read the fields of a dataclass that `save_fields` wrote; `what` it should be is named in messages.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, or is something else.
-    """
-    values = load_arrays(Path(path), what)
-    if values.pop("format", None) != FORMAT or set(values) != {item.name for item in fields(kind)}:
-        raise InputError(f"{path}: not {what} of format {FORMAT}")
-    return {name: _restored(value) for name, value in values.items()}
-
-
-def _written(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    partial = path.with_name(f".{path.name}.partial")
+    folder = Path(folder)
     try:
-        with partial.open("wb") as file:
-            write(file)
-        partial.replace(path)
+        folder.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        raise InputError(f"{folder}: the folder {folder.parent} does not exist: create it first") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        raise InputError(f"{folder}: cannot be made ({error.strerror or error})") from None
+    return folder
 
 
 def _restored(value: NDArray[Any]) -> Any:

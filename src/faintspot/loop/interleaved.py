@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between, numbers_between
+from faintspot.compare.running import Advance, Unit, Workplace, run_units
+from faintspot.compare.store import Arrays
 from faintspot.errors import InputError
-from faintspot.loop.arms import denoised_settings, kept_pixels, mean_pixel_noise_e
+from faintspot.estimate.noise import suggested_strength
+from faintspot.estimators.base import Estimator
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.files import save_arrays
+from faintspot.loop.arms import LoopArm
 from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.record import Arm, LoopRecord
+from faintspot.loop.files import load_arrays, make_folder
+from faintspot.loop.magnitude import unit_store
+from faintspot.loop.record import LoopRecord
 from faintspot.loop.results import InterleavedResult, set_file
-from faintspot.loop.running import Advance, Unit, UnitStore, Workplace, run_units
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.tuning import FIRST_TUNING_REALISATION
 from faintspot.settings import Settings
 
 KIND = "interleaved"
-Arrays = dict[str, NDArray[Any]]
+_MOST_ITERATIONS = 100  # near infeasible strengths the denoising is far from done after ten
+_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -128,8 +136,8 @@ def run_interleaved(
     """
     place = Workplace() if place is None else place
     plan = plan or (QUICK_PLAN if quick else ObservingPlan())
-    store = UnitStore(folder, KIND, f"{configuration.to_text()}\n{asdict(plan)}", overwrite=overwrite)
-    best = _tuned(configuration, plan, store, place)
+    folder = make_folder(folder)
+    best = _tuned(configuration, plan, folder, place, overwrite=overwrite)
     sets = range(len(plan.strengths))
     units = [
         Unit(
@@ -140,15 +148,15 @@ def run_interleaved(
         for number in sets
     ]
     place.say("observing")
-    records = run_units(_observe, units, _SetStore(store), place)
+    run_units(_observe, units, _SetStore(folder), place)
     result = InterleavedResult(
-        tuple(records[unit.key] for unit in units),
+        tuple(LoopRecord.load(set_file(folder, number + 1)) for number in sets),
         tuple(blocks_of(plan, number) for number in sets),
         tuple(strengths_of(plan, number) for number in sets),
         tuple(_set_name(plan, number) for number in sets),
         plan.settle_in_block,
     )
-    result.save_description(store.folder)
+    result.save_description(folder)
     return result
 
 
@@ -168,23 +176,42 @@ def _set_name(plan: ObservingPlan, number: int) -> str:
     return f"{gain}, {plan.strengths[number]} strengths"
 
 
+def _mean_pixel_noise_e(configuration: LoopConfiguration) -> float:
+    scene = configuration.scene
+    return float(suggested_strength(scene.dark_noise_e, scene.flux_e, scene.pixels))
+
+
 def _with_multiplication(configuration: LoopConfiguration, fraction: float) -> LoopConfiguration:
     return configuration.replace("camera", em_gain=max(1.0, fraction * configuration.camera.em_gain))
 
 
-def _arm(label: str, strength_e: float, kept: int, gain: float) -> Arm:
-    if math.isnan(strength_e):
-        return Arm(label, Settings(denoise=False, keep_brightest=kept), gain)
-    return Arm(label, denoised_settings(strength_e, kept), gain)
+def _arm(label: str, strength_e: float, kept: int, gain: float) -> LoopArm:
+    estimator: Estimator = BrightestPixels(keep_brightest=kept)
+    if not math.isnan(strength_e):
+        estimator = TotalVariation(
+            noise_std=strength_e, keep_brightest=kept, max_iterations=_MOST_ITERATIONS, tolerance=_TOLERANCE
+        )
+    return LoopArm(label, Settings(estimator), gain)
+
+
+def _kept_pixels(configuration: LoopConfiguration, fraction: float) -> int:
+    """Return a number of kept pixels for a fraction of the window's."""
+    pixels = configuration.scene.pixels
+    return max(4, min(pixels - 1, round(fraction * pixels)))
 
 
 def _tuned(
-    configuration: LoopConfiguration, plan: ObservingPlan, store: UnitStore, place: Workplace
+    configuration: LoopConfiguration,
+    plan: ObservingPlan,
+    folder: Path,
+    place: Workplace,
+    *,
+    overwrite: bool,
 ) -> dict[float, tuple[float, float]]:
     """Return kept pixels (as a fraction) and loop gain for each multiplication gain."""
     trials = {
         (fraction, kept, gain): Unit(
-            f"tune-{fraction:g}-{kept:g}-{gain:g}",
+            f"{fraction:g}-{kept:g}-{gain:g}",
             (configuration, plan, fraction, kept, gain),
             2 * plan.tuning_frames,
         )
@@ -192,8 +219,13 @@ def _tuned(
         for kept in plan.kept
         for gain in plan.gains
     }
+    units = list(trials.values())
+    store = unit_store(folder, f"{KIND}-tuning", (configuration, plan), units, overwrite=overwrite)
+    if store.is_empty:  # of another experiment
+        for old in folder.glob("set-*.npz"):
+            old.unlink(missing_ok=True)
     place.say("tuning")
-    tried = run_units(_trial, list(trials.values()), store, place)
+    tried = run_units(_trial, units, store, place)
     best: dict[float, tuple[float, float]] = {}
     highest: dict[float, float] = {}
     for (fraction, kept, gain), unit in trials.items():
@@ -215,12 +247,12 @@ def _trial(
     short = _with_multiplication(configuration, fraction).replace(
         "run", frames=plan.tuning_frames, settle_frames=plan.settle_in_block
     )
-    pixels = kept_pixels(configuration, kept)
+    pixels = _kept_pixels(configuration, kept)
     strehl = [
         simulate_loop(
             short, [_arm("tuning", strength, pixels, gain)], realisation=FIRST_TUNING_REALISATION
         ).mean_strehl()
-        for strength in (np.nan, mean_pixel_noise_e(short))
+        for strength in (np.nan, _mean_pixel_noise_e(short))
     ]
     advance(2 * plan.tuning_frames)
     return {"strehl": np.asarray(np.mean(strehl))}
@@ -233,10 +265,10 @@ def _observe(
     kept: float,
     gain: float,
     advance: Advance,
-) -> LoopRecord:
+) -> Arrays:
     """Observe one set; its number is that of the air's realisation."""
     strengths = strengths_of(plan, number)
-    pixels = kept_pixels(configuration, kept)
+    pixels = _kept_pixels(configuration, kept)
     arms = [
         _arm("no TV" if math.isnan(strength) else f"TV {strength:.3g} e-", float(strength), pixels, gain)
         for strength in strengths
@@ -245,25 +277,23 @@ def _observe(
     whole = _with_multiplication(configuration, plan.em_fractions[number]).replace(
         "run", frames=len(schedule), settle_frames=plan.settle_in_block
     )
-    return simulate_loop(
+    record = simulate_loop(
         whole, arms, schedule, realisation=number, progress=lambda done, total: advance(done)
     )
+    return record.arrays()
 
 
 class _SetStore:
     """The sets of an experiment, each in a file of its own."""
 
-    def __init__(self, units: UnitStore) -> None:
-        self._folder = units.folder
-        if units.fresh:
-            for old in self._folder.glob("set-*.npz"):
-                old.unlink(missing_ok=True)
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
 
     def done(self, key: str) -> bool:
         return set_file(self._folder, int(key)).exists()
 
-    def read(self, key: str) -> LoopRecord:
-        return LoopRecord.load(set_file(self._folder, int(key)))
+    def read(self, key: str) -> Arrays:
+        return load_arrays(set_file(self._folder, int(key)), LoopRecord.WHAT)
 
-    def write(self, key: str, result: LoopRecord) -> None:
-        result.save(set_file(self._folder, int(key)))
+    def write(self, key: str, result: Arrays) -> None:
+        save_arrays(set_file(self._folder, int(key)), result)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.compare.statistics import paired_mean
 from faintspot.loop.analysis import (
     BEST_STRENGTHS,
     NO_TV,
@@ -18,7 +19,7 @@ from faintspot.loop.analysis import (
     paired_differences,
     regression_lines,
 )
-from faintspot.loop.figures import standard_error, strehl_axis
+from faintspot.loop.figures import strehl_axis
 from faintspot.report.drawing import GREY, LIGHT_GREY, WIDTH, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
 
@@ -191,7 +192,7 @@ def _draw_regression(panel: Axes, table: Measurements) -> None:
 def _draw_means(panel: Axes, table: Measurements) -> None:
     without = table.strehl[table.group(NO_TV)]
     if len(without):
-        error = standard_error(without)
+        error = np.nan_to_num(paired_mean(without).standard_error)
         panel.axhspan(
             without.mean() - error, without.mean() + error, color=_GROUP_STYLES[NO_TV][0], alpha=0.2, lw=0
         )

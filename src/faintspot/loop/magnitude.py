@@ -11,11 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import numbers_between
+from faintspot.compare.running import Advance, Unit, Workplace, run_units
+from faintspot.compare.store import Arrays, ZarrStore, fingerprint_of, refuse_former_folder
 from faintspot.errors import InputError
-from faintspot.loop.arms import arm_label, arm_named, default_arms
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.estimators.trained import Trained
+from faintspot.loop.arms import LOOP_GAIN, ArmKind, Choice, arm_kind, default_arms
 from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.files import make_folder
 from faintspot.loop.results import MAGNITUDE_FILE, MagnitudeResult
-from faintspot.loop.running import Advance, Unit, UnitStore, Workplace, run_units
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.tuning import (
     QUICK,
@@ -26,11 +32,9 @@ from faintspot.loop.tuning import (
 )
 
 KIND = "magnitude"
-QUICK_ARMS = ("brightest", "smoothed", "tv", "trained")
+QUICK_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Trained))
 _QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
 _QUICK_FLUXES = 3
-
-Results = Mapping[str, dict[str, NDArray[Any]]]
 
 
 def run_magnitude(
@@ -55,7 +59,7 @@ def run_magnitude(
     folder : path
         Where finished units are remembered; made where it is not there.
     arms : sequence of str, optional
-        Of `faintspot.loop.arms.ARM_NAMES`. Default: `default_arms`; with `quick`, four.
+        See `faintspot.loop.arms.arm_kind`. Default: `default_arms`; with `quick`, four.
     photons : sequence of float, optional
         Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
     quick : bool
@@ -77,59 +81,92 @@ def run_magnitude(
     place = Workplace() if place is None else place
     configuration = quick_run(configuration) if quick else configuration
     search = search or (QUICK if quick else Search())
-    names = _checked_arms(arms if arms is not None else _default(configuration, quick))
+    kinds = checked_arms(arms if arms is not None else _default(configuration, quick))
     fluxes = _checked_fluxes(
         photons if photons is not None else configuration.run.photons_per_subaperture, quick
     )
-    store = UnitStore(folder, KIND, f"{configuration.to_text()}\n{asdict(search)}", overwrite=overwrite)
-    choices = tuned_choices(configuration, names, fluxes, search, store, place)
+    folder = make_folder(folder)
+    choices = tuned_choices(configuration, kinds, fluxes, search, folder, KIND, place, overwrite=overwrite)
     units = [
         Unit(
-            f"score-{name}-{flux:g}-{realisation}",
-            (name, with_flux(configuration, flux), choice, realisation),
+            _key(kind, flux, realisation),
+            (kind, with_flux(configuration, flux), choices[kind.name, flux], realisation),
             configuration.run.frames,
         )
-        for (name, flux), choice in choices.items()
+        for kind in kinds
+        for flux in fluxes
         for realisation in range(configuration.run.realisations)
     ]
+    store = unit_store(folder, KIND, (configuration, search), units, overwrite=overwrite)
     place.say("scoring")
-    result = _gathered(configuration, names, fluxes, choices, run_units(scored_run, units, store, place))
-    result.save(store.folder / MAGNITUDE_FILE)
+    result = _gathered(configuration, kinds, fluxes, choices, run_units(scored_run, units, store, place))
+    result.save(folder / MAGNITUDE_FILE)
     return result
 
 
 def tuned_choices(
     configuration: LoopConfiguration,
-    names: Sequence[str],
+    kinds: Sequence[ArmKind],
     fluxes: Sequence[float],
     search: Search,
-    store: UnitStore,
+    folder: Path,
+    experiment: str,
     place: Workplace,
-) -> dict[tuple[str, float], dict[str, float]]:
+    *,
+    overwrite: bool,
+) -> dict[tuple[str, float], dict[str, Any]]:
     """Return the tuned values of every arm at every flux, tuned now where they are not stored."""
-    units = {
-        (name, flux): Unit(
-            f"tune-{name}-{flux:g}",
-            (name, with_flux(configuration, flux), search),
-            tuning_frames(name, search),
-        )
-        for name in names
-        for flux in fluxes
-    }
+    units = {}
+    for kind in kinds:
+        for flux in fluxes:
+            star = with_flux(configuration, flux)
+            frames = tuning_frames(kind, star, search)
+            units[kind.name, flux] = Unit(f"{kind.name}-{flux:g}", (kind, star, search), frames)
+    every = list(units.values())
+    store = unit_store(folder, f"{experiment}-tuning", (configuration, search), every, overwrite=overwrite)
     place.say("tuning")
-    results = run_units(tuning_unit, list(units.values()), store, place)
+    results = run_units(tuning_unit, every, store, place)
     return {key: stored_choice(results[unit.key]) for key, unit in units.items()}
 
 
-def scored_run(
+def unit_store(
+    folder: Path,
     name: str,
+    experiment: tuple[LoopConfiguration, Any],
+    units: Sequence[Unit],
+    *,
+    overwrite: bool,
+) -> ZarrStore:
+    """Return where units of an experiment, a configuration and a plan, are kept in its folder.
+
+    Raises
+    ------
+    InputError
+        When the folder holds those of another experiment, or it cannot be written.
+    """
+    refuse_former_folder(folder)
+    configuration, plan = experiment
+    identity = fingerprint_of(configuration.to_text(), str(asdict(plan)))
+    keys = [unit.key for unit in units]
+    return ZarrStore(
+        make_folder(folder / "units") / f"{name}.zarr",
+        f"loop {name}",
+        identity,
+        keys,
+        attributes={"name": configuration.name},
+        overwrite=overwrite,
+    )
+
+
+def scored_run(
+    kind: ArmKind,
     configuration: LoopConfiguration,
-    choice: Mapping[str, float],
+    choice: Choice,
     realisation: int,
     advance: Advance,
 ) -> dict[str, NDArray[Any]]:
     """Return what one run of a tuned arm gives, as arrays that can be stored."""
-    arm = arm_named(name, configuration, choice)
+    arm = kind.arm(configuration, choice)
     record = simulate_loop(
         configuration, [arm], realisation=realisation, progress=lambda done, total: advance(done)
     )
@@ -152,18 +189,22 @@ def quick_run(configuration: LoopConfiguration) -> LoopConfiguration:
     return configuration.replace("run", **run)
 
 
-def _default(configuration: LoopConfiguration, quick: bool) -> tuple[str, ...]:
-    names = default_arms(configuration)
-    return tuple(name for name in names if name in QUICK_ARMS) if quick else names
+def checked_arms(names: Sequence[str]) -> list[ArmKind]:
+    """Return arms by their names, each once.
 
-
-def _checked_arms(arms: Sequence[str]) -> list[str]:
-    names = list(dict.fromkeys(arms))
+    Raises
+    ------
+    InputError
+        For an unknown one, or none.
+    """
     if not names:
         raise InputError("arms: expected at least one, got none")
-    for name in names:
-        arm_label(name)  # refuses unknown ones
-    return names
+    return list({kind.name: kind for kind in map(arm_kind, names)}.values())
+
+
+def _default(configuration: LoopConfiguration, quick: bool) -> list[str]:
+    names = default_arms(configuration)
+    return [name for name in names if name in QUICK_ARMS] if quick else names
 
 
 def _checked_fluxes(photons: Sequence[float], quick: bool) -> list[float]:
@@ -176,32 +217,36 @@ def _checked_fluxes(photons: Sequence[float], quick: bool) -> list[float]:
     return fluxes
 
 
+def _key(kind: ArmKind, flux: float, realisation: int) -> str:
+    return f"{kind.name}-{flux:g}-{realisation}"
+
+
 def _gathered(
     configuration: LoopConfiguration,
-    names: Sequence[str],
+    kinds: Sequence[ArmKind],
     fluxes: Sequence[float],
-    choices: Mapping[tuple[str, float], Mapping[str, float]],
-    results: Results,
+    choices: Mapping[tuple[str, float], Choice],
+    results: Mapping[str, Arrays],
 ) -> MagnitudeResult:
     runs = range(configuration.run.realisations)
 
-    def of(variable: str, average: bool = False) -> NDArray[Any]:
-        whole = np.array(
+    def of(variable: str) -> NDArray[Any]:
+        return np.array(
             [
-                [[results[f"score-{name}-{flux:g}-{run}"][variable] for run in runs] for flux in fluxes]
-                for name in names
+                [[results[_key(kind, flux, run)][variable] for run in runs] for flux in fluxes]
+                for kind in kinds
             ]
         )
-        return whole.mean(axis=2) if average else whole
 
     return MagnitudeResult(
-        tuple(arm_label(name) for name in names),
+        tuple(kind.name for kind in kinds),
+        tuple(kind.label for kind in kinds),
         np.array(fluxes),
         configuration.photometry.magnitude(fluxes),
         of("strehl"),
         of("centroid_gain"),
         of("settings")[:, :, 0],
-        np.array([[choices[name, flux]["gain"] for flux in fluxes] for name in names]),
-        of("psf", average=True),
+        np.array([[choices[kind.name, flux][LOOP_GAIN] for flux in fluxes] for kind in kinds]),
+        of("psf").mean(axis=2),
         configuration.to_text(),
     )

@@ -54,25 +54,33 @@ class BestFit:
     """The best that a mirror can do to a wavefront that is known: the fitting error is what it leaves."""
 
     basis: NDArray[np.float32]
-    """Orthonormal wavefronts of the mirror and piston, weighted by the pupil, (points^2, n)."""
+    """Orthonormal wavefronts of the mirror (and piston), weighted by the pupil, (points^2, n)."""
     weight: NDArray[np.float32]
     """Square root of the pupil's amplitude, (points^2,)."""
 
     @classmethod
-    def of(cls, mirror: DeformableMirror, pupil: Pupil) -> BestFit:
-        """Make the fit of a mirror in a pupil; it needs its full matrix, (points^2, commands)."""
+    def of(cls, mirror: DeformableMirror, pupil: Pupil, *, piston: bool = True) -> BestFit:
+        """Make the fit of a mirror, and of piston; it needs the full matrix, (points^2, commands)."""
         weight = np.sqrt(pupil.amplitude.ravel())
-        columns = np.hstack([mirror.matrix(), np.ones((len(weight), 1), np.float32)]) * weight[:, None]
-        left, size, _ = np.linalg.svd(columns.astype(np.float64), full_matrices=False)
-        return cls(left[:, size > 1e-6 * size[0]].astype(np.float32), weight)
+        flat = np.ones((len(weight), int(piston)), np.float32)
+        columns = np.hstack([mirror.matrix(), flat]) * weight[:, None]
+        left, size, _ = np.linalg.svd(columns, full_matrices=False)
+        return cls(left[:, : np.count_nonzero(size > 1e-6 * size[0])], weight)
+
+    def fitted(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return what the mirror can make of a wavefront (points, points); 0 outside the pupil."""
+        inside = self.weight > 0
+        inverse = np.where(inside, 1 / np.where(inside, self.weight, 1), 0)
+        seen = self.basis.T @ (self.weight * wavefront.ravel())
+        fitted: NDArray[np.float32] = (inverse * (self.basis @ seen)).reshape(wavefront.shape)
+        return fitted.astype(np.float32)
 
     def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return a wavefront (points, points) without what the mirror can take off; 0 outside the pupil."""
-        seen = wavefront.ravel() * self.weight
-        left = seen - self.basis @ (self.basis.T @ seen)
-        inside = self.weight > 0
-        residual = np.where(inside, left / np.where(inside, self.weight, 1), 0)
-        return residual.reshape(wavefront.shape).astype(np.float32)
+        left: NDArray[np.float32] = np.where(
+            self.weight.reshape(wavefront.shape) > 0, wavefront - self.fitted(wavefront), 0
+        )
+        return left.astype(np.float32)
 
 
 def make_mirror(configuration: LoopConfiguration, pupil: Pupil) -> DeformableMirror:

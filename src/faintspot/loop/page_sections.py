@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from faintspot.compare.statistics import paired_mean
 from faintspot.errors import InputError
 from faintspot.loop.analysis import (
     NO_TV,
     Measurements,
     measurements,
 )
-from faintspot.loop.budget import TERM_MEANINGS
+from faintspot.loop.budget import TERMS
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.figures import (
     budget_figure,
@@ -30,15 +31,14 @@ from faintspot.loop.page_tables import (
     strehl_groups_table,
 )
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
-from faintspot.loop.statistics import paired_mean
 from faintspot.loop.verdict import (
     LoopResults,
-    in_words,
     loop_verdict,
     options_that_may_pay,
     reference_arm,
     tv_arm,
 )
+from faintspot.loop.wording import in_words, with_error
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Section, Table
 
@@ -177,7 +177,11 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
     ]
     pairs = [(arm, without) for _, arm, without in options_that_may_pay(result)]
     if pairs:
-        tables.append(difference_table(result, pairs, "Whether the loop’s own prediction and weights pay."))
+        tables.append(
+            difference_table(
+                result, pairs, "Whether the loop’s own prediction, weights and the gain’s correction pay."
+            )
+        )
     realisations = result.strehl.shape[-1]
     text = [
         f"{len(result.labels)} arms, {len(result.photons)} fluxes, {realisations} realisations of the "
@@ -240,16 +244,18 @@ def _budget(result: BudgetResult, results: LoopResults) -> Section:
     rows = []
     for arm, name in enumerate(result.labels):
         for number, term in enumerate(result.terms):
-            strehl = paired_mean(result.strehl[arm, number])
+            strehl, residual = (
+                paired_mean(values[arm, number]) for values in (result.strehl, result.residual_nm)
+            )
             change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
-            residual = np.sqrt(paired_mean(np.square(result.residual_nm[arm, number])).value)
             off = "–" if number == 0 else term
-            rows.append([name, off, f"{strehl.value:.3f}", f"{residual:.0f}", in_words(change)])
+            rows.append([name, off, with_error(strehl), with_error(residual, 0), in_words(change)])
     table = Table(
         ["arm", "switched off", "Strehl", "residual wavefront (nm rms)", "change in Strehl"],
         rows,
-        "Change: against the whole loop, over the same realisations, with its 95 % interval. "
-        + "; ".join(f"{term}: {TERM_MEANINGS[term]}" for term in result.terms[1:] if term in TERM_MEANINGS)
+        "Means and their standard errors. Change: against the whole loop, over the same realisations, with "
+        "its 95 % interval. "
+        + "; ".join(f"{term}: {TERMS[term].meaning}" for term in result.terms[1:] if term in TERMS)
         + ".",
     )
     text = _budget_lines(result)
@@ -263,7 +269,7 @@ def _budget_lines(result: BudgetResult) -> list[str]:
     for arm, name in enumerate(result.labels):
         gains = [paired_mean(runs) for runs in changes[arm]]
         order = sorted(range(1, len(gains)), key=lambda number: -np.nan_to_num(gains[number].value))
-        parts = [f"{result.terms[n]} {in_words(gains[n])}" for n in order[:3] if gains[n].value > 0]
+        parts = [f"{result.terms[n]} {in_words(gains[n])}" for n in order[:3] if gains[n].decided > 0]
         if parts:
             lines.append(f"{name}: most Strehl is gained without {', then '.join(parts)}.")
         if _SLOPE_ERROR in result.terms:

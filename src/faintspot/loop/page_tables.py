@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from faintspot.compare.statistics import paired_mean
 from faintspot.loop.analysis import (
     NO_TV,
     Measurements,
@@ -17,10 +18,8 @@ from faintspot.loop.analysis import (
     strehl_table,
 )
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
-from faintspot.loop.statistics import paired_mean
-from faintspot.loop.verdict import gain_in_words, in_words
+from faintspot.loop.wording import gain_in_words, in_words, with_error
 from faintspot.report.page import Table
-from faintspot.settings import Settings
 
 
 def strehl_groups_table(result: InterleavedResult, table: Measurements) -> Table:
@@ -154,12 +153,11 @@ def centroid_gain_table(result: MagnitudeResult) -> Table:
     return Table(
         ["arm", *(f"{photons:.3g}" for photons in result.photons)],
         [
-            [label, *(f"{paired_mean(values).value:.2f}" for values in result.centroid_gain[arm])]
+            [label, *(with_error(paired_mean(values), 2) for values in result.centroid_gain[arm])]
             for arm, label in enumerate(result.labels)
         ],
-        "At each number of photo-electrons. Slopes are divided by it, except in arms that start from the "
-        "loop’s "
-        "own prediction.",
+        "At each number of photo-electrons, with its standard error. Slopes are divided by it, except in "
+        "arms that start from the loop’s own prediction.",
     )
 
 
@@ -184,8 +182,9 @@ def _settings_words(gain: float, text: str) -> str:
     if not text:
         return "not tuned yet"
     parts = [f"gain {gain:.2g}"] if np.isfinite(gain) else []
-    chosen = Settings.from_tables("settings", tomllib.loads(text)).chosen()
-    return ", ".join(parts + [_value_words(name, value) for name, value in chosen.items()])
+    for options in tomllib.loads(text).values():
+        parts += [_value_words(name, value) for name, value in options.items() if name != "name"]
+    return ", ".join(parts)
 
 
 def _value_words(name: str, value: object) -> str:

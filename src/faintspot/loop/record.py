@@ -3,73 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
 from faintspot.errors import InputError
-from faintspot.loop.files import load_fields, save_fields
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.settings import Settings
+from faintspot.loop.files import Stored
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
-    """One way to measure slopes and to use them, of those that are compared.
-
-    Parameters
-    ----------
-    label : str
-    settings : Settings
-    gain : float, optional
-        Loop gain, 0 to 2. Default: the configuration's.
-    window_pixels : int, optional
-        Side of the middle part of each sub-aperture's window that is used. Default: all.
-    weighted_reconstructor : bool
-        Whether slopes count by their standard errors.
-    predict_prior : bool
-        Whether the loop's own prediction of the slopes is the prior of "map" and where "trained" begins.
-    correct_gain : bool
-        Whether slopes are divided by the centroid gain measured at the run's flux.
-    true_slopes : bool
-        Whether slopes are the wavefront's true mean gradients instead of measured ones, for error budgets.
-    psf, score : PSF, TrainedScore, optional
-        For the estimators that need them. Default PSF: that of a flat wavefront.
-
-    Raises
-    ------
-    InputError
-        For an empty label, a gain or window out of range.
-    """
-
-    label: str
-    settings: Settings
-    gain: float | None = None
-    window_pixels: int | None = None
-    weighted_reconstructor: bool = False
-    predict_prior: bool = False
-    correct_gain: bool = True
-    true_slopes: bool = False
-    psf: PSF | None = None
-    score: TrainedScore | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.label, str) or not self.label:
-            raise InputError(f"arm.label: expected a text, got {self.label!r}")
-        if not isinstance(self.settings, Settings):
-            raise InputError(f"arm.settings: expected Settings, got {type(self.settings).__name__}")
-        if self.gain is not None:
-            number_between("arm.gain", self.gain, 0, 2)
-        if self.window_pixels is not None:
-            number_between("arm.window_pixels", self.window_pixels, 4, 64, integer=True)
-
-
-@dataclass(frozen=True, eq=False)
-class LoopRecord:
+class LoopRecord(Stored):
     """One run of the loop, n sub-apertures and m commands."""
+
+    WHAT: ClassVar[str] = "a record of a loop"
 
     slopes_px: NDArray[np.float32]
     """(frames, 2 n): all x, then all y, from the reference; not divided by the centroid gain."""
@@ -141,24 +88,3 @@ class LoopRecord:
         if not chosen.any():
             raise InputError(f"arm = {arm}: no frame after the {self.settle_frames} settling ones")
         return float(self.strehl[chosen].mean())
-
-    def save(self, path: str | Path) -> None:
-        """Write the record to a compressed NumPy file (.npz).
-
-        Raises
-        ------
-        InputError
-            When it cannot be written.
-        """
-        save_fields(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> LoopRecord:
-        """Read a record that `save` wrote.
-
-        Raises
-        ------
-        InputError
-            When it cannot be read, or is something else.
-        """
-        return cls(**load_fields(cls, path, "a record of a loop"))

@@ -6,19 +6,21 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.loop.files import FORMAT, load_fields, make_folder, save_fields, write_atomically
+from faintspot.files import write_atomically
+from faintspot.loop.files import Stored, make_folder
 from faintspot.loop.record import LoopRecord
 from faintspot.loop.stored_results import BUDGET_FILE as BUDGET_FILE
 from faintspot.loop.stored_results import INTERLEAVED_FILE as INTERLEAVED_FILE
 from faintspot.loop.stored_results import MAGNITUDE_FILE as MAGNITUDE_FILE
 
 Floats = NDArray[np.float64]
+_FORMAT = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +65,8 @@ class InterleavedResult:
             }
             for name, strengths, block in zip(self.set_names, self.strengths, self.block, strict=True)
         ]
-        document = {"format": FORMAT, "settle_in_block": self.settle_in_block, "sets": sets}
-        write_atomically(folder / INTERLEAVED_FILE, (json.dumps(document, indent=1) + "\n").encode())
+        document = {"format": _FORMAT, "settle_in_block": self.settle_in_block, "sets": sets}
+        write_atomically(folder / INTERLEAVED_FILE, json.dumps(document, indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: str | Path) -> InterleavedResult:
@@ -80,7 +82,7 @@ class InterleavedResult:
         try:
             document: Any = json.loads(path.read_text(encoding="utf-8"))
             sets = document["sets"]
-            if document["format"] != FORMAT:
+            if document["format"] != _FORMAT:
                 raise ValueError(f"format {document['format']}")
             strengths = [
                 np.array([math.nan if value is None else value for value in each["strengths_e"]], np.float64)
@@ -98,9 +100,14 @@ class InterleavedResult:
 
 
 @dataclass(frozen=True, eq=False)
-class MagnitudeResult:
+class MagnitudeResult(Stored):
     """Strehl ratio against the star's light: A arms, F fluxes, R realisations of the air."""
 
+    WHAT: ClassVar[str] = "a magnitude experiment"
+    FORMAT: ClassVar[int] = 2
+
+    names: tuple[str, ...]
+    """(A,): of the arms, see `faintspot.loop.arms.arm_kind`."""
     labels: tuple[str, ...]
     """(A,)"""
     photons: Floats
@@ -120,32 +127,16 @@ class MagnitudeResult:
     configuration: str
     """TOML text."""
 
-    def save(self, path: str | Path) -> None:
-        """Write the result to a compressed NumPy file (.npz).
-
-        Raises
-        ------
-        InputError
-            When it cannot be written.
-        """
-        save_fields(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> MagnitudeResult:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        InputError
-            When it cannot be read, or is something else.
-        """
-        return cls(**load_fields(cls, path, "a magnitude experiment"))
-
 
 @dataclass(frozen=True, eq=False)
-class BudgetResult:
+class BudgetResult(Stored):
     """Error budget: A arms with T terms switched off, R realisations of the air."""
 
+    WHAT: ClassVar[str] = "an error budget"
+    FORMAT: ClassVar[int] = 2
+
+    names: tuple[str, ...]
+    """(A,): of the arms, see `faintspot.loop.arms.arm_kind`."""
     terms: tuple[str, ...]
     """(T,): what is switched off; the first is nothing."""
     labels: tuple[str, ...]
@@ -154,27 +145,6 @@ class BudgetResult:
     """(A, T, R): long exposure; NaN where not measured yet."""
     residual_nm: Floats
     """(A, T, R): rms of the wavefront after the mirror, root of the mean square over the frames."""
-
-    def save(self, path: str | Path) -> None:
-        """Write the result to a compressed NumPy file (.npz).
-
-        Raises
-        ------
-        InputError
-            When it cannot be written.
-        """
-        save_fields(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> BudgetResult:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        InputError
-            When it cannot be read, or is something else.
-        """
-        return cls(**load_fields(cls, path, "an error budget"))
 
 
 def set_file(folder: Path, number: int) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,18 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot import configuration as configuration_file
 from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
+from faintspot.loop.arms import LoopArm
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.calibration import (
-    centroid_gain,
-    interaction_matrix,
-    make_detector,
-    make_pipeline,
-    typical_spots,
-)
+from faintspot.loop.calibration import centroid_gain, interaction_matrix, make_pipeline, typical_spots
+from faintspot.loop.camera import Exposing, NoiselessDetector, make_detector
 from faintspot.loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
 from faintspot.loop.control import Integrator, Reconstructor, check_controllable, make_reconstructor
-from faintspot.loop.mirror import DeformableMirror, make_mirror
-from faintspot.loop.record import Arm, LoopRecord
+from faintspot.loop.mirror import BestFit, DeformableMirror, make_mirror
+from faintspot.loop.record import LoopRecord
 from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pupil
 from faintspot.loop.wavefront_sensor import ShackHartmann, make_sensor
 from faintspot.pipeline import SlopePipeline
@@ -45,14 +42,53 @@ class LoopOptics:
     science: ScienceCamera
 
 
+@dataclass(frozen=True)
+class Idealised:
+    """What a run leaves out of what spoils the Strehl ratio, for error budgets; by default nothing."""
+
+    noiseless: bool = False
+    """Every pixel holds its mean light."""
+    true_slopes: bool = False
+    """Slopes are the wavefront's mean gradients, of every arm."""
+    correctable: bool = False
+    """The air is only what the mirror can make."""
+    faster: float = 1.0
+    """How many times as often frames are taken, as much light in each, in stretches over the same time."""
+    exact_gain: bool = False
+    """Slopes are divided by the centroid gain that they had in a first run, of one arm."""
+
+    stretch_frames: ClassVar[int] = 100
+    """Of a faster loop, which sees as much of the air, but not all of it."""
+    stretch_settle_frames: ClassVar[int] = 40
+
+    def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
+        """Return the configuration with its frame rate, and the light in a frame as it was."""
+        if self.faster == 1.0:
+            return configuration
+        rate = configuration.control.frame_rate_hz * self.faster
+        camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
+        return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
+
+    def time_s(self, frame: int, frame_rate_hz: float) -> float:
+        """Return the middle of a frame."""
+        first = 0 if self.faster == 1.0 else frame - frame % self.stretch_frames
+        return first * self.faster / frame_rate_hz + (frame - first + 0.5) / frame_rate_hz
+
+    def settled(self, frames: int) -> NDArray[np.bool_]:
+        """Return which frames do not come right after a gap, (frames,)."""
+        place = np.arange(frames) % self.stretch_frames
+        return (place >= self.stretch_settle_frames) | (self.faster == 1.0)
+
+
 def simulate_loop(
     configuration: LoopConfiguration,
-    arms: Sequence[Arm],
+    arms: Sequence[LoopArm],
     schedule: ArrayLike | None = None,
     *,
     seed: int | None = None,
     realisation: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    idealised: Idealised | None = None,
 ) -> LoopRecord:
     """Run the loop once.
 
@@ -63,7 +99,7 @@ def simulate_loop(
     Parameters
     ----------
     configuration : LoopConfiguration
-    arms : sequence of Arm
+    arms : sequence of LoopArm
     schedule : (frames,) array of int, optional
         Which arm measures each frame. Default: the configuration's number of frames with the first arm.
     seed : int, optional
@@ -72,6 +108,8 @@ def simulate_loop(
         Other realisations have other air and other noise.
     progress : callable, optional
         Called with the number of frames done and that of all, after every frame.
+    idealised : Idealised, optional
+        What is left out of what spoils the Strehl ratio.
 
     Returns
     -------
@@ -86,14 +124,12 @@ def simulate_loop(
     """
     which = _checked_schedule(configuration, arms, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
-    loop = _Loop(
-        configuration, arms, which, start, int(number_between("realisation", realisation, 0, integer=True))
-    )
-    for frame in range(len(which)):
-        loop.step(frame)
-        if progress is not None:
-            progress(frame + 1, len(which))
-    return loop.record()
+    number = int(number_between("realisation", realisation, 0, integer=True))
+    switches = Idealised() if idealised is None else idealised
+    gains = None
+    if switches.exact_gain:
+        gains = _Loop(configuration, arms, which, start, number, switches).run(None).gains_in_run()
+    return _Loop(configuration, arms, which, start, number, switches, gains).run(progress).record()
 
 
 def prepare(configuration: LoopConfiguration) -> LoopOptics:
@@ -119,9 +155,10 @@ def measure_gains(
     *,
     seed: int,
     realisation: int = 0,
+    detector: Exposing | None = None,
 ) -> NDArray[np.float64]:
     """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
-    optics, detector = prepare(configuration), make_detector(configuration)
+    optics, detector = prepare(configuration), detector or make_detector(configuration)
     spots = _typical_spots(_without_light(configuration), seed, realisation)
     return np.array(
         [
@@ -137,19 +174,26 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        arms: Sequence[Arm],
+        arms: Sequence[LoopArm],
         which: NDArray[np.int64],
         seed: int,
         realisation: int,
+        idealised: Idealised,
+        gains: NDArray[np.float64] | None = None,
     ) -> None:
-        self.configuration, self.arms, self.which = configuration, tuple(arms), which
+        self.configuration = configuration = idealised.configuration(configuration)
+        self.arms, self.which, self.idealised = tuple(arms), which, idealised
         self.seed, self.realisation = seed, realisation
         self.optics = optics = prepare(configuration)
         self.air = _air(_without_light(configuration), seed, realisation)
-        self.detector = make_detector(configuration)
+        self.best_fit = (
+            BestFit.of(optics.mirror, optics.pupil, piston=False) if idealised.correctable else None
+        )
+        camera = make_detector(configuration)
+        self.detector: Exposing = NoiselessDetector(camera) if idealised.noiseless else camera
         self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
-        gains = measure_gains(configuration, self.pipelines, seed=seed, realisation=realisation)
-        self.gains = np.where([arm.true_slopes for arm in arms], 1.0, gains)
+        self.true_slopes = [arm.true_slopes or idealised.true_slopes for arm in arms]
+        self.gains, self.divisors = self._gains_and_divisors(gains)
         self.controller = Integrator(configuration.control, optics.mirror.commands)
         frames, n = len(which), len(optics.sensor.layout)
         self.slopes = np.zeros((frames, 2 * n), np.float32)
@@ -157,22 +201,49 @@ class _Loop:
         self.errors = np.zeros((frames, 2 * n), np.float32)
         self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
         self.truth = np.zeros((3, frames))
+        self.regression = np.zeros((2, len(arms)))
         pixels = len(optics.science.transform)
         self.images = np.zeros((len(arms), pixels, pixels))
+
+    def _gains_and_divisors(
+        self, known: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return every arm's centroid gain, and what its slopes are divided by."""
+        if known is not None:
+            return known, known
+        gains = measure_gains(
+            self.configuration,
+            self.pipelines,
+            seed=self.seed,
+            realisation=self.realisation,
+            detector=self.detector,
+        )
+        gains = np.where(self.true_slopes, 1.0, gains)
+        return gains, np.where([arm.correct_gain for arm in self.arms], gains, 1.0)
+
+    def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
+        """Simulate all frames."""
+        frames = len(self.which)
+        for frame in range(frames):
+            self.step(frame)
+            if progress is not None:
+                progress(frame + 1, frames)
+        return self
 
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         control, number = self.configuration.control, int(self.which[frame])
-        commands = self.controller.acting
-        time = (frame + 0.5) / control.frame_rate_hz
+        arm, commands = self.arms[number], self.controller.acting
+        time = self.idealised.time_s(frame, control.frame_rate_hz)
         air = self.air.wavefront_nm(time)
+        if self.best_fit is not None:
+            air = self.best_fit.fitted(air)
         after = air + self.optics.mirror.wavefront_nm(commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, after if control.mode == CLOSED else air)
-        arm, divisor = self.arms[number], self.gains[number] if self.arms[number].correct_gain else 1.0
-        measured = slopes.vector.astype(np.float64) / divisor
+        measured = slopes.vector.astype(np.float64) / self.divisors[number]
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
-        if arm.weighted_reconstructor:
+        if arm.weighted_reconstructor and not self.true_slopes[number]:
             wavefront = self.optics.reconstructor.weighted(measured, error.astype(np.float64))
         else:
             wavefront = self.optics.reconstructor(measured)
@@ -191,14 +262,22 @@ class _Loop:
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the frame that the sensor's camera takes."""
         number, sensor = int(self.which[frame]), self.optics.sensor
-        if self.arms[number].true_slopes:
+        if self.true_slopes[number]:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
         light = sensor.frame(sensor.spots(wavefront)) * self.configuration.photons
         rng = np.random.default_rng([self.seed, self.realisation, frame, 2])
         prior = None
         if self.arms[number].predict_prior:
             prior = self.optics.interaction @ self.controller.expected()
-        return self.pipelines[number](self.detector.expose(light, rng), prior)
+        slopes = self.pipelines[number](self.detector.expose(light, rng), prior)
+        if self.idealised.exact_gain and frame >= self.configuration.run.settle_frames:
+            true = sensor.mean_slopes_px(wavefront)
+            self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
+        return slopes
+
+    def gains_in_run(self) -> NDArray[np.float64]:
+        """Return the regression of each arm's measured slopes on the true ones."""
+        return np.asarray(self.regression[0] / self.regression[1])
 
     def record(self) -> LoopRecord:
         """Return what was written down."""
@@ -246,7 +325,7 @@ def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
 
 
 def _checked_schedule(
-    configuration: LoopConfiguration, arms: Sequence[Arm], schedule: ArrayLike | None
+    configuration: LoopConfiguration, arms: Sequence[LoopArm], schedule: ArrayLike | None
 ) -> NDArray[np.int64]:
     if not 1 <= len(arms) <= _MOST_ARMS:
         raise InputError(f"arms: expected 1 to {_MOST_ARMS}, got {len(arms)}")

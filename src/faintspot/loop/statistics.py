@@ -1,4 +1,4 @@
-"""Statistics of loop results: paired differences, regression lines, gains in magnitude, with intervals."""
+"""Statistics of loop results: differences from neighbours, regression lines, gains in magnitude."""
 
 from __future__ import annotations
 
@@ -8,31 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between
+from faintspot.checks import finite_array
+from faintspot.compare.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, student
 from faintspot.errors import InputError
 
 Floats = NDArray[np.float64]
-
-_DRAWS = 2000
-_LEVEL = 0.95
-_FEWEST_BLOCKS = 3  # or realisations: of fewer, drawing again says nothing
-_SEED = 20150611  # of the resampling, when no generator is given: the same numbers give the same interval
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value with its 95 % interval; NaN where there is none."""
-
-    value: float
-    low: float
-    high: float
-    count: int
-    """Independent pieces that the interval is made of."""
-
-    @property
-    def decided(self) -> int:
-        """1 when the whole interval is above 0, -1 when it is below, else 0."""
-        return int(self.low > 0) - int(self.high < 0)
 
 
 @dataclass(frozen=True)
@@ -58,82 +38,11 @@ class MagnitudeGain:
     """How many magnitudes fainter an arm reaches the same Strehl ratio as the reference."""
 
     strehl: float
-    gain: float
-    """NaN when one of the curves does not reach it."""
-    low: float
-    high: float
-    """95 % interval; infinite where more than 2.5 % of the draws left the measured magnitudes there."""
+    gain: Estimate
+    """NaN when one of the curves does not reach it; its interval is infinite where more than 2.5 % of the
+    draws left the measured magnitudes there."""
     why_not: str = ""
     """Why there is no gain, or no interval."""
-
-    @property
-    def decided(self) -> int:
-        """1 when the whole interval is above 0, -1 when it is below, else 0."""
-        return int(self.low > 0) - int(self.high < 0)
-
-
-def mean_by_blocks(
-    values: ArrayLike,
-    block_length: int = 1,
-    rng: np.random.Generator | None = None,
-    comparisons: int = 1,
-) -> Estimate:
-    """Return the mean of a series with its interval by a moving-block bootstrap.
-
-    Kuensch 1989 (Annals of Statistics 17, 1217): blocks of neighbouring values are drawn, so that values
-    that resemble their neighbours do not make the interval too narrow. It is widened for the small number of
-    blocks, as Student's t is against the normal distribution.
-
-    Parameters
-    ----------
-    values : (n,) array
-        In the order of time.
-    block_length : int
-        Neighbouring values drawn together.
-    rng : numpy.random.Generator, optional
-    comparisons : int
-        Number of such intervals that are looked at together: all of them hold with 95 % (Bonferroni).
-
-    Raises
-    ------
-    InputError
-        When a value is not finite.
-    """
-    series = finite_array("values", values).astype(np.float64).ravel()
-    count = len(series)
-    length = int(number_between("block_length", block_length, 1, integer=True))
-    length = min(length, max(1, count // _FEWEST_BLOCKS))
-    blocks = math.ceil(count / length)
-    value = float(series.mean())
-    if blocks < _FEWEST_BLOCKS:
-        return Estimate(value, math.nan, math.nan, blocks)
-    rng = np.random.default_rng(_SEED) if rng is None else rng
-    starts = rng.integers(0, count - length + 1, (_DRAWS, blocks))
-    drawn = series[starts[:, :, None] + np.arange(length)].reshape(_DRAWS, -1)[:, :count].mean(axis=1)
-    low, high = _widened(value, drawn, blocks, comparisons)
-    return Estimate(value, low, high, blocks)
-
-
-def paired_mean(differences: ArrayLike, comparisons: int = 1) -> Estimate:
-    """Return the mean of independent differences, as of realisations, with its interval by Student's t.
-
-    Parameters
-    ----------
-    differences : (R,) array
-        NaN, of what is not measured yet, are left out.
-    comparisons : int
-        Number of such intervals that are looked at together: all of them hold with 95 % (Bonferroni).
-    """
-    values = np.asarray(differences, np.float64).ravel()
-    values = values[np.isfinite(values)]
-    count = len(values)
-    if count == 0:
-        return Estimate(math.nan, math.nan, math.nan, 0)
-    mean = float(values.mean())
-    if count < 2:
-        return Estimate(mean, math.nan, math.nan, count)
-    half = _student(count - 1, comparisons) * float(values.std(ddof=1)) / math.sqrt(count)
-    return Estimate(mean, mean - half, mean + half, count)
 
 
 def neighbour_differences(values: ArrayLike, time: ArrayLike, reference: ArrayLike) -> Floats:
@@ -193,7 +102,7 @@ def regression_line(x: ArrayLike, y: ArrayLike) -> RegressionLine:
     slope = sum_xy / sum_xx
     correlation = sum_xy / math.sqrt(sum_xx * sum_yy) if sum_yy > 0 else math.nan
     left = max(0.0, sum_yy - slope * sum_xy)
-    half = _student(count - 2) * math.sqrt(left / (count - 2) / sum_xx)
+    half = student(count - 2) * math.sqrt(left / (count - 2) / sum_xx)
     return RegressionLine(
         slope, float(up.mean() - slope * across.mean()), correlation, slope - half, slope + half, count
     )
@@ -234,20 +143,19 @@ def magnitude_gain(
     whole = ~np.isnan(curves[0] + curves[1]).any(axis=1)
     order = np.flatnonzero(whole)[np.argsort(faint[whole])]
     if len(order) < 2:
-        return MagnitudeGain(level, math.nan, math.nan, math.nan, "not measured yet")
+        return MagnitudeGain(level, Estimate(math.nan), "not measured yet")
     faint, curves = faint[order], [curve[order] for curve in curves]
     limits = [float(limiting_magnitudes(faint, curve.mean(axis=1), level)) for curve in curves]
     if any(math.isinf(limit) for limit in limits):
-        return MagnitudeGain(level, math.nan, math.nan, math.nan, _why_not(limits))
+        return MagnitudeGain(level, Estimate(math.nan), _why_not(limits))
     realisations = curves[0].shape[1]
     gain = limits[0] - limits[1]
-    if realisations < _FEWEST_BLOCKS:
-        return MagnitudeGain(level, gain, math.nan, math.nan, "too few realisations for an interval")
-    rng = np.random.default_rng(_SEED) if rng is None else rng
-    draws = rng.integers(0, realisations, (_DRAWS, realisations))
+    if realisations < FEWEST_PIECES:
+        return MagnitudeGain(level, Estimate(gain), "too few realisations for an interval")
+    rng = np.random.default_rng(SEED) if rng is None else rng
+    draws = rng.integers(0, realisations, (DRAWS, realisations))
     ends = [limiting_magnitudes(faint, curve[:, draws].mean(axis=2).T, level) for curve in curves]
-    low, high = _widened(gain, _differences(*ends), realisations)
-    return MagnitudeGain(level, gain, low, high)
+    return MagnitudeGain(level, of_draws(gain, _differences(*ends), realisations))
 
 
 def limiting_magnitudes(magnitudes: ArrayLike, strehl: ArrayLike, level: float) -> Floats:
@@ -306,20 +214,3 @@ def _why_not(limits: list[float]) -> str:
         if limit in sides
     ]
     return "; ".join(parts)
-
-
-def _widened(value: float, drawn: Floats, pieces: int, comparisons: int = 1) -> tuple[float, float]:
-    """Return the 95 % interval of bootstrap draws, widened about the value for few pieces.
-
-    A bootstrap of n pieces has sqrt((n - 1) / n) of the scatter, and knows nothing of Student's t.
-    """
-    tail = 50 * (1 - _LEVEL)
-    low, high = np.percentile(drawn, [tail, 100 - tail], method="nearest")
-    factor = math.sqrt(pieces / (pieces - 1)) * _student(pieces - 1, comparisons) / 1.96
-    return float(value + factor * (low - value)), float(value + factor * (high - value))
-
-
-def _student(degrees: int, comparisons: int = 1) -> float:
-    from scipy.special import stdtrit
-
-    return float(stdtrit(degrees, 1 - (1 - _LEVEL) / 2 / comparisons))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 
-import numpy as np
-from numpy.typing import NDArray
-
+from faintspot.compare.statistics import Estimate, paired_mean
 from faintspot.loop.analysis import GROUPS, GroupRow, measurements, strehl_table
-from faintspot.loop.budget import TERM_MEANINGS
+from faintspot.loop.budget import TERMS
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
 from faintspot.loop.verdict import LoopResults, loop_verdict
+from faintspot.loop.wording import with_error
 
 _WIDTH = 100
 
@@ -35,9 +33,8 @@ def magnitude_summary(result: MagnitudeResult) -> str:
         "photo-electrons".ljust(width) + "".join(f"{flux:>14g}" for flux in result.photons),
         "magnitude".ljust(width) + "".join(f"{magnitude:>14.1f}" for magnitude in result.magnitudes),
     ]
-    mean, error = _mean_and_error(result.strehl)
-    for number, label in enumerate(result.labels):
-        cells = (_with_error(m, e) for m, e in zip(mean[number], error[number], strict=True))
+    for label, curve in zip(result.labels, result.strehl, strict=True):
+        cells = (with_error(paired_mean(runs)) for runs in curve)
         lines.append(label.ljust(width) + "".join(f"{cell:>14s}" for cell in cells))
     lines.append(f"± standard error from {result.strehl.shape[-1]} realisations of the air")
     return "\n".join([*lines, "", *_verdict(LoopResults(magnitude=result))])
@@ -46,38 +43,24 @@ def magnitude_summary(result: MagnitudeResult) -> str:
 def budget_summary(result: BudgetResult) -> str:
     """Return the Strehl ratio and the rms wavefront of every arm without each term."""
     width = max(map(len, result.terms)) + 2
-    column = max(24, *(len(label) + 2 for label in result.labels))
+    column = max(30, *(len(label) + 2 for label in result.labels))
     lines = ["without".ljust(width) + "".join(label.rjust(column) for label in result.labels)]
-    strehl, error = _mean_and_error(result.strehl)
-    residual = result.residual_nm.mean(axis=-1)
     for number, term in enumerate(result.terms):
         cells = (
-            f"{_with_error(strehl[arm, number], error[arm, number])} {residual[arm, number]:5.0f} nm"
+            f"{with_error(paired_mean(result.strehl[arm, number]))}  "
+            f"{with_error(paired_mean(result.residual_nm[arm, number]), 0)} nm"
             for arm in range(len(result.labels))
         )
         lines.append(term.ljust(width) + "".join(cell.rjust(column) for cell in cells))
-    lines += ["Strehl ratio with its standard error, and rms wavefront", ""]
-    meanings = (f"without {term}: {TERM_MEANINGS[term]}" for term in result.terms if term in TERM_MEANINGS)
+    lines += ["Strehl ratio and rms wavefront with their standard errors", ""]
+    meanings = (f"without {term}: {TERMS[term].meaning}" for term in result.terms if term in TERMS)
     return "\n".join([*lines, *meanings])
 
 
 def _cell(row: GroupRow) -> str:
-    return f"{_with_error(row.mean, row.standard_deviation)} ({row.count})"
-
-
-def _with_error(value: float, error: float) -> str:
-    return f"{value:.3f} ±{error:.3f}" if math.isfinite(error) else f"{value:.3f}"
+    return f"{with_error(Estimate(row.mean, row.standard_deviation))} ({row.count})"
 
 
 def _verdict(results: LoopResults) -> list[str]:
     lines = loop_verdict(results)
     return [part for line in lines for part in textwrap.wrap(line, _WIDTH, subsequent_indent="  ")]
-
-
-def _mean_and_error(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and standard error along the last axis; NaN for the error of one value."""
-    count = values.shape[-1]
-    mean = values.mean(axis=-1)
-    if count < 2:
-        return mean, np.full(mean.shape, math.nan)
-    return mean, values.std(axis=-1, ddof=1) / math.sqrt(count)

@@ -41,7 +41,7 @@ def analyse_telemetry(
     pixel_scale_rad: float,
     outer_scale_m: float,
     frame_rate_hz: float,
-    centroid_gain: float = 1.0,
+    centroid_gain: ArrayLike = 1.0,
     segment_s: float = 10.0,
 ) -> TelemetryAnalysis:
     """Return the slopes of the air and r0, whole and in stretches, from a loop's recorded telemetry.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
-from faintspot.loop.arms import Choice, Parameter, arm_named, tuned_parameters
+from faintspot.compare.running import Advance
+from faintspot.loop.arms import ArmKind, Choice, Tunable
 from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.running import Advance
 from faintspot.loop.simulation import simulate_loop
 
 FIRST_TUNING_REALISATION = 1000
@@ -74,44 +75,38 @@ class Tuned:
 
 
 def tune(
-    name: str,
+    kind: ArmKind,
     configuration: LoopConfiguration,
     search: Search | None = None,
     advance: Advance | None = None,
 ) -> Tuned:
     """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
 
-    All combinations of a few values of each parameter first, then steps from the best of them to
-    neighbouring values of one parameter at a time, as long as that helps. All see the same air and noise;
+    All combinations of a few values of each option first, then steps from the best of them to
+    neighbouring values of one option at a time, as long as that helps. All see the same air and noise;
     realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
 
     Parameters
     ----------
-    name : str
-        One of `faintspot.loop.arms.ARM_NAMES`.
+    kind : ArmKind
     configuration : LoopConfiguration
     search : Search, optional
     advance : callable, optional
         Told the number of frames simulated, after every run.
-
-    Raises
-    ------
-    InputError
-        For an unknown arm.
     """
     search = Search() if search is None else search
-    parameters = tuned_parameters(name)
-    trials = _Trials(name, configuration, search, advance)
+    tuned = kind.tuned(configuration)
+    trials = _Trials(kind, configuration, search, advance)
     coarse = [
-        dict(zip(parameters, values, strict=True))
-        for values in itertools.product(*(parameter.coarse for parameter in parameters.values()))
+        dict(zip(tuned, values, strict=True))
+        for values in itertools.product(*(each.first for each in tuned.values()))
     ]
     ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
     if search.rounds == 0:
         return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
     best = max(ranked[: search.finalists], key=trials.fine)
     for _ in range(search.rounds):
-        better = max(_neighbours(best, parameters), key=trials.fine)
+        better = max(_neighbours(best, tuned), key=trials.fine)
         if trials.fine(better) <= trials.fine(best):
             break
         best = better
@@ -119,10 +114,10 @@ def tune(
 
 
 def tuning_unit(
-    name: str, configuration: LoopConfiguration, search: Search, advance: Advance
+    kind: ArmKind, configuration: LoopConfiguration, search: Search, advance: Advance
 ) -> dict[str, NDArray[Any]]:
     """Return what `tune` found, as arrays that can be stored."""
-    tuned = tune(name, configuration, search, advance)
+    tuned = tune(kind, configuration, search, advance)
     return {
         "choice": np.asarray(json.dumps(dict(tuned.choice))),
         "strehl": np.asarray(tuned.strehl),
@@ -130,17 +125,17 @@ def tuning_unit(
     }
 
 
-def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, float]:
+def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return the choice that `tuning_unit` stored."""
-    choice: dict[str, float] = json.loads(str(result["choice"]))
+    choice: dict[str, Any] = json.loads(str(result["choice"]))
     return choice
 
 
-def tuning_frames(name: str, search: Search) -> int:
+def tuning_frames(kind: ArmKind, configuration: LoopConfiguration, search: Search) -> int:
     """Return about how many frames tuning an arm simulates."""
-    parameters = tuned_parameters(name)
-    combinations = int(np.prod([len(parameter.coarse) for parameter in parameters.values()]))
-    looks = search.finalists + 2 * len(parameters) * min(2, search.rounds) if search.rounds else 0
+    tuned = kind.tuned(configuration)
+    combinations = math.prod(len(each.first) for each in tuned.values())
+    looks = search.finalists + 2 * len(tuned) * min(2, search.rounds) if search.rounds else 0
     return combinations * search.coarse_frames + looks * search.frames * search.realisations
 
 
@@ -148,13 +143,13 @@ class _Trials:
     """Strehl ratios of the settings that were looked at."""
 
     def __init__(
-        self, name: str, configuration: LoopConfiguration, search: Search, advance: Advance | None
+        self, kind: ArmKind, configuration: LoopConfiguration, search: Search, advance: Advance | None
     ) -> None:
-        self._name, self._search = name, search
+        self._kind, self._search = kind, search
         self._advance, self._frames = advance, 0
         self._configuration = configuration
-        self._coarse: dict[tuple[float, ...], float] = {}
-        self._fine: dict[tuple[float, ...], float] = {}
+        self._coarse: dict[tuple[Any, ...], float] = {}
+        self._fine: dict[tuple[Any, ...], float] = {}
 
     @property
     def tried(self) -> int:
@@ -176,7 +171,7 @@ class _Trials:
 
     def _strehl(self, choice: Choice, frames: int, realisations: int) -> float:
         short = self._configuration.replace("run", frames=frames, settle_frames=self._search.settle_frames)
-        arm = arm_named(self._name, short, choice)
+        arm = self._kind.arm(short, choice)
         runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
         strehl = float(np.mean([simulate_loop(short, [arm], realisation=run).mean_strehl() for run in runs]))
         self._frames += frames * realisations
@@ -185,12 +180,12 @@ class _Trials:
         return strehl
 
 
-def _neighbours(choice: Choice, parameters: Mapping[str, Parameter]) -> list[dict[str, float]]:
-    """Return the choices one step away in one parameter."""
+def _neighbours(choice: Choice, tuned: Mapping[str, Tunable]) -> list[dict[str, Any]]:
+    """Return the choices one step away in one option."""
     near = []
-    for name, parameter in parameters.items():
-        place = parameter.values.index(choice[name])
+    for name, each in tuned.items():
+        place = each.values.index(choice[name])
         for other in (place - 1, place + 1):
-            if 0 <= other < len(parameter.values):
-                near.append({**choice, name: parameter.values[other]})
+            if 0 <= other < len(each.values):
+                near.append({**choice, name: each.values[other]})
     return near

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from faintspot.compare.statistics import Estimate
 from faintspot.errors import InputError
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.loop.analysis import (
     NO_TV,
     TV,
@@ -19,6 +22,7 @@ from faintspot.loop.analysis import (
     measurements,
     strehl_table,
 )
+from faintspot.loop.arms import VARIANTS
 from faintspot.loop.results import (
     BUDGET_FILE,
     INTERLEAVED_FILE,
@@ -27,16 +31,11 @@ from faintspot.loop.results import (
     InterleavedResult,
     MagnitudeResult,
 )
-from faintspot.loop.statistics import Estimate, MagnitudeGain
+from faintspot.loop.wording import gain_in_words, in_words
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
-REFERENCE = "brightest pixels"
-"""Label of the arm that others are compared with."""
-_WEIGHTED = ", weighted reconstructor"
-_PREDICTED = (
-    ("maximum a posteriori", "maximum likelihood"),
-    ("trained score, from the prediction", "trained score"),
-)
+REFERENCE = BrightestPixels.name
+"""Name of the arm that others are compared with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,51 +88,23 @@ def loop_verdict(results: LoopResults) -> list[str]:
 
 def reference_arm(result: MagnitudeResult) -> int:
     """Return the arm that others are compared with: brightest pixels, else the first."""
-    return result.labels.index(REFERENCE) if REFERENCE in result.labels else 0
+    return result.names.index(REFERENCE) if REFERENCE in result.names else 0
 
 
 def tv_arm(result: MagnitudeResult) -> int | None:
     """Return the arm with TV, or None."""
-    return next((arm for arm, label in enumerate(result.labels) if label.lower().startswith("tv")), None)
+    return result.names.index(TotalVariation.name) if TotalVariation.name in result.names else None
 
 
 def options_that_may_pay(result: MagnitudeResult) -> list[tuple[str, int, int]]:
-    """Return what arms of a pair differ by, the arm with it and the one without: weights, predictions."""
-    labels = result.labels
-    pairs = [
-        ("weighted reconstructor", arm, labels.index(label.removesuffix(_WEIGHTED)))
-        for arm, label in enumerate(labels)
-        if label.endswith(_WEIGHTED) and label.removesuffix(_WEIGHTED) in labels
+    """Return what arms of a pair differ by, the arm with it and the one without, for each of `VARIANTS`."""
+    names = result.names
+    return [
+        (variant.label, arm, names.index(name.replace(ending, "")))
+        for ending, variant in VARIANTS.items()
+        for arm, name in enumerate(names)
+        if ending in name and name.replace(ending, "") in names
     ]
-    return pairs + [
-        ("loop's own prediction", labels.index(with_it), labels.index(without))
-        for with_it, without in _PREDICTED
-        if with_it in labels and without in labels
-    ]
-
-
-def in_words(estimate: Estimate | None) -> str:
-    """Return a difference in Strehl with its interval, as "+0.012 (−0.004 to +0.028)"."""
-    if estimate is None or not np.isfinite(estimate.value):
-        return "–"
-    if not np.isfinite(estimate.low):
-        return f"{signed(estimate.value)} (too few for an interval)"
-    return f"{signed(estimate.value)} ({signed(estimate.low)} to {signed(estimate.high)})"
-
-
-def gain_in_words(gain: MagnitudeGain) -> str:
-    """Return a gain in magnitudes with its interval, or why there is none."""
-    if not np.isfinite(gain.gain):
-        return gain.why_not
-    if np.isnan(gain.low):
-        return f"{signed(gain.gain, 2)} ({gain.why_not})"
-    ends = [signed(end, 2) if np.isfinite(end) else "beyond" for end in (gain.low, gain.high)]
-    return f"{signed(gain.gain, 2)} ({ends[0]} to {ends[1]})"
-
-
-def signed(value: float, digits: int = 3) -> str:
-    """Return a number with its sign, a minus as long as a plus."""
-    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
 def better_and_worse(result: MagnitudeResult, arm: int, reference: int) -> tuple[str, str]:
@@ -199,22 +170,29 @@ def _magnitude_lines(result: MagnitudeResult) -> list[str]:
         parts = [f"more Strehl beyond its error at {above}"] if above else []
         parts += [f"less Strehl beyond its error at {below}"] if below else []
         found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
-        lines.append(f"Magnitudes, {result.labels[arm]} against {base}: {found}{_largest_gain(result, arm)}.")
+        lines.append(
+            f"Magnitudes, {result.labels[arm]} against {base}: {found}{_gain_in_magnitude(result, arm)}."
+        )
     for option, arm, without in options_that_may_pay(result):
         above, below = better_and_worse(result, arm, without)
         found = f"pays at {above}" if above else "pays nowhere beyond its error"
         found += f", costs at {below}" if below else ""
-        lines.append(f"The {option} ({result.labels[arm]} against {result.labels[without]}) {found}.")
+        lines.append(f"{result.labels[arm]} against {result.labels[without]}: {option} {found}.")
     return lines
 
 
-def _largest_gain(result: MagnitudeResult, arm: int) -> str:
+def _gain_in_magnitude(result: MagnitudeResult, arm: int) -> str:
+    """Return the gain at the middle one of the Strehl ratios at which there is one."""
     gains = [
-        gain for gain in gains_in_magnitude(result, arm, reference_arm(result)) if np.isfinite(gain.gain)
+        each
+        for each in gains_in_magnitude(result, arm, reference_arm(result))
+        if np.isfinite(each.gain.value)
     ]
     if not gains:
         return ""
     middle = gains[len(gains) // 2]
+    if np.isnan(middle.gain.low):
+        return f"; gain in limiting magnitude: {middle.why_not}"
     return f"; limiting magnitude at Strehl {middle.strehl:g}: {gain_in_words(middle)} mag"
 
 

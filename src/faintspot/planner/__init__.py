@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from faintspot.compare.photometry import Photometry as Photometry
     from faintspot.planner.answer import Answer as Answer
-    from faintspot.planner.photometry import Photometry as Photometry
     from faintspot.planner.question import Question as Question
     from faintspot.planner.recorded import question_from_frames as question_from_frames
     from faintspot.planner.tuning import tune as tune
 
 _HOMES = {
     "Answer": "faintspot.planner.answer",
-    "Photometry": "faintspot.planner.photometry",
+    "Photometry": "faintspot.compare.photometry",
     "Question": "faintspot.planner.question",
     "question_from_frames": "faintspot.planner.recorded",
     "tune": "faintspot.planner.tuning",

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from faintspot.checks import number_between, one_of
-from faintspot.errors import InputError
-from faintspot.estimators.scene import Scene
-from faintspot.planner.photometry import (
+from faintspot.compare.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
     DEFAULT_THROUGHPUT,
     ZERO_POINTS,
     Photometry,
 )
+from faintspot.errors import InputError
+from faintspot.estimators.scene import Scene
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF

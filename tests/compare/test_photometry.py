@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from faintspot.compare.photometry import ZERO_POINTS, Photometry
 from faintspot.errors import InputError
-from faintspot.planner.photometry import ZERO_POINTS, Photometry
 
 LIGHT = Photometry(area_m2=0.36, frame_time_s=0.004)
 
