@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -68,6 +70,15 @@ def test_built_in_ones_in_their_order() -> None:
     for name, kind in estimators().items():
         assert kind.name == name
         assert estimator_named(name) is kind
+
+
+def test_order_does_not_depend_on_what_was_imported_first() -> None:
+    code = (
+        "from faintspot.estimators.weighted import Weighted; from faintspot.estimators import estimators; "
+        "print(*estimators())"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split()[: len(BUILT_IN)] == BUILT_IN
 
 
 def test_what_is_returned_is_a_copy() -> None:

@@ -82,8 +82,14 @@ FORMER_NAMES = {"plain": "brightest", "gaussian": "smoothed", "cog": "centroid"}
 @cache
 def _load() -> None:
     """Import the built-in estimators, and those of installed packages."""
-    for module in _BUILT_IN:
-        import_module(f"faintspot.estimators.{module}")
+    modules = [f"faintspot.estimators.{module}" for module in _BUILT_IN]
+    for module in modules:
+        import_module(module)
+    # Whoever imported one of them first has changed their order.
+    places = {module: place for place, module in enumerate(modules)}
+    kinds = sorted(_kinds.values(), key=lambda kind: places.get(kind.__module__, len(places)))
+    _kinds.clear()
+    _kinds.update({kind.name: kind for kind in kinds})
     for point in entry_points(group=ENTRY_POINTS):
         try:
             point.load()
