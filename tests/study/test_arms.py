@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter, median_filter
 import faintspot as fs
 from faintspot.errors import InputError
 from faintspot.estimators import Estimator, Need, Scene, Sensor, option, registry
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.study import StudySpecification, Sweep
 from faintspot.study.arms import CellArms, keeps_every_k, kind_of, knows_the_spot, label_of, style_of
 from faintspot.study.cell import realisations
@@ -64,7 +65,7 @@ def test_arms_are_what_they_say(
 def test_without_light_the_position_is_the_centre() -> None:
     truth = np.array([[0.5, -0.25]])
     noise = np.random.default_rng(4).normal(scale=0.1, size=(1, 10, 10)).astype(np.float32)
-    table, valid = error_table(kind_of("tv")(noise_std=1.4), noise, truth)  # type: ignore[arg-type]
+    table, valid = error_table(TotalVariation(noise_std=1.4), noise, truth)
     assert not valid.any()
     np.testing.assert_allclose(table, 0.375, rtol=1e-6)
     specification = StudySpecification("s", [Sweep("a", pixels=10)], arms=["thresholded"])

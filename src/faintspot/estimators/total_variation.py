@@ -136,7 +136,10 @@ class TotalVariation(KeepingBrightest):
         if is_auto(self.noise_std):
             return None  # it follows from the light
         limits = {name: getattr(self, name) for name in ("tolerance", "max_iterations")}
-        return tv_denoise(images, self.noise_std, algorithm=self.algorithm, preset=self.preset, **limits)
+        result: NDArray[np.float32] = tv_denoise(
+            images, self.noise_std, algorithm=self.algorithm, preset=self.preset, **limits
+        )
+        return result
 
     def prepared(self, sensor: Sensor) -> GravityPrepared:
         """See `Estimator`."""
