@@ -74,7 +74,8 @@ def test_near_the_best_of_a_search(cell: Cell) -> None:
     def errors(estimator: KeepingBrightest) -> NDArray[np.float64]:
         """Mean error for every number of kept pixels, px."""
         each = [error_table(estimator, block.images, block.truth)[0] for block in blocks]
-        return np.concatenate(each).mean(axis=0, dtype=np.float64)
+        mean: NDArray[np.float64] = np.concatenate(each).mean(axis=0, dtype=np.float64)
+        return mean
 
     plain = errors(BrightestPixels())
     denoised = [errors(TotalVariation(noise_std=s * cell.pixel_noise_e)) for s in (*STRENGTHS, strength) if s]
