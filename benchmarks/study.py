@@ -18,15 +18,21 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, best, interleaved, pinned, ratio
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.gravity import KeepingBrightest
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.study.cell import measure_cell, realisations
 from faintspot.study.specification import StudySpecification
 from faintspot.study.sweep import Sweep
-from faintspot.study.tuning import mean_errors
+from faintspot.study.tables import mean_errors
 
 STRENGTHS = (0.3, 0.5, 0.7, 0.85, 1.0)
 SPECIFICATION = StudySpecification("benchmark", [Sweep("a", flux_e=60, read_noise_e=1)], realisations=2000)
 CELL = SPECIFICATION.cells()[0]
-ARMS = {"plain": (float("nan"),), "tv": STRENGTHS}
+ARMS: dict[str, list[KeepingBrightest]] = {
+    "plain": [BrightestPixels()],
+    "tv": [TotalVariation(noise_std=strength * CELL.pixel_noise_e) for strength in STRENGTHS],
+}
 RIVAL_REALISATIONS = 2  # takes one after the other: so many tell the time of one
 SAME_PLAIN_PX = 1e-5  # R of the same images; single precision in one of the two
 SAME_TV_PX = 0.02  # slow to converge near the largest feasible strength, where scikit-image stops earlier
@@ -37,7 +43,7 @@ Floats = NDArray[np.float64]
 
 def ours(count: int) -> dict[str, Floats]:
     """Return R of both arms, (candidates, k)."""
-    return mean_errors(CELL, ARMS, realisations(CELL, count, np.random.default_rng(1)))
+    return mean_errors(ARMS, realisations(CELL, count, np.random.default_rng(1)))
 
 
 def errors_of_every_k(image: Floats, truth: Floats) -> Floats:
@@ -85,7 +91,7 @@ def weights_of(images: NDArray[np.float32]) -> Floats:
 def differences(count: int = 30) -> tuple[float, float]:
     """Return the largest differences of R of the same images: plain at any k, TV at k = 5 to 40."""
     ((images, truth),) = realisations(CELL, count, np.random.default_rng(2))
-    fast = mean_errors(CELL, ARMS, [(images, truth)])
+    fast = mean_errors(ARMS, [(images, truth)])
     slow = straightforward(images, truth, weights_of(images))
     tv = np.abs(fast["tv"] - slow["tv"])[:, 4:40]
     return float(np.abs(fast["plain"] - slow["plain"]).max()), float(tv.max())

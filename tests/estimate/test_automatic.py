@@ -17,9 +17,13 @@ from faintspot.estimate.automatic import (
     automatic_smoothing,
     automatic_strength,
 )
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.gravity import KeepingBrightest
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.total_variation import TotalVariation
 from faintspot.study.cell import realisations
 from faintspot.study.sweep import Cell
-from faintspot.study.tuning import mean_errors
+from faintspot.study.tables import mean_errors
 
 FWHM_OF_SIZE = {"diffraction": 1.772, "gaussian": 2.0}
 REALISATIONS = 600
@@ -64,9 +68,13 @@ def test_near_the_best_of_a_search(cell: Cell) -> None:
     about = known(cell)
     strength = float(automatic_strength(**about)) / cell.pixel_noise_e
     width = float(automatic_smoothing(**about))
-    arms = {"plain": (float("nan"),), "tv": (*STRENGTHS, strength), "gaussian": (*WIDTHS, width)}
-    arms = {arm: tuple(value for value in values if value != 0) for arm, values in arms.items()}
-    errors = mean_errors(cell, arms, realisations(cell, REALISATIONS, np.random.default_rng(3)))
+    noise = cell.pixel_noise_e
+    arms: dict[str, list[KeepingBrightest]] = {
+        "plain": [BrightestPixels()],
+        "tv": [TotalVariation(noise_std=value * noise) for value in (*STRENGTHS, strength) if value != 0],
+        "gaussian": [Smoothed(smoothing_px=value) for value in (*WIDTHS, width) if value != 0],
+    }
+    errors = mean_errors(arms, realisations(cell, REALISATIONS, np.random.default_rng(3)))
     plain = errors["plain"][0]
     methods = (("plain", "none", 1.0), ("tv", "tv", strength), ("gaussian", "smoothed", width))
     for arm, method, value in methods:
