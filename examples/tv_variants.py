@@ -24,9 +24,10 @@ from scipy.ndimage import gaussian_filter
 import faintspot as fs
 from faintspot.compare.statistics import slope_statistics
 from faintspot.estimate.automatic import automatic_kept_pixels, automatic_strength
+from faintspot.estimators.brightest import BrightestPixels
 from faintspot.simulate import Detector, subapertures
-from faintspot.study.arms import position_table
 from faintspot.study.sweep import Cell
+from faintspot.study.tables import position_table
 
 SIDE = 16
 LENSLETS = 7  # sub-apertures along a side of the frame
@@ -146,7 +147,7 @@ ARMS = (
 
 def positions_of(images: Images, cell: Cell, kept: Any = KEPT) -> Floats:
     """Return positions (n, K, 2) for every number of kept pixels."""
-    every_k, _ = position_table("plain", np.nan, cell, np.ascontiguousarray(images))
+    every_k, _ = position_table(BrightestPixels(), np.ascontiguousarray(images))
     return every_k[:, np.atleast_1d(kept) - 1]
 
 

@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter, median_filter
 import faintspot as fs
 from faintspot.errors import InputError
 from faintspot.estimators import Estimator, Need, Scene, Sensor, option, registry
+from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.study import StudySpecification, Sweep
 from faintspot.study.arms import CellArms, keeps_every_k, kind_of, knows_the_spot, label_of, style_of
@@ -80,9 +81,9 @@ def test_errors_are_those_of_the_positions(
     simulated: tuple[NDArray[np.float32], NDArray[np.float64]], search_range_px: float
 ) -> None:
     images, truth = simulated
-    brightest = kind_of("brightest")()
-    positions, valid = position_table(brightest, images, search_range_px)  # type: ignore[arg-type]
-    table, also_valid = error_table(brightest, images, truth, search_range_px)  # type: ignore[arg-type]
+    brightest = BrightestPixels()
+    positions, valid = position_table(brightest, images, search_range_px)
+    table, also_valid = error_table(brightest, images, truth, search_range_px)
     assert np.abs(positions).max() <= search_range_px
     found = np.abs(positions - truth[:, None]).mean(axis=2).astype(np.float32)
     np.testing.assert_array_equal(found, table)

@@ -14,6 +14,7 @@ from faintspot.kernels.groups import Scratch, new_scratch
 from faintspot.kernels.simd import Lanes
 
 _FEWEST_GROUPS = 16  # a thread with less to do costs more than it saves
+_REMEMBERED = 2
 _local = threading.local()
 
 
@@ -33,12 +34,17 @@ OwnScratch = Callable[[Lanes, int, int], tuple[Any, ...]]
 
 
 def _thread_scratch(lanes: Lanes, window: tuple[int, int], own: OwnScratch) -> Scratch:
-    """Return the scratch of the calling thread, made anew only when the shape of the work changes."""
+    """Return the scratch of the calling thread, made anew only when the shape of the work changes.
+
+    Two shapes are remembered: a pipeline may look at the light of a frame before it measures it.
+    """
     key = (lanes, window, own)
-    if getattr(_local, "key", None) != key:
-        _local.scratch = new_scratch(lanes, *window, own(lanes, *window))
-        _local.key = key
-    return _local.scratch  # type: ignore[no-any-return]
+    known: dict[Any, Scratch] = vars(_local).setdefault("known", {})
+    if key not in known:
+        while len(known) >= _REMEMBERED:
+            known.pop(next(iter(known)))
+        known[key] = new_scratch(lanes, *window, own(lanes, *window))
+    return known[key]
 
 
 def run_groups(

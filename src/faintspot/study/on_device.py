@@ -159,7 +159,7 @@ class DeviceTables:
 
     def _positions(self, estimator: Any, block: DeviceBlock) -> tuple[Any, Any]:
         """Positions (K, n, 2) and validity (K, n) on the GPU, which the next call may overwrite."""
-        side, n = block.on_device.shape[-1], len(block.on_device)
+        n, side = block.on_device.shape[:2]
         launched = max(n, FEWEST_BLOCKS), WARP
         limits = np.float64(estimator.flux_floor), np.float64(self._search_range_px)
         if isinstance(estimator, Thresholded):

@@ -7,7 +7,7 @@ brightest pixels: images are denoised once, each is sorted once, and all numbers
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -95,6 +95,22 @@ class HostTables:
         errors = errors_of(positions, truth[:, None])
         sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
         return Scored(positions[:, list(columns)], valid[:, list(columns)], sums)
+
+
+def mean_errors(
+    estimators: Mapping[str, Sequence[KeepingBrightest]],
+    blocks: Iterable[tuple[Images, Floats]],
+    search_range_px: float = math.inf,
+) -> dict[str, Floats]:
+    """Return R of lists of estimators for every k, (estimators, K) px each, over images with their truth."""
+    tables = HostTables(search_range_px)
+    sums: dict[str, Any] = dict.fromkeys(estimators, 0.0)
+    count = 0
+    for images, truth in blocks:
+        count += len(images)
+        for name, each in estimators.items():
+            sums[name] = sums[name] + tables.sums(each, Block(images, truth), moments=False)[0]
+    return {name: total / count for name, total in sums.items()}
 
 
 def error_table(
