@@ -29,7 +29,7 @@ def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--workers",
             type=click.IntRange(0),
             metavar="N",
-            help="Processes on this machine. Default: all processors. 0: this process, without Dask.",
+            help="Processes on this machine. Default: all processors. 0: this process.",
         ),
         click.option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
         click.option(
@@ -128,8 +128,9 @@ def magnitude(
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
     Each method is tuned at each flux, its settings and the loop gain together, on air that is not scored.
-    Methods: every estimator by its name, with _predicted after it (the loop's prediction is its prior),
-    _weighted (slopes count by their standard errors) or _uncorrected (for the centroid gain).
+    Methods: every estimator by its name (`faintspot estimators` lists them); after the name may follow
+    _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors) and
+    _uncorrected (slopes are not divided by the centroid gain).
 
     \b
     Examples:

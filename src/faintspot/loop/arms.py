@@ -43,7 +43,7 @@ class LoopArm:
     Parameters
     ----------
     label : str
-    settings : Settings or Estimator
+    settings : Settings
     gain : float, optional
         Loop gain, 0 to 2. Default: the configuration's.
     window_pixels : int, optional
@@ -79,8 +79,6 @@ class LoopArm:
     def __post_init__(self) -> None:
         if not isinstance(self.label, str) or not self.label:
             raise InputError(f"arm.label: expected a text, got {self.label!r}")
-        if isinstance(self.settings, Estimator):
-            object.__setattr__(self, "settings", Settings(self.settings))
         if not isinstance(self.settings, Settings):
             raise InputError(f"arm.settings: expected Settings, got {type(self.settings).__name__}")
         if self.gain is not None:
@@ -215,7 +213,7 @@ def arm_kind(name: str) -> ArmKind:
         estimator = estimator_named(base)
     except InputError as error:
         text = str(error).removeprefix("estimator")
-        raise InputError(f"arm{text}, and what may follow it: {', '.join(VARIANTS)}") from None
+        raise InputError(f"arm{text}; after it may follow {', '.join(VARIANTS)}") from None
     if _PREDICTED in variants and not estimator.takes_prior:
         raise InputError(f"arm = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
     return ArmKind(estimator, tuple(variant for variant in VARIANTS if variant in variants))
