@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray
 
-from faintspot.study.arms import keeps_every_k, kind_of
+from faintspot.study.arm_names import keeps_every_k, kind_of
 
 ARMS = ("brightest", "tv", "threshold", "smoothed", "median", "thresholded")
 ESTIMATOR_ARMS = ("ml", "map", "weighted")

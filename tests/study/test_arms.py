@@ -17,7 +17,8 @@ from faintspot.estimators import Estimator, Need, Scene, Sensor, option, registr
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.study import StudySpecification, Sweep
-from faintspot.study.arms import CellArms, keeps_every_k, kind_of, knows_the_spot, label_of, style_of
+from faintspot.study.arm_names import keeps_every_k, kind_of, knows_the_spot, label_of, style_of
+from faintspot.study.arms import CellArms
 from faintspot.study.cell import realisations
 from faintspot.study.simple_denoisers import median_of_nine
 from faintspot.study.tables import error_table, position_table

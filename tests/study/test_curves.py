@@ -8,8 +8,8 @@ from tests.study.study_cases import cells, dataset, power_law
 
 from faintspot.compare.curves import Curve, gain_at_error, gain_at_flux
 from faintspot.errors import InputError
+from faintspot.study.arm_names import TV_OVER_NO_TV
 from faintspot.study.curves import Configuration, study_curves
-from faintspot.study.paper import TV_OVER_NO_TV
 
 CONFIGURATION = Configuration("diffraction", 1.0, 0.1, 1.0, 1.0, 16)
 

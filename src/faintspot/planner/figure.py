@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from faintspot.planner.answer import Answer, ArmResult
 
 _WIDTH, _HEIGHT = 10.5, 6.6
 _TICKS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5)
 
 
 @styled
-def tune_figure(answer: Answer) -> Figure:
-    """Draw R of every arm and the bound against the star's magnitude, and the limiting magnitude."""
+def tune_figure(answer: Any) -> Figure:
+    """Draw R of every arm and the bound against the star's magnitude, and the limiting magnitude.
+
+    `answer` is a `faintspot.planner.Answer`, whose module calls this one.
+    """
     figure = new_figure(_WIDTH, _HEIGHT)
     axes = figure.subplots()
     place = answer.magnitudes(answer.flux_e)
@@ -45,7 +47,7 @@ def tune_figure(answer: Answer) -> Figure:
     return figure
 
 
-def _draw_arm(axes: Axes, answer: Answer, result: ArmResult, place: NDArray[np.float64]) -> None:
+def _draw_arm(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) -> None:
     style = result.arm.style
     best = result is answer.best
     axes.errorbar(
@@ -63,7 +65,7 @@ def _draw_arm(axes: Axes, answer: Answer, result: ArmResult, place: NDArray[np.f
     )
 
 
-def _axis_limits(axes: Axes, answer: Answer, saturated: float) -> None:
+def _axis_limits(axes: Axes, answer: Any, saturated: float) -> None:
     drawn = [result.error_px for result in answer.results]
     lowest = min(float(np.min(drawn)), float(answer.bound_px.min()))
     highest = min(float(np.max(drawn)), 2.5 * saturated)
@@ -73,7 +75,7 @@ def _axis_limits(axes: Axes, answer: Answer, saturated: float) -> None:
     axes.set_ylim(lowest / 1.15, highest * 1.15)
 
 
-def _mark_star(axes: Axes, answer: Answer) -> None:
+def _mark_star(axes: Axes, answer: Any) -> None:
     where = float(answer.magnitudes(answer.question.star_flux_e))
     axes.axvline(where, color="black", lw=0.8, ls=":", zorder=0)
     axes.annotate(
@@ -85,7 +87,7 @@ def _mark_star(axes: Axes, answer: Answer) -> None:
     )
 
 
-def _mark_budget(axes: Axes, answer: Answer) -> None:
+def _mark_budget(axes: Axes, answer: Any) -> None:
     budget, limit = answer.question.budget_px, answer.best.limiting_flux_e
     if budget is None:
         return
@@ -113,7 +115,7 @@ def _mark_budget(axes: Axes, answer: Answer) -> None:
     )
 
 
-def _electrons_above(axes: Axes, answer: Answer) -> None:
+def _electrons_above(axes: Axes, answer: Any) -> None:
     """Put an axis of electrons on top, at every flux that was simulated."""
     top = axes.secondary_xaxis("top")
     top.set_xticks(answer.magnitudes(answer.flux_e), [f"{float(f'{flux:.3g}'):g}" for flux in answer.flux_e])

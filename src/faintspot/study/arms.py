@@ -11,16 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import estimators
-from faintspot.compare.arms import Arm, Knowledge
-from faintspot.errors import InputError
-from faintspot.estimators.base import Estimator, Need, Style
-from faintspot.estimators.brightest import BrightestPixels
-from faintspot.estimators.gravity import KeepingBrightest
-from faintspot.estimators.registry import FORMER_NAMES, estimator_named
+from faintspot.compare.arms import Arm
+from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.scene import Scene
-from faintspot.estimators.smoothed import Smoothed
-from faintspot.estimators.thresholded import Thresholded
-from faintspot.estimators.total_variation import TotalVariation
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
@@ -28,7 +21,7 @@ from faintspot.settings import Settings
 from faintspot.simulate import Detector
 from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
 from faintspot.slopes import Slopes
-from faintspot.study.simple_denoisers import BrightestAsTheyAre, MedianFiltered
+from faintspot.study.arm_names import Kind, keeps_every_k, kind_of
 from faintspot.training import train_estimator
 
 if TYPE_CHECKING:
@@ -36,62 +29,10 @@ if TYPE_CHECKING:
     from faintspot.study.sweep import Cell
 
 Images = NDArray[np.float32]
-Kind = type[Estimator]
 
-_ONLY_HERE: dict[str, Kind] = {kind.name: kind for kind in (BrightestAsTheyAre, MedianFiltered)}
-DEFAULT_ARMS = tuple(
-    kind.name
-    for kind in (BrightestPixels, TotalVariation, BrightestAsTheyAre, Smoothed, MedianFiltered, Thresholded)
-)
-"""The built-in ones that know nothing of the spot."""
 _KEPT = "keep_brightest"
 _TRAINING = 1  # word that is added to a cell's seed
 _LEAST_LIGHT_E = 1e-3  # a mean of noise may be negative
-
-
-def kind_of(arm: str) -> Kind:
-    """Return the estimator that an arm is.
-
-    Raises
-    ------
-    InputError
-        For an unknown name.
-    """
-    name = FORMER_NAMES.get(arm, arm) if isinstance(arm, str) else arm
-    known = [*estimators.estimators(), *_ONLY_HERE]
-    if name not in known:
-        raise InputError(f"arms = {arm!r}: expected one of {', '.join(map(repr, known))}")
-    return _ONLY_HERE.get(name) or estimator_named(name)
-
-
-def label_of(arm: str) -> str:
-    """Return what tables and figures call an arm; its name where its estimator is not installed here."""
-    return kind_of(arm).label if _is_known(arm) else arm
-
-
-def style_of(arm: str) -> Style:
-    """Return how figures draw an arm."""
-    return kind_of(arm).style if _is_known(arm) else Estimator.style
-
-
-def knows_the_spot(arm: str) -> bool:
-    """Whether an arm is told more than the noise."""
-    return _is_known(arm) and Knowledge.of(kind_of(arm)) > Knowledge.NOISE
-
-
-def is_estimator(arm: str) -> bool:
-    """Whether an arm is not of studies alone."""
-    return arm not in _ONLY_HERE
-
-
-def keeps_every_k(kind: Kind) -> bool:
-    """Whether all numbers of kept pixels are measured at once: its denoised images are known."""
-    return issubclass(kind, KeepingBrightest) and kind.denoised is not KeepingBrightest.denoised
-
-
-def _is_known(arm: str) -> bool:
-    return arm in _ONLY_HERE or arm in estimators.estimators()
-
 
 # In a cell ------------------------------------------------------------------------------------------------
 

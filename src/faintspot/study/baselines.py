@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from faintspot.study.arm_names import TV
 from faintspot.study.curves import study_curves
-from faintspot.study.paper import TV
 
 if TYPE_CHECKING:
     import xarray

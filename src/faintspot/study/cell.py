@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from faintspot.compare.statistics import OUTLIER_PX, slope_statistics
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 from faintspot.simulate import subapertures
-from faintspot.study.arms import Candidate, CellArms, Images, detector_of, kind_of, shown
+from faintspot.study.arm_names import kind_of
+from faintspot.study.arms import Candidate, CellArms, Images, detector_of, shown
 from faintspot.study.specification import BEST, StudySpecification
 from faintspot.study.sweep import Cell
 from faintspot.study.tables import Block, Floats, HostTables, Tables, errors_of

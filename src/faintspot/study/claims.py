@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.study import judges
-from faintspot.study.paper import NO_TV, TV
+from faintspot.study.arm_names import NO_TV, TV
 from faintspot.study.verdicts import Case, Finding, Verdict
 
 if TYPE_CHECKING:

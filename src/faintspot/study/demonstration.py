@@ -21,7 +21,7 @@ from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.simulate import Detector, sensor_frames
-from faintspot.study.paper import NO_TV, TV, TV_OVER_NO_TV
+from faintspot.study.arm_names import NO_TV, TV, TV_OVER_NO_TV
 
 FLUXES_E = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0)
 SHOWN_FLUX_E = 60.0

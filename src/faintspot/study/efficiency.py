@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.estimators.weighted import Weighted
-from faintspot.study.arms import knows_the_spot
+from faintspot.study.arm_names import knows_the_spot
 from faintspot.study.curves import Configuration
 from faintspot.study.specification import BEST, CORRECTED
 

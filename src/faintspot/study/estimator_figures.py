@@ -10,7 +10,7 @@ import numpy as np
 
 from faintspot.report.drawing import GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
-from faintspot.study.arms import is_estimator, knows_the_spot, label_of, style_of
+from faintspot.study.arm_names import is_estimator, knows_the_spot, label_of, style_of
 from faintspot.study.cell_table import parameter_in_words, parameters_of, table_of_cells
 from faintspot.study.specification import BEST, CORRECTED
 from faintspot.study.sweep import PARAMETERS

@@ -10,7 +10,7 @@ from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.estimators.trained import Trained
 from faintspot.estimators.weighted import Weighted
-from faintspot.study.arms import DEFAULT_ARMS
+from faintspot.study.arm_names import DEFAULT_ARMS
 from faintspot.study.specification import StudySpecification, Sweep
 
 if TYPE_CHECKING:

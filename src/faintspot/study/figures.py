@@ -10,7 +10,7 @@ import numpy as np
 
 from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
-from faintspot.study.arms import knows_the_spot, label_of, style_of
+from faintspot.study.arm_names import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.study.cell_table import (
     mode_in_words,
     parameter_in_words,
@@ -19,7 +19,6 @@ from faintspot.study.cell_table import (
 )
 from faintspot.study.claims import BEST_MODE, fixed_mode
 from faintspot.study.kept_pixels import kept_panels
-from faintspot.study.paper import NO_TV, TV
 from faintspot.study.sweep import PARAMETERS
 
 if TYPE_CHECKING:

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.compare.curves import Curve, Gain, gain_at_error
-from faintspot.study.arms import label_of
+from faintspot.study.arm_names import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV, label_of
 from faintspot.study.baselines import AgainstTV, against_tv
 from faintspot.study.claims import BEST_MODE, fixed_mode
 from faintspot.study.curves import Configuration, study_curves
 from faintspot.study.judges import LEVEL_PX
-from faintspot.study.paper import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 
 if TYPE_CHECKING:
     import xarray

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.compare.curves import Curve, Gain, gain_at_error, gain_at_flux
+from faintspot.study.arm_names import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.study.curves import Configuration, study_curves
 from faintspot.study.kept_pixels import KEPT_RANGE, kept_panels, spread
-from faintspot.study.paper import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.study.verdicts import Case, Outcome, judged, with_error
 
 if TYPE_CHECKING:

@@ -9,13 +9,12 @@ import numpy as np
 from faintspot.compare.curves import Gain, gain_at_error
 from faintspot.report.figure_data import csv_text
 from faintspot.report.page import Badge, Cell, Section, Table
-from faintspot.study.arms import label_of
+from faintspot.study.arm_names import NO_TV, TV, TV_OVER_NO_TV, label_of
 from faintspot.study.baselines import against_tv
 from faintspot.study.cell_table import mode_in_words
 from faintspot.study.claims import fixed_mode
 from faintspot.study.curves import Configuration, study_curves
 from faintspot.study.judges import LEVEL_PX
-from faintspot.study.paper import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.study.verdicts import Finding, Outcome, Verdict
 
 if TYPE_CHECKING:

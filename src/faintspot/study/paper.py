@@ -12,18 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from faintspot.checks import one_of
 from faintspot.errors import InputError
-from faintspot.estimators.brightest import BrightestPixels
-from faintspot.estimators.smoothed import Smoothed
-from faintspot.estimators.total_variation import TotalVariation
 from faintspot.study.specification import StudySpecification, Sweep
 
 if TYPE_CHECKING:
     import xarray
-
-TV, NO_TV, SMOOTHING = TotalVariation.name, BrightestPixels.name, Smoothed.name
-"""The arms that the paper's claims compare, and the simplest rival."""
-TV_OVER_NO_TV = {"method": TV, "reference": NO_TV}
-"""Which curves gains are taken between."""
 
 NAME = "paper"
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7")

@@ -14,7 +14,7 @@ import tomlkit
 from faintspot.checks import number_between, one_of
 from faintspot.compare.store import fingerprint_of
 from faintspot.errors import InputError
-from faintspot.study.arms import DEFAULT_ARMS, kind_of, knows_the_spot
+from faintspot.study.arm_names import DEFAULT_ARMS, kind_of, knows_the_spot
 from faintspot.study.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
 from faintspot.toml_files import check_keys, checked_table, parse_file, parse_text
 

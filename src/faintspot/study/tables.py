@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.kernels import scoring
-from faintspot.study.arms import Images, keeps_every_k
+from faintspot.study.arm_names import keeps_every_k
+from faintspot.study.arms import Images
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
