@@ -4,7 +4,7 @@ A package makes it known with an entry point of the group "faintspot.estimators"
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +18,8 @@ class PowerCentroid(Estimator):
     """Centre of gravity of a power of the image: bright pixels count more."""
 
     power: Any = option(1.5, "Power of each pixel's light.", low=1.0, high=4.0, per_subaperture=False)
-    name: ClassVar[str] = "power"
-    label: ClassVar[str] = "power centroid"
+    name = "power"
+    label = "power centroid"
 
     def tuned(self, scene: Any) -> dict[str, list[float]]:
         """Return what a planner, a study or a loop may choose from."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,12 @@ from faintspot.estimators.sensor import Sensor
 class BrightestPixels(KeepingBrightest):
     """Centre of gravity of the brightest pixels (Basden, Myers & Gendron 2012), without denoising."""
 
-    name: ClassVar[str] = "brightest"
-    label: ClassVar[str] = "brightest pixels"
-    method: ClassVar[str] = "brightest pixels, centre of gravity"
-    cost: ClassVar[float] = 0.21
-    style: ClassVar[Style] = Style("#000000", "--", "o")
-    automatic_method: ClassVar[str] = "none"
+    name = "brightest"
+    label = "brightest pixels"
+    method = "brightest pixels, centre of gravity"
+    cost = 0.21
+    style = Style("#000000", "--", "o")
+    automatic_method = "none"
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""

@@ -45,7 +45,7 @@ class Gravity(Estimator):
         high=1.0,
     )
 
-    runs_on_gpu: ClassVar[bool] = True
+    runs_on_gpu = True
     steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, BACKGROUND)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from faintspot.estimators.base import Need, Style
 from faintspot.estimators.registry import register
@@ -29,7 +29,7 @@ class Fitted(Stepping):
         per_subaperture=False,
     )
 
-    needs: ClassVar[frozenset[Need]] = frozenset({Need.PSF})
+    needs = frozenset({Need.PSF})
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Blurs, of spots that are speckled."""
@@ -43,11 +43,11 @@ class Fitted(Stepping):
 class Matched(Fitted):
     """Matched filter: least squares of position and light, all pixels weighted alike."""
 
-    name: ClassVar[str] = "matched"
-    label: ClassVar[str] = "matched filter"
-    method: ClassVar[str] = "matched filter, least squares with the PSF"
-    cost: ClassVar[float] = 0.26
-    style: ClassVar[Style] = Style("#CC79A7", "--", "v")
+    name = "matched"
+    label = "matched filter"
+    method = "matched filter, least squares with the PSF"
+    cost = 0.26
+    style = Style("#CC79A7", "--", "v")
 
     def prepared(self, sensor: Sensor) -> PSFPrepared:
         """See `Estimator`."""

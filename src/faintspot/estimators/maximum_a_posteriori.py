@@ -46,12 +46,12 @@ class MaximumAPosteriori(Likelihood):
         per_subaperture=False,
     )
 
-    name: ClassVar[str] = "map"
-    label: ClassVar[str] = "maximum a posteriori"
-    method: ClassVar[str] = "maximum likelihood with a prior on the position"
-    cost: ClassVar[float] = 0.6
-    style: ClassVar[Style] = Style("#56B4E9", "-", "*")
-    takes_prior: ClassVar[bool] = True
+    name = "map"
+    label = "maximum a posteriori"
+    method = "maximum likelihood with a prior on the position"
+    cost = 0.6
+    style = Style("#56B4E9", "-", "*")
+    takes_prior = True
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3, "fast": 2}
 
     def for_scene(self, scene: Scene) -> Self:

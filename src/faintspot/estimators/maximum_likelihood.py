@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ class Likelihood(Fitted):
         high=1.0,
     )
 
-    needs: ClassVar[frozenset[Need]] = frozenset({Need.PSF, Need.READ_NOISE})
+    needs = frozenset({Need.PSF, Need.READ_NOISE})
 
     def for_scene(self, scene: Scene) -> Self:
         """Trust the wings of a learnt PSF less."""
@@ -61,11 +61,11 @@ class Likelihood(Fitted):
 class MaximumLikelihood(Likelihood):
     """Position and light of maximum likelihood, by Fisher scoring."""
 
-    name: ClassVar[str] = "ml"
-    label: ClassVar[str] = "maximum likelihood"
-    method: ClassVar[str] = "maximum likelihood for Poisson and Gaussian noise"
-    cost: ClassVar[float] = 0.27
-    style: ClassVar[Style] = Style("#0072B2", "-", "P")
+    name = "ml"
+    label = "maximum likelihood"
+    method = "maximum likelihood for Poisson and Gaussian noise"
+    cost = 0.27
+    style = Style("#0072B2", "-", "P")
 
     def prepared(self, sensor: Sensor) -> LikelihoodPrepared:
         """See `Estimator`."""

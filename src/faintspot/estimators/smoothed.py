@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,13 +39,13 @@ class Smoothed(KeepingBrightest):
         low_open=True,
     )
 
-    name: ClassVar[str] = "smoothed"
-    label: ClassVar[str] = "Gaussian smoothing"
-    method: ClassVar[str] = "linear Gaussian smoothing, brightest pixels, centre of gravity"
-    cost: ClassVar[float] = 0.22
-    style: ClassVar[Style] = Style("#E69F00", "-", "D")
-    steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, Step("smoothed", "denoised"), BACKGROUND)
-    automatic_method: ClassVar[str] = "smoothed"
+    name = "smoothed"
+    label = "Gaussian smoothing"
+    method = "linear Gaussian smoothing, brightest pixels, centre of gravity"
+    cost = 0.22
+    style = Style("#E69F00", "-", "D")
+    steps_shown = (RAW, CALIBRATED, Step("smoothed", "denoised"), BACKGROUND)
+    automatic_method = "smoothed"
 
     @property
     def denoises(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,11 @@ class Thresholded(Gravity):
 
     threshold_e: Any = option(None, "What is taken off every pixel.", unit="e-", low=0.0, high=1e12)
 
-    name: ClassVar[str] = "thresholded"
-    label: ClassVar[str] = "thresholded centre of gravity"
-    method: ClassVar[str] = "centre of gravity of what is above a threshold"
-    cost: ClassVar[float] = 0.15
-    style: ClassVar[Style] = Style("#9a9a9a", ":", "X")
+    name = "thresholded"
+    label = "thresholded centre of gravity"
+    method = "centre of gravity of what is above a threshold"
+    cost = 0.15
+    style = Style("#9a9a9a", ":", "X")
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,13 +63,13 @@ class TotalVariation(KeepingBrightest):
         per_subaperture=False,
     )
 
-    name: ClassVar[str] = "tv"
-    label: ClassVar[str] = "TV denoising"
-    method: ClassVar[str] = "total-variation denoising, brightest pixels, centre of gravity"
-    cost: ClassVar[float] = 0.71
-    style: ClassVar[Style] = Style("#D55E00", "-", "s")
-    steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED, Step("denoised", "denoised"), BACKGROUND)
-    automatic_method: ClassVar[str] = "tv"
+    name = "tv"
+    label = "TV denoising"
+    method = "total-variation denoising, brightest pixels, centre of gravity"
+    cost = 0.71
+    style = Style("#D55E00", "-", "s")
+    steps_shown = (RAW, CALIBRATED, Step("denoised", "denoised"), BACKGROUND)
+    automatic_method = "tv"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,13 @@ _LEAST_SMOOTHING_PX = 0.1
 class Trained(Estimator):
     """The trained linear score; `faintspot.train_estimator` and `train_from_frames` make one."""
 
-    name: ClassVar[str] = "trained"
-    label: ClassVar[str] = "trained score"
-    method: ClassVar[str] = "a linear score learnt for the sensor, applied in a few passes"
-    needs: ClassVar[frozenset[Need]] = frozenset({Need.SCORE})
-    cost: ClassVar[float] = 0.15
-    style: ClassVar[Style] = Style("#6b3fa0", "-", "h")
-    takes_prior: ClassVar[bool] = True
+    name = "trained"
+    label = "trained score"
+    method = "a linear score learnt for the sensor, applied in a few passes"
+    needs = frozenset({Need.SCORE})
+    cost = 0.15
+    style = Style("#6b3fa0", "-", "h")
+    takes_prior = True
 
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""

@@ -44,12 +44,12 @@ class Weighted(Stepping):
         per_subaperture=False,
     )
 
-    name: ClassVar[str] = "weighted"
-    label: ClassVar[str] = "weighted centre of gravity"
-    method: ClassVar[str] = "centre of gravity under a Gaussian weight that follows the spot"
-    needs: ClassVar[frozenset[Need]] = frozenset({Need.WIDTH})
-    cost: ClassVar[float] = 0.23
-    style: ClassVar[Style] = Style("#009E73", "--", "^")
+    name = "weighted"
+    label = "weighted centre of gravity"
+    method = "centre of gravity under a Gaussian weight that follows the spot"
+    needs = frozenset({Need.WIDTH})
+    cost = 0.23
+    style = Style("#009E73", "--", "^")
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 8, "fast": 3}
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,19 @@ class BrightestAsTheyAre(BrightestPixels):
 
     rule: Any = option("threshold", "As of `KeepingBrightest`.", choices=RULES)
 
-    name: ClassVar[str] = "threshold"
-    label: ClassVar[str] = "brightest pixels, rule “threshold”"
-    style: ClassVar[Style] = Style("#0072B2", "--", "v")
+    name = "threshold"
+    label = "brightest pixels, rule “threshold”"
+    style = Style("#0072B2", "--", "v")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MedianFiltered(KeepingBrightest):
     """The median of 3 x 3 pixels, then the brightest of them."""
 
-    name: ClassVar[str] = "median"
-    label: ClassVar[str] = "3 × 3 median filter"
-    style: ClassVar[Style] = Style("#56B4E9", "-", "<")
-    automatic_method: ClassVar[str] = BrightestPixels.automatic_method
+    name = "median"
+    label = "3 × 3 median filter"
+    style = Style("#56B4E9", "-", "<")
+    automatic_method = BrightestPixels.automatic_method
 
     def denoised(self, images: Images) -> Images:
         """See `KeepingBrightest`."""
