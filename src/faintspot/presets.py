@@ -14,10 +14,6 @@ _DENOISING: dict[str, dict[str, Any]] = {
     "accurate": {"tolerance": 1e-2, "max_iterations": 200},
     "fast": {"tolerance": 0.0, "max_iterations": 8},
 }
-_STEPS = {
-    "accurate": {"matched": 3, "ml": 3, "map": 3, "weighted": 8},
-    "fast": {"matched": 3, "ml": 3, "map": 2, "weighted": 3},
-}
 
 
 def of_denoising(preset: str) -> dict[str, Any]:
@@ -28,8 +24,3 @@ def of_denoising(preset: str) -> dict[str, Any]:
 def starts_flat(preset: str) -> bool:
     """Whether the denoising begins at the flat solution's dual field rather than at zero."""
     return preset == "fast"
-
-
-def steps(preset: str, estimator: str) -> int:
-    """Steps of an iterated estimator; 1 of others."""
-    return _STEPS[preset].get(estimator, 1)
