@@ -66,7 +66,7 @@ def test_nothing_is_done_twice(whole: Path) -> None:
 def test_other_plan_is_refused_or_replaces(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
     shorter = replace(PLAN, block_frames=50, strengths=(2,), em_fractions=(1.0,), repeats=(1,))
-    with pytest.raises(InputError, match="belongs to another loop"):
+    with pytest.raises(InputError, match="belongs to another closed-loop experiment"):
         run_interleaved(CAMERA, folder, plan=shorter, place=HERE)
     result = run_interleaved(CAMERA, folder, plan=shorter, place=HERE, overwrite=True)
     assert [record.frames for record in result.records] == [150]

@@ -52,7 +52,7 @@ class Stored:
         found = values.pop("format", None)
         if found is not None and found.shape == () and 0 < int(found) < cls.FORMAT:
             raise InputError(
-                f"{path}: {cls.WHAT} of an earlier version of faintspot: measure again, with --overwrite"
+                f"{path}: {cls.WHAT} of an earlier version of faintspot: measure again, in another folder"
             )
         if found != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
             raise InputError(f"{path}: not {cls.WHAT} of format {cls.FORMAT}")

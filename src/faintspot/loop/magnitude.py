@@ -150,7 +150,7 @@ def unit_store(
     keys = [unit.key for unit in units]
     return ZarrStore(
         make_folder(folder / "units") / f"{name}.zarr",
-        f"loop {name}",
+        "closed-loop experiment",
         identity,
         keys,
         attributes={"name": configuration.name},
