@@ -144,7 +144,7 @@ def magnitude(
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
     fluxes = None if photons is None else [_number(text) for text in _listed(photons)]
-    names = None if arms is None else _listed(arms)
+    names = None if arms is None else _arms(arms)
     with _workplace(**where) as place:
         result = run_magnitude(loop, folder, names, fluxes, quick=quick, place=place, overwrite=overwrite)
     click.echo(magnitude_summary(result))
@@ -173,7 +173,7 @@ def budget(
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
-    names = None if arms is None else _listed(arms)
+    names = None if arms is None else _arms(arms)
     with _workplace(**where) as place:
         result = run_budget(loop, folder, names, quick=quick, place=place, overwrite=overwrite)
     click.echo(budget_summary(result))
@@ -195,6 +195,20 @@ def _folder(name: str, quick: bool) -> str:
 
 def _listed(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _arms(text: str) -> list[str]:
+    """Return the arms that are asked for; say of those that could be told a prediction that they are not."""
+    from faintspot.loop.arms import arm_kind
+
+    names = _listed(text)
+    for name in names:
+        kind = arm_kind(name)
+        if kind.estimator.takes_prior and not kind.is_predicted:
+            own = kind.estimator.name
+            rest = kind.name.removeprefix(own)
+            click.echo(f"{name}: without the loop's prediction; {own}_predicted{rest} uses it", err=True)
+    return names
 
 
 def _number(text: str) -> float:

@@ -143,6 +143,11 @@ class ArmKind:
         return "".join([self.estimator.name, *self.variants])
 
     @property
+    def is_predicted(self) -> bool:
+        """Whether it is told what the loop predicts."""
+        return _PREDICTED in self.variants
+
+    @property
     def label(self) -> str:
         """What reports call it."""
         return ", ".join([self.estimator.label, *(VARIANTS[name].label for name in self.variants)])
