@@ -234,3 +234,5 @@ def test_schedulers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(InputError, match=r"scheduler = .*cannot be reached") as raised:
             run_units(double, UNITS, MemoryStore(), Workplace(scheduler=address))
         assert "\n" not in str(raised.value)
+    with pytest.raises(InputError, match="expected certificates"):
+        run_units(double, UNITS, MemoryStore(), Workplace(scheduler="tls://127.0.0.1:1"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.planner.planner_cases import answered
 
-from faintspot import Calibration, Layout, Settings, SlopePipeline
+from faintspot import Calibration, InputError, Layout, Settings, SlopePipeline
 from faintspot.compare.statistics import Estimate, slope_error
 from faintspot.estimators import estimators
 from faintspot.planner import answer_text
@@ -64,6 +64,13 @@ def test_magnitudes_are_relative_without_photometry() -> None:
     answer = answered()
     assert answer.magnitudes([200.0, 100.0]) == pytest.approx([0.0, 0.7526], abs=1e-4)
     assert "fainter" in answer.magnitude_label
+
+
+def test_results_by_name() -> None:
+    answer = answered()
+    assert answer["plain"] is answer["brightest"]  # as version 0.1 called it
+    with pytest.raises(InputError, match="'tvs': expected one that was tried: brightest, tv"):
+        answer["tvs"]
 
 
 def test_the_recommendation_in_words() -> None:

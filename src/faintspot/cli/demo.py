@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
@@ -13,6 +14,7 @@ from rich.table import Table
 from faintspot import configuration
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
+from faintspot.files import write_atomically
 from faintspot.io.slopes import read_slopes
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
@@ -97,8 +99,8 @@ def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.ran
     layout = demonstration.demonstration_layout()
     shown = demonstration.FLUXES_E.index(demonstration.SHOWN_FLUX_E)
     frames, truth = demonstration.simulate(layout, demonstration.SHOWN_FLUX_E, n_frames, rng)
-    np.save(folder / "frames.npy", frames)
-    np.save(folder / "truth.npy", truth)
+    for name, values in (("frames", frames), ("truth", truth)):
+        write_atomically(folder / f"{name}.npy", partial(np.save, arr=values))
     arms, stages = [], {}
     for name, chosen in (("TV", comparison.denoised[shown]), ("no TV", comparison.without[shown])):
         stem = name.lower().replace(" ", "-")

@@ -34,7 +34,10 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="cpu or cuda: an NVIDIA GPU. Default: what the specification says, else cpu.",
         ),
         click.option(
-            "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use instead: tcp://HOST:PORT."
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Running Dask scheduler to use instead: tls://HOST:PORT. Whoever reaches it can run code as "
+            "you: see docs/study.md.",
         ),
     ):
         command = option(command)
@@ -82,7 +85,7 @@ def run(
     \b
     Examples:
       faintspot study run my-study.toml -o my-study.zarr
-      faintspot study run my-study.toml --scheduler tcp://head-node:8786
+      faintspot study run my-study.toml --scheduler tls://head-node:8786
       faintspot study run my-study.toml --device cuda
     """
     from faintspot.study.specification import StudySpecification

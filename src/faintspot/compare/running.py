@@ -173,7 +173,7 @@ def _finished(
 ) -> Finished:
     """Yield every unit and its result as it finishes."""
     if place.scheduler is not None:
-        return _by_dask(function, units, place, count)
+        return _by_dask(function, units, place, place.scheduler, count)
     if place.workers == 0:
         return _here(function, units, count)
     processes = min(available_cpus() if place.workers is None else place.workers, len(units))
@@ -294,13 +294,15 @@ def _seldom(tell: Advance) -> Advance:
 # A Dask cluster -------------------------------------------------------------------------------------------
 
 
-def _by_dask(function: Callable[..., Arrays], units: list[Unit], place: Workplace, count: _Count) -> Finished:
+def _by_dask(
+    function: Callable[..., Arrays], units: list[Unit], place: Workplace, scheduler: str, count: _Count
+) -> Finished:
     """Let a running cluster do the units."""
     distributed = _distributed()
     topic = f"faintspot-{uuid.uuid4()}"
     # What workers tell and finished units arrive here, so that all is told to the caller in its own thread.
     news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-    with _connected(distributed, place.scheduler) as client:
+    with _connected(distributed, scheduler) as client:
         place.say(f"Dask scheduler {client.scheduler.address}{_dashboard(client)}")
         client.subscribe_topic(topic, lambda event: news.put(event[1]))
         waiting, futures = {unit.key: unit for unit in units}, dict[str, Any]()
@@ -344,8 +346,14 @@ def _distributed() -> Any:
 
 
 @contextmanager
-def _connected(distributed: Any, scheduler: str | None) -> Iterator[Any]:
+def _connected(distributed: Any, scheduler: str) -> Iterator[Any]:
     """Connect to a running scheduler; never as Dask's default, which what else the process does would use."""
+    certificates = distributed.Security().get_connection_args("client").get("ssl_context")
+    if scheduler.startswith("tls:") and certificates is None:
+        raise InputError(
+            f"scheduler = {scheduler!r}: expected certificates in Dask's configuration, found none; "
+            "docs/study.md says how to give them"
+        )
     try:
         client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:

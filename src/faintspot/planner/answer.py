@@ -14,6 +14,8 @@ from faintspot import configuration
 from faintspot.compare.arms import Arm, Knowledge
 from faintspot.compare.curves import Curve
 from faintspot.compare.statistics import Estimate, SlopeStatistics
+from faintspot.errors import InputError
+from faintspot.estimators.registry import FORMER_NAMES
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
@@ -138,8 +140,18 @@ class Answer:
         )
 
     def __getitem__(self, name: str) -> ArmResult:
-        """Return the result of an arm."""
-        return next(result for result in self.results if result.arm.name == name)
+        """Return the result of an estimator.
+
+        Raises
+        ------
+        InputError
+            For one that was not tried.
+        """
+        results = {result.arm.name: result for result in self.results}
+        found = results.get(FORMER_NAMES.get(name, name))
+        if found is None:
+            raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
+        return found
 
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.compare.statistics import OUTLIER_PX, slope_statistics
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 from faintspot.simulate import subapertures
-from faintspot.study.arm_names import kind_of
+from faintspot.study.arm_names import kind_of, knows_the_spot
 from faintspot.study.arms import Candidate, CellArms, Images, detector_of, shown
 from faintspot.study.specification import BEST, StudySpecification
 from faintspot.study.sweep import Cell
@@ -166,7 +166,7 @@ class Scores:
             self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
             self._valid[arm, mode].append(slopes.valid)
         stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
-        if BEST in modes and np.isfinite(stated).any():
+        if BEST in modes and knows_the_spot(arm):
             self._stated.setdefault(arm, []).append(stated.astype(np.float64))
 
     def _add_table(self, arm: str, candidate: Candidate, block: Any, tables: Tables, arms: CellArms) -> None:
