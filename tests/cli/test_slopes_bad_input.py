@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected, simulated
 
-from faintspot.io import read_slopes, slopes_folder, zarr_files
+from faintspot.io import read_slopes, slopes_folder, zarr_store
 
 fits = pytest.importorskip("astropy.io.fits")
 pytest.importorskip("zarr")
@@ -178,7 +178,7 @@ def test_foreign_directory_is_never_replaced(folder: Path, run: Commands) -> Non
 @pytest.mark.parametrize("output", ["s.zarr", "s.npz", "s.csv"])
 def test_full_disk(folder: Path, run: Commands, output: str, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save("a.npy", simulated())
-    module = zarr_files if output.endswith("zarr") else slopes_folder
+    module = zarr_store if output.endswith("zarr") else slopes_folder
 
     def full(path: Path, text: str) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -40,9 +40,8 @@ def finished(output: Path) -> int:
     try:
         if output.suffix == ".zarr":
             return int(json.loads((output / "zarr.json").read_text())["attributes"]["finished_frames"])
-        return int(
-            (output.with_name(f".{output.name}.partial") / "finished").read_text() or 0
-        )  # being written
+        mark = (output.with_name(f".{output.name}.partial") / "finished").read_text()
+        return int(mark.split("\n")[0] or 0)  # empty while it is written
     except FileNotFoundError:
         return 0
 

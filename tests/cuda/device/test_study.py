@@ -249,4 +249,5 @@ def test_images_that_only_the_cpu_draws() -> None:
     assert not draws(cell)
     found, expected = measure_cell(cell, there), measure_cell(cell, replace(there, device="cpu"))
     for name, value in expected.items():
-        assert np.allclose(found[name], value, rtol=1e-4, atol=1e-5, equal_nan=True), name
+        if not name.startswith("stated"):  # the GPU's tables state no standard errors
+            assert np.allclose(found[name], value, rtol=1e-4, atol=1e-5, equal_nan=True), name
