@@ -113,7 +113,7 @@ def measure_recorded(
     if changes:
         settings = settings.replace(**changes)
     if not denoise:
-        settings = without_denoising(settings, "denoise = False")
+        settings = without_denoising(settings, "denoise = False (--no-denoise)")
     if preset is not None:
         settings = with_preset(settings, preset)
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
