@@ -26,7 +26,7 @@ from faintspot.kernels.groups import (
     store_stage,
 )
 from faintspot.kernels.host import aligned_zeros
-from faintspot.kernels.simd import Lanes, width_of
+from faintspot.kernels.simd import Lanes, load, store, width_of
 from faintspot.kernels.smoothing import gather_taps, smooth_group
 from faintspot.kernels.sweeps import STATE_VECTORS
 from faintspot.kernels.total_variation import denoise_group
@@ -120,8 +120,16 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     if stages.shape[0] > 0:
         _subtract_background(lanes, denoised, ny * nx, own.centroid, output)
         store_stage(width, output, stages[BACKGROUND, group.frame], first)
+    for row, found in (
+        (FLUX, brightest.SUM),
+        (X, brightest.X),
+        (Y, brightest.Y),
+        (ERROR_X, brightest.ERROR_X),
+        (ERROR_Y, brightest.ERROR_Y),
+    ):
+        store(scratch.results, row * width, load(lanes, own.centroid, found * width))
     for lane in range(width):
-        _store_result(width, lane, ny, nx, first, settings, own, scratch)
+        _flag_lane(width, lane, ny, nx, first, settings, own, scratch)
 
 
 @compiled
@@ -152,12 +160,12 @@ def _set_threshold(lanes: Any, image: Any, pixels: Any, centroid: Any) -> None:
 
 
 @compiled
-def _store_result(
+def _flag_lane(
     width: Any, lane: Any, ny: Any, nx: Any, first: Any, settings: Any, own: Any, scratch: Any
 ) -> None:
-    """Write one lane's result, and the bits of its flags."""
+    """Write the bits of one lane's flags, and its iterations."""
     s = min(first + lane, settings.shape[1] - 1)
-    counts, centroid, found = own.counts, own.centroid, scratch.results
+    counts, centroid = own.counts, own.centroid
     bits = scratch.flags[lane]
     if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
         if counts[total_variation.INFEASIBLE * width + lane]:
@@ -168,10 +176,6 @@ def _store_result(
     x, y = centroid[brightest.X * width + lane], centroid[brightest.Y * width + lane]
     scratch.flags[lane] = bits | lightless(ny, nx, bits, light, settings[FLOOR, s] * largest, x, y)
     scratch.iterations[lane] = counts[total_variation.ITERATIONS * width + lane]
-    found[FLUX * width + lane] = light
-    found[X * width + lane], found[Y * width + lane] = x, y
-    found[ERROR_X * width + lane] = centroid[brightest.ERROR_X * width + lane]
-    found[ERROR_Y * width + lane] = centroid[brightest.ERROR_Y * width + lane]
 
 
 @compiled
