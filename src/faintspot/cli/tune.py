@@ -160,7 +160,7 @@ def command(
 def answer_table(answer: Answer) -> Table:
     """Return the errors of all arms at the star's flux as a table."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("estimator", no_wrap=True)
+    table.add_column("estimator", ratio=1)  # long names wrap, numbers do not
     for heading in ("R (px)", "gain", "rms/gain", "outliers", "cost", "mag saved"):
         table.add_column(heading, justify="right", no_wrap=True)
     for result in answer.results:
