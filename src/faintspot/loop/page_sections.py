@@ -31,6 +31,7 @@ from faintspot.loop.page_tables import (
     strehl_groups_table,
 )
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
+from faintspot.loop.values_with_errors import in_words, with_error
 from faintspot.loop.verdict import (
     LoopResults,
     loop_verdict,
@@ -38,7 +39,6 @@ from faintspot.loop.verdict import (
     reference_arm,
     tv_arm,
 )
-from faintspot.loop.wording import in_words, with_error
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Section, Table
 

@@ -18,7 +18,7 @@ from faintspot.loop.analysis import (
     strehl_table,
 )
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
-from faintspot.loop.wording import gain_in_words, in_words, with_error
+from faintspot.loop.values_with_errors import gain_in_words, in_words, with_error
 from faintspot.report.page import Table
 
 

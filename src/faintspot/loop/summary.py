@@ -8,8 +8,8 @@ from faintspot.compare.statistics import Estimate, paired_mean
 from faintspot.loop.analysis import GROUPS, GroupRow, measurements, strehl_table
 from faintspot.loop.budget import TERMS
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
+from faintspot.loop.values_with_errors import with_error
 from faintspot.loop.verdict import LoopResults, loop_verdict
-from faintspot.loop.wording import with_error
 
 _WIDTH = 100
 

@@ -31,7 +31,7 @@ from faintspot.loop.results import (
     InterleavedResult,
     MagnitudeResult,
 )
-from faintspot.loop.wording import gain_in_words, in_words
+from faintspot.loop.values_with_errors import gain_in_words, in_words
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 REFERENCE = BrightestPixels.name
