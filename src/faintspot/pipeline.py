@@ -16,8 +16,7 @@ from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
-from faintspot.kernels.compiling import Direct
-from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source, light_of_groups
+from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
 from faintspot.preparation import Preparation, packed_calibration
@@ -95,7 +94,6 @@ class SlopePipeline:
         self._parts = psf, score, layout.offsets + _reference_positions(reference, len(layout))
         self.preparation = self._prepared()
         """What was computed beforehand."""
-        self._light_kernels: dict[str, Direct] = {}
         self._identity = _identity(*self._parts)
         self.device = one_of("device", device, ("cpu", "cuda"))
         self.on_device = self._device_pipeline() if self.device == "cuda" else None
@@ -133,7 +131,7 @@ class SlopePipeline:
             For another width.
         """
         other = copy.copy(self)
-        other._lanes, other._light_kernels = lanes_for(np.float32, width), {}
+        other._lanes = lanes_for(np.float32, width)
         other._calibration = packed_calibration(self.layout, self.calibration, width)
         other.preparation = other._prepared()
         other.on_device = None if self.on_device is None else other._device_pipeline()
@@ -162,12 +160,9 @@ class SlopePipeline:
 
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx), electrons, read as one tall frame."""
-        layout, camera, (ny, nx) = self.layout, self.calibration, self.layout.window
-        n = len(layout)
-        corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
-        centres = corners[:, ::-1] + 0.5 * (np.array([nx, ny]) - 1) + layout.offsets
+        layout, camera = self.layout, self.calibration
         other = copy.copy(self)
-        other.layout = Layout((n * ny, nx), (ny, nx), corners, centres)
+        other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
         other.calibration = Calibration(
             gain_e_per_adu=camera.em_gain,
             em_gain=camera.em_gain,
@@ -287,7 +282,7 @@ class SlopePipeline:
             return np.zeros(n_frames, np.int64)
         light = np.empty((n_frames, n), np.float32)
 
-        light_kernel = self._light_kernels.setdefault(source.frames.dtype.str, Direct(light_of_groups))
+        light_kernel = self.preparation.light_kernel(source.frames)
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
             light_kernel(source, start, stop, scratch, light)

@@ -91,7 +91,7 @@ class Preparation:
         self._fixed = self._fixed_table(each)
         self._levels: list[NDArray[np.float32]] = []
         self._variants: dict[int, int] = {}
-        self._kernels: dict[str, Direct] = {}
+        self._kernels: dict[tuple[Any, str], Direct] = {}
         self._lock = threading.RLock()
         self._made: tuple[NDArray[np.float32], Any, Any] | None = None
         if not self.needs_light:
@@ -114,10 +114,17 @@ class Preparation:
 
     def kernel(self, frames: NDArray[Any]) -> Direct:
         """Return the compiled function that measures groups of frames of this dtype."""
-        name = frames.dtype.str
-        if name not in self._kernels:
-            self._kernels[name] = Direct(self.prepared.kernel)
-        return self._kernels[name]
+        return self._direct(self.prepared.kernel, frames)
+
+    def light_kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that sums up their light."""
+        return self._direct(groups.light_of_groups, frames)
+
+    def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
+        key = kernel, frames.dtype.str
+        if key not in self._kernels:
+            self._kernels[key] = Direct(kernel)
+        return self._kernels[key]
 
     def task(self, variants: NDArray[np.int64], prior: NDArray[np.float32] | None = None) -> Task:
         """Return what the kernel is to do with frames.

@@ -226,7 +226,7 @@ class Settings:
         given = {name: value for name, value in changes.items() if name != "estimator"}
         if isinstance(wanted, Estimator):
             return self._of(wanted, self._shared.replaced(given))
-        if "denoise" in given and wanted == self.estimator.name == "tv":
+        if "denoise" in given and wanted == self.estimator.name and "noise_std" in self.estimator.declared():
             given.setdefault("noise_std", self.noise_std)  # which becomes 0 where it is false
         name, options = current_options(wanted, given)
         kept = {

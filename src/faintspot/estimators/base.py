@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.kernels.groups import COMMON_ROWS, STAGE_ROWS
+from faintspot.kernels.groups import COMMON_ROWS
 from faintspot.options import Options, is_auto
 
 Floats = NDArray[np.float64]
@@ -202,7 +202,6 @@ class Prepared:
     """Compiled function that measures groups of sub-apertures: see `faintspot.kernels.groups`."""
     setting_rows: int = COMMON_ROWS
     """Of the table of settings."""
-    stage_rows: int = STAGE_ROWS
     needs_light: bool = False
     """Whether the light must be measured in every frame."""
     light_step: float = 1.02

@@ -25,6 +25,11 @@ class BrightestPixels(KeepingBrightest):
     style = Style("#000000", "--", "o")
     automatic_method = "none"
 
+    @classmethod
+    def like(cls, other: KeepingBrightest) -> BrightestPixels:
+        """Return what keeps the same pixels as another estimator, without its denoising."""
+        return cls(**{name: getattr(other, name) for name in cls.declared()})
+
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
         return f"no denoising; {self.kept_in_words(n_subapertures, pixels)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from faintspot.checks import real_array
@@ -55,7 +54,6 @@ def measure(
     if stack.ndim != 3:
         raise InputError(f"images: expected shape (n, ny, nx), got {stack.shape}")
     n, ny, nx = stack.shape
-    corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
-    layout = Layout((n * ny, nx), (ny, nx), corners)
+    layout = Layout.stacked(n, (ny, nx))
     pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score)
     return pipeline(stack.reshape(n * ny, nx), prior)

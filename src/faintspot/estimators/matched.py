@@ -12,7 +12,6 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spots import BLURS, PSFPrepared
 from faintspot.estimators.stepping import Stepping
-from faintspot.kernels import located
 from faintspot.options import option
 
 
@@ -51,10 +50,4 @@ class Matched(Fitted):
 
     def prepared(self, sensor: Sensor) -> PSFPrepared:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
-
-
-class _Prepared(PSFPrepared):
-    """Tables of a fit in which every pixel has the same weight."""
-
-    kernel = staticmethod(located.fitted_of_groups)
+        return PSFPrepared(self, sensor)

@@ -75,8 +75,6 @@ class MaximumLikelihood(Likelihood):
 class LikelihoodPrepared(PSFPrepared):
     """Tables of a fit with weights; images of low noise are rounded to whole electrons."""
 
-    kernel = staticmethod(located.fitted_of_groups)
-
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         noise = sensor.calibration.read_noise_photoelectrons

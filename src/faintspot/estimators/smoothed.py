@@ -54,7 +54,7 @@ class Smoothed(KeepingBrightest):
 
     def without_denoising(self) -> BrightestPixels:
         """See `Estimator`."""
-        return BrightestPixels(**{name: getattr(self, name) for name in BrightestPixels.declared()})
+        return BrightestPixels.like(self)
 
     def default_of(self, name: str, pixels: int) -> Any:
         """See `Options`."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from faintspot.estimators import spot_tables
 from faintspot.estimators.base import Prepared
 from faintspot.estimators.spot_tables import SpotModel
+from faintspot.estimators.stepping import Stepping
 from faintspot.kernels import located
 from faintspot.kernels.groups import RANGE
 
@@ -25,6 +26,8 @@ class SpotPrepared(Prepared):
 
     setting_rows = located.SETTING_ROWS
 
+    estimator: Stepping
+
     @cached_property
     def model(self) -> SpotModel:
         """Profiles of the spots, or of weights."""
@@ -38,7 +41,7 @@ class SpotPrepared(Prepared):
     @property
     def step_count(self) -> int:
         """Steps of the fit."""
-        return int(getattr(self.estimator, "step_count", 1))
+        return self.estimator.step_count
 
     @property
     def rounds_electrons(self) -> bool:
@@ -98,7 +101,9 @@ class SpotPrepared(Prepared):
 
 
 class PSFPrepared(SpotPrepared):
-    """The same with the PSF itself."""
+    """The same for a fit of the PSF itself."""
+
+    kernel = staticmethod(located.fitted_of_groups)
 
     @cached_property
     def model(self) -> SpotModel:

@@ -92,7 +92,7 @@ class TotalVariation(KeepingBrightest):
 
     def without_denoising(self) -> BrightestPixels:
         """See `Estimator`."""
-        return BrightestPixels(**{name: getattr(self, name) for name in BrightestPixels.declared()})
+        return BrightestPixels.like(self)
 
     def for_bright_light(self) -> Estimator:
         """Do not denoise: an image without noise has nothing to take off."""

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import output_errors as output_errors
 
 
 @dataclass(frozen=True)

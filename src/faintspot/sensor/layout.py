@@ -187,6 +187,23 @@ class Layout:
         )
 
     @classmethod
+    def stacked(cls, n: int, window: tuple[int, int], offsets: NDArray[np.float64] | None = None) -> Layout:
+        """Return the layout of n images on top of each other, read as one tall frame.
+
+        Parameters
+        ----------
+        n : int
+        window : (int, int)
+            Height and width of an image.
+        offsets : (n, 2) array, optional
+            x, y of each sub-aperture's centre from the middle of its image, px. Default 0.
+        """
+        ny, nx = window
+        corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
+        middles = corners[:, ::-1] + 0.5 * (np.array([nx, ny]) - 1)
+        return cls((n * ny, nx), window, corners, middles if offsets is None else middles + offsets)
+
+    @classmethod
     def from_frame(
         cls,
         frame: ArrayLike,
