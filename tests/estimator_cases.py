@@ -138,7 +138,18 @@ def random_settings(rng: np.random.Generator, estimator: str, n: int, window: tu
         prior_std_px=rng.uniform(0.2, 2.0, n),
         error_scale=rng.uniform(0.5, 2.0, n),
         **optional,
+        **(window_options(rng, n) if estimator == "window" else {}),
     )
+
+
+def window_options(rng: np.random.Generator, n: int) -> dict[str, Any]:
+    """Of fixed windows."""
+    return {
+        "window_fwhm_px": rng.uniform(2.0, 20.0, n),
+        "region_px": rng.uniform(6.0, 40.0, n),
+        "normalisation": str(rng.choice(["mean", "frame"])),
+        "centroid_gain": None if rng.random() < 0.7 else rng.uniform(0.3, 1.5, n),
+    }
 
 
 def random_case(

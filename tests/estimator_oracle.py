@@ -183,6 +183,23 @@ def by_weight(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     return oracle.weighted(g, task, begin(case, s, g, task))
 
 
+def by_window(case: Case, s: int, g: Floats, task: Task) -> Estimate:
+    """Not limited to the window, as it is linear; slopes only to the search range."""
+    fwhm = (case.each("spot_fwhm_px")[s], case.each("spot_fwhm_y_px")[s])
+    how, gain = case.settings.normalisation, case.each("centroid_gain")[s]
+    divisor = float(case.each("flux_e")[s]) if how == "mean" else None
+    found = oracle.fixed_window(
+        g,
+        replace(task, spot=gaussian_spot(*fwhm)),
+        float(case.each("window_fwhm_px")[s]),
+        float(case.each("region_px")[s]),
+        divisor,
+        None if math.isnan(gain) else float(gain),
+    )
+    reach = np.nan_to_num(case.each("search_range_px"), nan=math.inf)[s]
+    return replace(found, x=oracle.clamp(found.x, -reach, reach), y=oracle.clamp(found.y, -reach, reach))
+
+
 def by_score(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     assert case.score is not None
     assert case.score.index is not None
@@ -225,6 +242,7 @@ METHODS: dict[str, tuple[Callable[[Case], list[Task]], Method]] = {
     "centroid": (tasks, by_gravity),
     "thresholded": (tasks, by_gravity),
     "smoothed": (tasks, by_gravity),
+    "window": (tasks, by_window),
     "weighted": (tasks, by_weight),
     "matched": (spot_tasks, by_fit),
     "ml": (spot_tasks, by_fit),

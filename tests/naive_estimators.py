@@ -292,6 +292,48 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
     return Estimate(x, y, total, error_x, error_y, margin)
 
 
+def fixed_window(
+    g: ArrayLike,
+    task: Task,
+    window_fwhm: float,
+    region: float,
+    divisor: float | None,
+    gain: float | None,
+) -> Estimate:
+    """Sum pixels under a Gaussian at the reference, over the expected light, or the frame's own where None.
+
+    The gain, where not given, is the slope of the response to the spot at +-0.25 px; at the reference a spot
+    is at 0. Weights below 1e-4 of the middle's, and outside the region, are 0.
+    """
+    assert task.spot is not None
+    g = np.asarray(g, np.float64)
+    ny, nx = g.shape
+    x0, y0 = task.reference
+    std_x = window_fwhm / FWHM_PER_STD / math.sqrt(task.axis_ratio)
+    std_y = window_fwhm / FWHM_PER_STD * math.sqrt(task.axis_ratio)
+    spot = task.spot.images(x0, y0, g.shape)[0]
+    weights = np.zeros((3, ny, nx))
+    for j, v in enumerate(pixel_centres(ny)):
+        for i, u in enumerate(pixel_centres(nx)):
+            w = math.exp(-0.5 * (((u - x0) / std_x) ** 2 + ((v - y0) / std_y) ** 2))
+            if w >= 1e-4 and max(abs(u - x0), abs(v - y0)) < region / 2:
+                weights[:, j, i] = w * (u - x0), w * (v - y0), w
+    for axis, step in enumerate(((0.25, 0.0), (0.0, 0.25))):
+        ahead = task.spot.images(x0 + step[0], y0 + step[1], g.shape)[0]
+        behind = task.spot.images(x0 - step[0], y0 - step[1], g.shape)[0]
+        seen = float(np.sum(weights[axis] * (ahead - behind))) / 0.5
+        weights[axis] /= max(seen, 0.02) if gain is None else gain
+    weights[2] /= max(float(np.sum(weights[2] * spot)), 0.02)
+    light = float(np.sum(weights[2] * g))
+    divisor = light if divisor is None else divisor
+    found, errors = [], []
+    for axis, home in enumerate((x0, y0)):
+        found.append(home + float(np.sum(weights[axis] * g)) / divisor - float(np.sum(weights[axis] * spot)))
+        noise = weights[axis] ** 2 * (task.variance + task.excess * divisor * np.maximum(spot, 0.0))
+        errors.append(task.error_scale * math.sqrt(float(noise.sum())) / divisor)
+    return Estimate(found[0], found[1], light, errors[0], errors[1])
+
+
 def thresholded(g: ArrayLike, threshold_e: float) -> Estimate:
     """Centre of gravity of what is above a threshold, which is subtracted."""
     spot = np.maximum(np.asarray(g, np.float64) - threshold_e, 0.0)

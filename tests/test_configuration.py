@@ -362,8 +362,8 @@ def test_bad_settings(words: str, text: str, tmp_path: Path) -> None:
     [
         ("layout.frame_shape: expected a value, found none", "[layout]\nwindow = 4"),
         (
-            "layout.window = 2: expected a number from 4 to 64",
-            "[layout]\nframe_shape=9\nwindow=2\ncorners=[[0,0]]",
+            "layout.window = 1: expected a number from 2 to 64",
+            "[layout]\nframe_shape=9\nwindow=1\ncorners=[[0,0]]",
         ),
         ("layout.corners", "[layout]\nframe_shape=9\nwindow=4\ncorners=[[0,0],[1]]"),
         ("layout: sub-aperture 0", "[layout]\nframe_shape=9\nwindow=4\ncorners=[[8,0]]"),
@@ -373,7 +373,7 @@ def test_bad_settings(words: str, text: str, tmp_path: Path) -> None:
         ("layout.grid: expected a table, got 3", "[layout]\ngrid = 3"),
         ("layout.grid.pixels: expected a value", "[layout.grid]\nshape = [2, 3]"),
         ("layout.grid.outer_radus: unknown key; did you mean outer_radius?", f"{LAYOUT}outer_radus = 1"),
-        ("layout.grid.pixels = 99: expected a number from 4 to 64", "[layout.grid]\nshape=[2, 3]\npixels=99"),
+        ("layout.grid.pixels = 99: expected a number from 2 to 64", "[layout.grid]\nshape=[2, 3]\npixels=99"),
         ("layout.grid.outer_radius = 0.1", f"{LAYOUT}outer_radius = 0.1"),
         ("layout: sub-apertures 0 and 1 overlap", f"{LAYOUT}pitch = 2"),
     ],

@@ -43,8 +43,8 @@ class TestAgainstOracle:
         case = random_case(width, estimator, n=7)
         assert assert_equals_oracle(case, case.measure(width=width)) > 2
 
-    @pytest.mark.parametrize("estimator", ["ml", "trained", "weighted"])
-    @pytest.mark.parametrize("window", [(4, 4), (5, 17), (20, 24)])
+    @pytest.mark.parametrize("estimator", ["ml", "trained", "weighted", "window", "brightest"])
+    @pytest.mark.parametrize("window", [(2, 2), (3, 5), (5, 17), (20, 24)])
     def test_any_window(self, estimator: str, window: tuple[int, int]) -> None:
         case = random_case(11, estimator, n=6, window=window)
         assert assert_equals_oracle(case, case.measure()) > 2

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from faintspot.pipeline import SlopePipeline as SlopePipeline
     from faintspot.planner import tune as tune
     from faintspot.sensor.calibration import Calibration as Calibration
+    from faintspot.sensor.fixed_weights import FixedWeights as FixedWeights
     from faintspot.sensor.layout import Layout as Layout
     from faintspot.sensor.photon_transfer import measure_detector as measure_detector
     from faintspot.sensor.psf import PSF as PSF
@@ -39,6 +40,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Calibration": "faintspot.sensor.calibration",
     "Denoised": "faintspot.estimate.total_variation",
+    "FixedWeights": "faintspot.sensor.fixed_weights",
     "InputError": "faintspot.errors",
     "Layout": "faintspot.sensor.layout",
     "MissingExtraError": "faintspot.errors",

@@ -13,14 +13,14 @@ from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score, load_score
 from faintspot.settings import Settings
 from faintspot.tables import errors_of_table, read_tables, save_tables, table_of, tables_as_text
 from faintspot.toml_files import check_keys
 
 _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
 
-Item = Layout | Calibration | Settings | PSF | TrainedScore
+Item = Layout | Calibration | Settings | PSF | Score
 
 
 class Configuration(NamedTuple):
@@ -30,7 +30,7 @@ class Configuration(NamedTuple):
     settings: Settings
     calibration: Calibration
     psf: PSF | None
-    score: TrainedScore | None
+    score: Score | None
 
 
 def load(path: str | Path, table: str) -> Any:
@@ -92,7 +92,7 @@ def save(path: str | Path, item: Item) -> None:
     InputError
         When the file exists and is not TOML, or cannot be written.
     """
-    if not isinstance(item, PSF | TrainedScore):
+    if not isinstance(item, PSF | Score):
         item.save(path)
         return
     table = "psf" if isinstance(item, PSF) else "score"
@@ -124,12 +124,12 @@ def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
         return PSF.load(_named_file(path, "psf", values, ("file", "profile")))
 
 
-def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> TrainedScore | None:
+def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
     """Return the score that a configuration file names, if any."""
     if "score" not in document:
         return None
     with errors_of_table(path, "score"):
-        return TrainedScore.load(_named_file(path, "score", document["score"], ("file",)))
+        return load_score(_named_file(path, "score", document["score"], ("file",)))
 
 
 def _named_file(path: Path, table: str, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:

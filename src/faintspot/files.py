@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -72,6 +72,29 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
         When it cannot be written.
     """
     write_atomically(path, lambda stream: np.savez_compressed(stream, **arrays))
+
+
+def read_arrays(
+    path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the arrays of these names from a NumPy file (.npz) that should hold `what`.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or one that is not optional is missing.
+    """
+    try:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            values: dict[str, Any] = {name: stored[name] for name in names if name in stored}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Exception:  # a damaged archive raises whatever its decoder meets
+        raise InputError(f"{path}: expected {what} (.npz), got something else") from None
+    for name in names:
+        if name not in values and name not in optional:
+            raise InputError(f"{path}: expected {what}, but {name} is missing")
+    return values
 
 
 def replace_file(path: Path, content: Content) -> None:

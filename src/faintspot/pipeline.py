@@ -23,7 +23,7 @@ from faintspot.preparation import Preparation, packed_calibration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.settings import Settings
 from faintspot.slopes import RESULT_TYPES, Slopes, Stages
 
@@ -45,8 +45,8 @@ class SlopePipeline:
         y, or (2 n,) all x then all y, or the slopes of one frame. Default 0.
     psf : PSF, optional
         Needed by estimators that know the spot itself; tells others the spots' width.
-    score : TrainedScore, optional
-        Needed by estimators that apply one.
+    score : Score, optional
+        Needed by estimators that apply one: `TrainedScore`; `FixedWeights` take the place of a window's.
     width : int, optional
         SIMD width in float32 numbers: 4, 8 or 16. Default: what the machine has.
     threads : int, optional
@@ -78,7 +78,7 @@ class SlopePipeline:
         reference: ArrayLike | Slopes | None = None,
         *,
         psf: PSF | None = None,
-        score: TrainedScore | None = None,
+        score: Score | None = None,
         width: int | None = None,
         threads: int | None = None,
         device: str = "cpu",
@@ -325,7 +325,7 @@ def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, n: int) -> NDArray[n
     return np.ascontiguousarray(array.reshape(-1, 2, n), np.float32)
 
 
-def _identity(psf: PSF | None, score: TrainedScore | None, zero: NDArray[np.float64]) -> bytes:
+def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -> bytes:
     """A digest of what slopes depend on beside layout, settings and calibration."""
     digest = hashlib.sha256(zero.tobytes())
     for part in (psf, score):

@@ -18,7 +18,7 @@ from faintspot.kernels.groups import Task
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.settings import Settings, spot_fwhm_px
 
 _MOST_LIGHT_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
@@ -61,7 +61,7 @@ class Preparation:
         settings: Settings,
         calibration: Calibration,
         psf: PSF | None,
-        score: TrainedScore | None,
+        score: Score | None,
         zero: Floats,
         width: int,
     ) -> None:

@@ -25,7 +25,7 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.settings import Settings
 from faintspot.simulate.spots import spots
 from faintspot.slopes import Slopes
@@ -49,7 +49,7 @@ class EstimatorTests:
         """Return the estimator with options that suit 16 x 16 px, spots of 2 px and 1 e- of read noise."""
         raise NotImplementedError
 
-    def score(self) -> TrainedScore | None:
+    def score(self) -> Score | None:
         """Return the score that it applies, if it does."""
         return None
 

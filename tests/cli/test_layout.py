@@ -192,7 +192,7 @@ def test_which_lenslets(folder: Path, run: Commands) -> None:
         ("--window", "12", "height and width"),
         ("--window", "3,12", "pixels = 3"),
         ("--lit-fraction", "2", "lit-fraction = 2"),
-        ("--pitch", "2", "windows below 4 px are not supported yet"),
+        ("--pitch", "2", "spots of quad cells overlap"),
     ):
         assert words in run.refused("layout", "a.npy", "-o", "o.toml", option, value).error
     run.refused(

@@ -100,7 +100,7 @@ CONFIGURATIONS: list[tuple[str, tuple[str, ...]]] = [
     (CONFIGURATION.replace("2.0", "[1.0, 2.0]"), ("noise_std", "16", "2")),
     (CONFIGURATION.replace("= 10", "= 64"), ("keep_brightest", "64", "63")),
     (CONFIGURATION.replace("= 10", "= 2.5"), ("settings.keep_brightest", "2.5", "whole number")),
-    (CONFIGURATION.replace("pixels = 8", "pixels = 2"), ("layout.grid", "pixels", "2", "from 4 to 64")),
+    (CONFIGURATION.replace("pixels = 8", "pixels = 1"), ("layout.grid", "pixels", "1", "from 2 to 64")),
     (CONFIGURATION.replace("[4, 4]", '"4x4"'), ("layout.grid", "shape")),
     (
         CONFIGURATION.replace("pixels = 8", "pixels = 8\npixel = 8"),

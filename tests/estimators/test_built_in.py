@@ -23,6 +23,7 @@ from faintspot.estimators.thresholded import Thresholded
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.trained import Trained
 from faintspot.estimators.weighted import Weighted
+from faintspot.estimators.window import Window
 from faintspot.testing import FLUX_E, READ_NOISE_E, SIDE, EstimatorTests
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_estimator.py"
@@ -67,6 +68,11 @@ class TestCentroid(EstimatorTests):
 class TestThresholded(EstimatorTests):
     def make(self) -> Estimator:
         return Thresholded(threshold_e=5.0)
+
+
+class TestWindow(EstimatorTests):
+    def make(self) -> Estimator:
+        return Window(window_fwhm_px=4.0)
 
 
 class TestWeighted(EstimatorTests):

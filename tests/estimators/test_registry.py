@@ -23,6 +23,7 @@ BUILT_IN = [
     "smoothed",
     "centroid",
     "thresholded",
+    "window",
     "weighted",
     "matched",
     "ml",

@@ -109,7 +109,7 @@ class TestLayout:
             ("pitch_px = 0", {"pitch_px": 0.0}),
             ("pitch_px", {"pitch_px": "8"}),
             ("angle_deg = 400", {"angle_deg": 400.0}),
-            ("window = 2", {"window": (2, 2)}),
+            ("window = 1", {"window": (1, 2)}),
             ("frame_shape", {"frame_shape": (8, 16, 3)}),
         ],
     )

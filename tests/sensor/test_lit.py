@@ -213,7 +213,7 @@ def test_region_of_interest() -> None:
         ("roi = 10, 0, 5, 20: expected x0 < x1", {"roi": (10, 0, 5, 20)}),
         ("within the frame's 60 columns and 50 rows", {"roi": (0, 0, 61, 50)}),
         ("roi = 0.5", {"roi": (0.5, 0, 10, 10)}),
-        ("pitch_px = 2: windows below 4 px are not supported yet", {"pitch_px": 2}),
+        ("pitch_px = 2: expected 4 to", {"pitch_px": 2}),
         ("pitch_px = 40: expected at most 31.25", {"pitch_px": 40}),
     ],
 )

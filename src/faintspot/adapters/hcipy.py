@@ -13,7 +13,7 @@ from faintspot.errors import InputError, MissingExtraError
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.settings import Settings
 from faintspot.slopes import Slopes
@@ -43,7 +43,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
     calibration : Calibration, optional
         Default: images are in electrons. Its maps have the shape of `image.shaped`.
     psf : PSF, optional
-    score : TrainedScore, optional
+    score : Score, optional
         For the estimators that need them, see `faintspot.SlopePipeline`.
     detector_grid : hcipy.Grid, optional
         Pixel centres, m: regular and Cartesian. Default: the grid of `mla_index`; a detector with other
@@ -77,7 +77,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         settings: Settings,
         calibration: Calibration | None = None,
         psf: PSF | None = None,
-        score: TrainedScore | None = None,
+        score: Score | None = None,
         detector_grid: Any = None,
         pixels: int | None = None,
     ) -> None:

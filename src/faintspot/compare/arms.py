@@ -11,7 +11,7 @@ from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.scene import Scene
 from faintspot.options import AUTO
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.settings import Settings
 
 
@@ -38,7 +38,7 @@ class Arm:
     ----------
     settings : Settings
         With the estimator and its options.
-    psf, score : PSF, TrainedScore, optional
+    psf, score : PSF, Score, optional
         What the estimator knows.
     title : str
         What tables and figures call it. Default: the estimator's label.
@@ -46,7 +46,7 @@ class Arm:
 
     settings: Settings
     psf: PSF | None = None
-    score: TrainedScore | None = None
+    score: Score | None = None
     title: str = ""
 
     @property
@@ -89,7 +89,7 @@ def arm_for_scene(
     scene: Scene,
     *,
     psf: PSF | None = None,
-    score: TrainedScore | None = None,
+    score: Score | None = None,
 ) -> Arm:
     """Return an estimator with the options that a scene asks for, before any are tuned.
 
@@ -98,7 +98,7 @@ def arm_for_scene(
     kind : type of Estimator
     scene : Scene
         Its range of positions is the search range.
-    psf, score : PSF, TrainedScore, optional
+    psf, score : PSF, Score, optional
         Only what the estimator needs is kept.
 
     Raises

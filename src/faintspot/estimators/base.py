@@ -19,6 +19,7 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels.groups import COMMON_ROWS
 from faintspot.options import Options, is_auto
+from faintspot.sensor.score import TrainedScore
 
 Floats = NDArray[np.float64]
 
@@ -157,7 +158,7 @@ class Estimator(Options):
         """
         missing = {
             Need.PSF: sensor.psf is None,
-            Need.SCORE: sensor.score is None,
+            Need.SCORE: not isinstance(sensor.score, TrainedScore),
             Need.READ_NOISE: sensor.calibration.read_noise_e is None,
             Need.WIDTH: bool(np.isnan(sensor.spot_fwhm_px).any()),
         }

@@ -11,7 +11,7 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.settings import Settings
 from faintspot.slopes import Slopes
 
@@ -22,7 +22,7 @@ def measure(
     *,
     calibration: Calibration | None = None,
     psf: PSF | None = None,
-    score: TrainedScore | None = None,
+    score: Score | None = None,
     prior: ArrayLike | None = None,
 ) -> Slopes:
     """Measure the positions of the spots of a stack of images, each image a sub-aperture of its own.

@@ -19,6 +19,7 @@ _BUILT_IN = (
     "smoothed",
     "centroid",
     "thresholded",
+    "window",
     "weighted",
     "matched",
     "maximum_likelihood",

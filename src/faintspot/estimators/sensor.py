@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class Sensor:
     ----------
     layout : Layout
     calibration : Calibration
-    psf, score : PSF, TrainedScore, or None
+    psf, score : PSF, Score, or None
     zero : (n, 2) array
         Reference positions, px from the windows' middles.
     search_range_px : (n,) array
@@ -40,7 +40,7 @@ class Sensor:
     layout: Layout
     calibration: Calibration
     psf: PSF | None
-    score: TrainedScore | None
+    score: Score | None
     zero: Floats
     search_range_px: Floats
     flux_e: Floats

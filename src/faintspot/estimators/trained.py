@@ -15,6 +15,7 @@ from faintspot.estimators.base import Estimator, Need, Prepared, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import located
+from faintspot.sensor.score import TrainedScore
 
 Floats = NDArray[np.float64]
 _LEAST_SMOOTHING_PX = 0.1
@@ -36,7 +37,8 @@ class Trained(Estimator):
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""
         super().check(sensor)
-        kinds = None if sensor.score is None else sensor.score.index
+        assert isinstance(sensor.score, TrainedScore)
+        kinds = sensor.score.index
         if kinds is not None and len(kinds) != sensor.n:
             raise InputError(
                 f"score.index: expected {sensor.n} numbers, one per sub-aperture, got {len(kinds)}"
@@ -55,7 +57,7 @@ class _Prepared(Prepared):
 
     def __init__(self, estimator: Trained, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
-        assert sensor.score is not None
+        assert isinstance(sensor.score, TrainedScore)
         self._score = sensor.score
         self.needs_light = bool(np.isnan(sensor.flux_e).all())
 

@@ -17,7 +17,7 @@ from faintspot.loop.camera import make_detector
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.options import AUTO, Option
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score, TrainedScore
 from faintspot.settings import Settings
 
 Choice = Mapping[str, Any]
@@ -56,7 +56,7 @@ class LoopArm:
         Whether slopes are divided by the centroid gain measured at the run's flux.
     true_slopes : bool
         Whether slopes are the wavefront's true mean gradients instead of measured ones.
-    psf, score : PSF, TrainedScore, optional
+    psf, score : PSF, Score, optional
         For the estimators that need them. Default PSF: that of a flat wavefront.
 
     Raises
@@ -74,7 +74,7 @@ class LoopArm:
     correct_gain: bool = True
     true_slopes: bool = False
     psf: PSF | None = None
-    score: TrainedScore | None = None
+    score: Score | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.label, str) or not self.label:
@@ -84,7 +84,7 @@ class LoopArm:
         if self.gain is not None:
             number_between("arm.gain", self.gain, 0, 2)
         if self.window_pixels is not None:
-            number_between("arm.window_pixels", self.window_pixels, 4, 64, integer=True)
+            number_between("arm.window_pixels", self.window_pixels, 2, 64, integer=True)
 
 
 Arm = LoopArm

@@ -19,7 +19,7 @@ from faintspot.estimators.registry import FORMER_NAMES
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score
 from faintspot.settings import Settings
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class ArmResult:
         return self.arm.psf
 
     @property
-    def score(self) -> TrainedScore | None:
+    def score(self) -> Score | None:
         """What the arm has learnt."""
         return self.arm.score
 

@@ -20,11 +20,11 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.sensor.score import Score, load_score
 from faintspot.settings import Settings
 from faintspot.tables import read_tables
 
-_Part = TypeVar("_Part", PSF, TrainedScore)
+_Part = TypeVar("_Part", PSF, Score)
 
 
 @dataclass
@@ -38,7 +38,7 @@ class StoredRun:
     settings: Settings | None = None
     calibration: Calibration | None = None
     psf: PSF | None = None
-    score: TrainedScore | None = None
+    score: Score | None = None
     lost: list[str] = field(default_factory=list)
     """What a pipeline may lack: a PSF or a score whose file is gone."""
 
@@ -126,7 +126,7 @@ def _rebuild(store: StoredRun) -> None:
     if not mapless:
         store.calibration = _original_calibration(store, tables["calibration"])
     store.psf = _of_the_spot(store, "psf", PSF.load, configuration.psf_of)
-    store.score = _of_the_spot(store, "score", TrainedScore.load, configuration.score_of)
+    store.score = _of_the_spot(store, "score", load_score, configuration.score_of)
 
 
 def _of_the_spot(

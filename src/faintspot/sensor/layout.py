@@ -32,7 +32,7 @@ class Layout:
     frame_shape : (int, int)
         Height and width of a frame in pixels.
     window : (int, int)
-        Height and width of every sub-aperture in pixels, 4 to 64.
+        Height and width of every sub-aperture in pixels, 2 (quad cells) to 64.
     corners : (n, 2) array of int
         Row and column of each window's first pixel.
     centres : (n, 2) array, optional

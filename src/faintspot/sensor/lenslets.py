@@ -15,10 +15,10 @@ from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_la
 from faintspot.sensor.lit import Lit, find_lit
 from faintspot.sensor.nodes import NodeLight, measure_nodes, spot_width
 from faintspot.sensor.region import Pupil, Rectangle
-from faintspot.sensor.window_size import SMALLEST_WINDOW
 
 _FIT_PASSES = 4
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
+_SMALLEST_GIVEN_PITCH_PX = 4
 
 
 @dataclass(frozen=True)
@@ -144,10 +144,10 @@ def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float,
     if pitch_px is None:
         return SMALLEST_PITCH_PX, largest
     pitch_px = number_between("pitch_px", pitch_px, 0.0, low_open=True)
-    if pitch_px < SMALLEST_WINDOW:
+    if pitch_px < _SMALLEST_GIVEN_PITCH_PX:
         raise InputError(
-            f"pitch_px = {pitch_px:g}: windows below {SMALLEST_WINDOW} px are not supported yet, expected "
-            f"{SMALLEST_WINDOW} to {largest:g}"
+            f"pitch_px = {pitch_px:g}: expected {_SMALLEST_GIVEN_PITCH_PX} to {largest:g}; spots of quad "
+            "cells overlap too much to be found, give their places as [layout.grid] in a configuration file"
         )
     if pitch_px > largest:
         raise InputError(

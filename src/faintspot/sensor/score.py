@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, image_stack, number_between, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.files import read_arrays, save_arrays
+from faintspot.sensor.fixed_weights import FixedWeights
 
 STARTS = ("reference", "peak")
 _BLOCK_IMAGES = 4096  # images worked on at a time: bounds the memory of the gathered tables
@@ -225,12 +227,7 @@ class TrainedScore:
         InputError
             When the file cannot be written.
         """
-        arrays = {name: getattr(self, name) for name in _FIELDS if getattr(self, name) is not None}
-        try:
-            with Path(path).open("wb") as file:
-                np.savez_compressed(file, **arrays)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        save_arrays(path, {name: getattr(self, name) for name in _FIELDS if getattr(self, name) is not None})
 
     @classmethod
     def load(cls, path: str | Path) -> TrainedScore:
@@ -241,21 +238,30 @@ class TrainedScore:
         InputError
             When the file cannot be read or holds something else.
         """
-        try:
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                values: dict[str, Any] = {name: stored[name] for name in _FIELDS if name in stored}
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except Exception:  # a damaged archive raises whatever its decoder meets
-            raise InputError(f"{path}: expected a trained score (.npz), got something else") from None
-        missing = [name for name in _FIELDS if name not in values and name != "index"]
-        if missing:
-            raise InputError(f"{path}: expected a trained score, but {missing[0]} is missing")
+        values = read_arrays(path, "a trained score", _FIELDS, optional=("index",))
         values["start"] = str(values["start"])
         try:
             return cls(**values)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+
+
+Score = TrainedScore | FixedWeights
+"""What an estimator applies that was learnt or made by hand."""
+
+
+def load_score(path: str | Path) -> Score:
+    """Read a trained score, or fixed weights.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or holds something else.
+    """
+    try:
+        return FixedWeights.load(path)
+    except InputError:
+        return TrainedScore.load(path)
 
 
 def table_sums(

@@ -9,7 +9,7 @@ import numpy as np
 from faintspot.checks import numbers_between
 from faintspot.errors import InputError
 
-SMALLEST_WINDOW, LARGEST_WINDOW = 4, 64
+SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
 
 
 def window_size(name: str, value: Any) -> tuple[int, int]:

@@ -1,0 +1,234 @@
+"""Slopes that are linear in the pixels: a fixed Gaussian window, or any fixed weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.estimators.base import Estimator, Need, Prepared, Style
+from faintspot.estimators.registry import register
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.sensor import Sensor
+from faintspot.estimators.spot_tables import FWHM_TO_STD, gaussian_psf
+from faintspot.kernels import window
+from faintspot.options import option
+from faintspot.sensor.fixed_weights import FixedWeights
+
+Floats = NDArray[np.float64]
+
+_WIDTHS = (1.25, 0.8, 1.0, 1.6, 2.0, 2.8)  # times the spot's
+_WIDTHS_OF_SPECKLES = (2.0, 1.0, 1.25, 1.6, 2.8, 4.0)
+_LEAST_WEIGHT = 1e-4  # of the window's middle: what is less counts nothing, and need not be read
+_STEP_PX = 0.25  # by which the spot is moved to find the gain
+_SMALLEST_GAIN = 0.02
+_LEAST_LIGHT_E = 1e-3
+MEAN, FRAME, NONE = "mean", "frame", "none"
+
+
+@register
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Window(Estimator):
+    """Centre of gravity under a fixed window over its mean light and its gain (Nicolle et al. 2004)."""
+
+    window_fwhm_px: Any = option(
+        None,
+        "Full width at half maximum of the Gaussian window at the reference position, geometric mean of both "
+        "axes; it is elongated like the spot. Default: that of the spot. Fixed weights that the pipeline is "
+        "given take its place.",
+        unit="px",
+        low=0.1,
+        high=1e3,
+    )
+    region_px: Any = option(
+        None,
+        "Side of the square of pixels around the reference position that count. Default: the whole "
+        "sub-aperture.",
+        unit="px",
+        low=0.0,
+        high=64.0,
+        low_open=True,
+    )
+    normalisation: Any = option(
+        None,
+        'What the sums are divided by: "mean", the light that is expected (`flux_e`, or a running mean); '
+        '"frame", the light of the frame itself under the window; "none": nothing. Default: "mean" where '
+        'the light is known, else "frame".',
+        choices=(MEAN, FRAME, NONE),
+        per_subaperture=False,
+    )
+    centroid_gain: Any = option(
+        None,
+        "Slope that the window shows for a displacement of 1 px, by which slopes are divided. Default: that "
+        "of the spot near the reference position.",
+        low=0.0,
+        high=100.0,
+        low_open=True,
+    )
+
+    name = "window"
+    label = "fixed window"
+    method = "centre of gravity under a fixed window, over its mean light and gain"
+    needs = frozenset({Need.WIDTH})
+    cost = 0.16
+    style = Style("#000000", "--", "o")
+
+    def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
+        """Widths around the spot's; wider ones where it is speckled."""
+        factors = _WIDTHS_OF_SPECKLES if scene.d_over_r0 > 1 else _WIDTHS
+        return {"window_fwhm_px": [factor * scene.seen_fwhm_px for factor in factors]}
+
+    def for_bright_light(self) -> Window:
+        """Divide by the light that is there."""
+        return self.replaced({"normalisation": FRAME}) if self.normalisation == MEAN else self
+
+    def check(self, sensor: Sensor) -> None:
+        """See `Estimator`."""
+        weights = sensor.score
+        if isinstance(weights, FixedWeights):
+            if weights.window != sensor.window:
+                wanted, got = (f"{ny} x {nx}" for ny, nx in (sensor.window, weights.window))
+                raise InputError(f"weights: expected windows of {wanted} px as in the layout, got {got}")
+            weights.kinds(sensor.n)
+        else:
+            super().check(sensor)
+        if self.normalisation == MEAN and np.isnan(sensor.flux_e).any():
+            raise InputError(
+                f"settings.flux_e: expected the light of the spots (electrons) for estimator {self.name!r} "
+                'with normalisation "mean", got none'
+            )
+
+    def prepared(self, sensor: Sensor) -> Prepared:
+        """See `Estimator`."""
+        return _Prepared(self, sensor)
+
+
+class _Prepared(Prepared):
+    """Weights of every sub-aperture, and what follows from them."""
+
+    kernel = staticmethod(window.window_of_groups)
+    setting_rows = window.SETTING_ROWS
+    own_scratch = staticmethod(window.no_scratch)
+
+    estimator: Window
+
+    @cached_property
+    def weights(self) -> FixedWeights:
+        """Those that were given, or those of the Gaussian windows."""
+        given, sensor = self.sensor.score, self.sensor
+        if not isinstance(given, FixedWeights):
+            return self._gaussian()
+        gain, region = self.each("centroid_gain"), self._half_regions()
+        if np.isnan(gain).all() and region.min() > max(sensor.window):
+            return given
+        kinds, gain = given.kinds(sensor.n), np.nan_to_num(gain, nan=1.0)[:, None, None]
+        inside = ~_outside(*_offsets(sensor.layout.offsets, sensor.window), region)
+        x, y, spot, light = (maps[kinds] for maps in (given.x, given.y, given.mean_spot, given.light))
+        return FixedWeights(inside * x / gain, inside * y / gain, spot, inside * light, np.arange(sensor.n))
+
+    def _gaussian(self) -> FixedWeights:
+        """Windows around the reference positions."""
+        sensor = self.sensor
+        gain, region = np.nan_to_num(self.each("centroid_gain")), self._half_regions()
+        planes = np.zeros(sensor.n) if sensor.psf is None else sensor.psf.index_of(sensor.n)
+        parts = [sensor.zero, self._window_std_px(), sensor.spot_fwhm_px, planes, gain, region]
+        kinds, index = np.unique(np.column_stack(parts), axis=0, return_inverse=True)
+        zero, std, own = kinds[:, :2], kinds[:, 2:4], kinds[:, 7]
+        spots = gaussian_psf(kinds[:, 4:6]) if sensor.psf is None else sensor.psf
+        which = np.arange(len(kinds)) if sensor.psf is None else kinds[:, 6].astype(np.int64)
+        u, v = _offsets(zero, sensor.window)
+        weight = np.exp(-0.5 * ((u / std[:, :1, None]) ** 2 + (v / std[:, 1:, None]) ** 2))
+        weight[(weight < _LEAST_WEIGHT) | _outside(u, v, kinds[:, 8])] = 0.0
+        maps = [weight * u, weight * v]
+        for axis in range(2):
+            seen = own
+            if not own.all():
+                step = np.eye(2)[axis] * _STEP_PX
+                ahead, behind = (spots.images(zero + d, sensor.window, which=which) for d in (step, -step))
+                slope = (maps[axis] * (ahead - behind)).sum(axis=(1, 2)) / (2 * _STEP_PX)
+                seen = np.where(own > 0, own, np.maximum(slope, _SMALLEST_GAIN))
+            maps[axis] = maps[axis] / seen[:, None, None]
+        at_reference = spots.images(zero, sensor.window, which=which)
+        seen = np.maximum((weight * at_reference).sum(axis=(1, 2)), _SMALLEST_GAIN)
+        return FixedWeights(maps[0], maps[1], at_reference, weight / seen[:, None, None], index.reshape(-1))
+
+    def _window_std_px(self) -> Floats:
+        """Standard deviations of the windows along x and y, (n, 2)."""
+        spot = self.sensor.spot_fwhm_px
+        factor = self.each("window_fwhm_px") / np.sqrt(spot.prod(axis=1))
+        std: Floats = FWHM_TO_STD * spot * np.where(np.isnan(factor), 1.0, factor)[:, None]
+        return std
+
+    def _half_regions(self) -> Floats:
+        """Half of the sides of the regions that count, (n,) px."""
+        half: Floats = np.minimum(0.5 * np.nan_to_num(self.each("region_px"), nan=np.inf), 1e3)
+        return half
+
+    @cached_property
+    def tables(self) -> Any:
+        """See `Prepared`."""
+        weights, width = self.weights, self.sensor.width
+        maps = np.stack([weights.x, weights.y, weights.light], axis=-1)
+        counted = np.argwhere(maps.any(axis=(0, 3)))
+        counted = counted if len(counted) else np.zeros((1, 2), np.int64)
+        (top, left), (bottom, right) = counted.min(axis=0), counted.max(axis=0) + 1
+        n_groups = -(-self.sensor.n // width)
+        lanes = np.minimum(np.arange(n_groups * width), self.sensor.n - 1)
+        packed = maps[weights.kinds(self.sensor.n)[lanes], top:bottom, left:right]
+        packed = packed.reshape(n_groups, width, *packed.shape[1:]).transpose(0, 2, 3, 4, 1)
+        return window.WindowTables(
+            np.ascontiguousarray(packed, np.float32),
+            int(top),
+            int(left),
+            int(bottom - top),
+            int(right - left),
+        )
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `Prepared`."""
+        weights, sensor = self.weights, self.sensor
+        kinds = weights.kinds(sensor.n)
+        fixed = isinstance(sensor.score, FixedWeights)
+        table[window.HOME_X], table[window.HOME_Y] = (sensor.layout.offsets if fixed else sensor.zero).T
+        photons = sensor.excess_noise * np.maximum(weights.mean_spot, 0.0)
+        rows = zip(
+            (window.DARK_X, window.DARK_Y, window.DARK_LIGHT),
+            (window.PHOTON_X, window.PHOTON_Y, window.PHOTON_LIGHT),
+            (weights.x, weights.y, weights.light),
+            strict=True,
+        )
+        for dark, photon, maps in rows:
+            table[dark] = self.variance * np.square(maps).sum(axis=(1, 2))[kinds]
+            table[photon] = (photons * np.square(maps)).sum(axis=(1, 2))[kinds]
+
+    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `Prepared`."""
+        weights, how = self.weights, self.estimator.normalisation
+        kinds = weights.kinds(self.sensor.n)
+        offsets = [(maps * weights.mean_spot).sum(axis=(1, 2))[kinds] for maps in (weights.x, weights.y)]
+        if how == NONE:
+            table[window.DIVISOR], offsets = 1.0, [np.zeros(1), np.zeros(1)]
+        elif how == FRAME:
+            table[window.DIVISOR] = 0.0
+        else:
+            # A spot that is known to have no light is none; where nothing is known, the frame says it.
+            lit = np.where(flux_e > _LEAST_LIGHT_E, flux_e, -1.0)
+            table[window.DIVISOR] = np.where(np.isnan(flux_e), 0.0, lit)
+        table[window.OFFSET_X], table[window.OFFSET_Y] = offsets
+
+
+def _offsets(middles: Floats, window_px: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Return how far pixels are from middles (n, 2), px from the window's: (n, 1, nx) and (n, ny, 1)."""
+    v, u = (np.arange(side) - 0.5 * (side - 1) for side in window_px)
+    return u - middles[:, :1, None], v[:, None] - middles[:, 1:, None]
+
+
+def _outside(u: Floats, v: Floats, half: Floats) -> NDArray[np.bool_]:
+    """Return which pixels are not within half a side of the middles."""
+    away: NDArray[np.bool_] = np.maximum(np.abs(u), np.abs(v)) >= half[:, None, None]
+    return away
