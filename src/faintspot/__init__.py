@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from faintspot.estimate.total_variation import Denoised as Denoised
     from faintspot.estimate.total_variation import tv_denoise as tv_denoise
     from faintspot.flags import SubapertureFlag as SubapertureFlag
+    from faintspot.light import MeanLight as MeanLight
     from faintspot.pipeline import SlopePipeline as SlopePipeline
     from faintspot.planner import tune as tune
     from faintspot.sensor.calibration import Calibration as Calibration
@@ -43,6 +44,7 @@ _HOMES = {
     "FixedWeights": "faintspot.sensor.fixed_weights",
     "InputError": "faintspot.errors",
     "Layout": "faintspot.sensor.layout",
+    "MeanLight": "faintspot.light",
     "MissingExtraError": "faintspot.errors",
     "PSF": "faintspot.sensor.psf",
     "RunningPSF": "faintspot.training",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot import configuration
-from faintspot.checks import finite_array, number_between, one_of, real_array
+from faintspot.checks import finite_array, number_between, numbers_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
+from faintspot.light import MeanLight
 from faintspot.preparation import Preparation, packed_calibration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
@@ -157,6 +159,36 @@ class SlopePipeline:
             threads=self.threads,
             device=self.device,
         )
+
+    def with_light(self, light: MeanLight | ArrayLike) -> SlopePipeline:
+        """Return the same pipeline for a mean light of its sub-apertures.
+
+        Estimators that use the light measure it in every frame where nobody tells them (`flux_e`), which
+        costs precision when a frame is faint. Light counts in steps of a few per cent: where it has not
+        changed by so much, this pipeline itself is returned, so that it may be called in every frame.
+
+        Parameters
+        ----------
+        light : MeanLight, or float or (n,) array
+            Electrons of a frame.
+
+        Raises
+        ------
+        InputError
+            For light that is not positive, or of another number of sub-apertures.
+        """
+        flux = light.positive_flux_e if isinstance(light, MeanLight) else light
+        flux = numbers_between("light", flux, 0.0, 1e12, low_open=True)
+        if flux.shape not in ((), (len(self.layout),)):
+            raise InputError(f"light: expected one number or {len(self.layout)}, got shape {flux.shape}")
+        step = math.log(self.preparation.prepared.light_step)
+        known = self.preparation.sensor.flux_e
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steady = np.abs(np.log(flux / known)) <= step
+        if steady.all():
+            return self
+        rounded = np.exp(step * np.rint(np.log(flux) / step))
+        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
 
     def for_images(self) -> SlopePipeline:
         """Return the same pipeline for calibrated images (n, ny, nx), electrons, read as one tall frame."""

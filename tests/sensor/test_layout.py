@@ -48,7 +48,7 @@ class TestGrid:
             ("no sub-aperture is lit", {"outer_radius": 1.0, "inner_radius": 2.0}),
             ("overlap", {"pitch": 3}),
             ("leaves the frame of 10 x 28", {"frame_shape": (10, 28)}),
-            ("pixels = 3", {"pixels": 3}),
+            ("pixels = 1", {"pixels": 1}),
             ("pixels = 65", {"pixels": 65}),
             ("pixels = 4.5", {"pixels": 4.5}),
             ("pixels", {"pixels": (4, 4, 4)}),

@@ -93,6 +93,11 @@ class Estimator(Options):
         return self.needs
 
     @property
+    def uses_light(self) -> bool:
+        """Whether it is better for knowing the mean light, as `faintspot.MeanLight` finds it."""
+        return False
+
+    @property
     def denoises(self) -> bool:
         """Whether it removes noise from the images before it measures them."""
         return False

@@ -72,6 +72,11 @@ class KeepingBrightest(Gravity):
     """What `automatic_kept_pixels` calls it."""
 
     @property
+    def uses_light(self) -> bool:
+        """See `Estimator`."""
+        return self.is_automatic
+
+    @property
     def is_automatic(self) -> bool:
         """Whether some option follows from the light."""
         return is_auto(self.keep_brightest)

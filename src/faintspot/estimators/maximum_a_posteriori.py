@@ -54,6 +54,11 @@ class MaximumAPosteriori(Likelihood):
     takes_prior = True
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3, "fast": 2}
 
+    @property
+    def uses_light(self) -> bool:
+        """See `Estimator`."""
+        return True
+
     def for_scene(self, scene: Scene) -> Self:
         """Take the spread of positions that are uniform within their range."""
         return super().for_scene(scene).replaced({"prior_std_px": scene.position_range_px / math.sqrt(3)})

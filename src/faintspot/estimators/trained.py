@@ -34,6 +34,11 @@ class Trained(Estimator):
     style = Style("#6b3fa0", "-", "h")
     takes_prior = True
 
+    @property
+    def uses_light(self) -> bool:
+        """See `Estimator`."""
+        return True
+
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""
         super().check(sensor)

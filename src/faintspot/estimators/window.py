@@ -78,6 +78,11 @@ class Window(Estimator):
     cost = 0.16
     style = Style("#000000", "--", "o")
 
+    @property
+    def uses_light(self) -> bool:
+        """See `Estimator`."""
+        return self.normalisation in (None, MEAN)
+
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Widths around the spot's; wider ones where it is speckled."""
         factors = _WIDTHS_OF_SPECKLES if scene.d_over_r0 > 1 else _WIDTHS

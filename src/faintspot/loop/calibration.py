@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
+from faintspot.light import MeanLight
 from faintspot.loop.arms import LoopArm
 from faintspot.loop.atmosphere import MovingLayers
 from faintspot.loop.camera import Exposing, camera_calibration
@@ -143,6 +144,22 @@ def typical_spots(
         pairs.append([sensor.spots(wavefront, sign * _DITHER_PX) for sign in (1.0, -1.0)])
     up, down = (np.stack(spots) for spots in zip(*pairs, strict=True))
     return up, down
+
+
+def mean_light(
+    pipeline: SlopePipeline,
+    sensor: ShackHartmann,
+    detector: Exposing,
+    photons: float,
+    spots: tuple[NDArray[np.float32], NDArray[np.float32]],
+    seed: int,
+) -> MeanLight:
+    """Return the mean light of every sub-aperture, from frames of `typical_spots` at the run's own flux."""
+    frames = []
+    for number, each in enumerate(spots[0]):
+        rng = np.random.default_rng([seed, number, 5])
+        frames.append(detector.expose(sensor.frame(each) * photons, rng))
+    return MeanLight(pipeline(np.stack(frames)).flux)
 
 
 def centroid_gain(

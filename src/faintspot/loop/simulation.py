@@ -13,9 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot import configuration as configuration_file
 from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
+from faintspot.light import MeanLight
 from faintspot.loop.arms import LoopArm
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.calibration import centroid_gain, interaction_matrix, make_pipeline, typical_spots
+from faintspot.loop.calibration import (
+    centroid_gain,
+    interaction_matrix,
+    make_pipeline,
+    mean_light,
+    typical_spots,
+)
 from faintspot.loop.camera import Exposing, NoiselessDetector, make_detector
 from faintspot.loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
 from faintspot.loop.control import Integrator, Reconstructor, check_controllable, make_reconstructor
@@ -192,6 +199,9 @@ class _Loop:
         camera = make_detector(configuration)
         self.detector: Exposing = NoiselessDetector(camera) if idealised.noiseless else camera
         self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
+        self.lights = [self._first_light(pipeline) for pipeline in self.pipelines]
+        for number in range(len(arms)):
+            self._follow_light(number)
         self.true_slopes = [arm.true_slopes or idealised.true_slopes for arm in arms]
         self.gains, self.divisors = self._gains_and_divisors(gains)
         self.controller = Integrator(configuration.control, optics.mirror.commands)
@@ -204,6 +214,20 @@ class _Loop:
         self.regression = np.zeros((2, len(arms)))
         pixels = len(optics.science.transform)
         self.images = np.zeros((len(arms), pixels, pixels))
+
+    def _first_light(self, pipeline: SlopePipeline) -> MeanLight | None:
+        """Return the mean light of every sub-aperture for an estimator that uses it, as before a run."""
+        if not pipeline.settings.estimator.uses_light or pipeline.settings.flux_e is not None:
+            return None
+        spots = _typical_spots(_without_light(self.configuration), self.seed, self.realisation)
+        photons, sensor = self.configuration.photons, self.optics.sensor
+        return mean_light(pipeline, sensor, self.detector, photons, spots, self.seed)
+
+    def _follow_light(self, number: int) -> None:
+        """Tell an arm's pipeline the mean light."""
+        light = self.lights[number]
+        if light is not None:
+            self.pipelines[number] = self.pipelines[number].with_light(light)
 
     def _gains_and_divisors(
         self, known: NDArray[np.float64] | None
@@ -270,6 +294,10 @@ class _Loop:
         if self.arms[number].predict_prior:
             prior = self.optics.interaction @ self.controller.expected()
         slopes = self.pipelines[number](self.detector.expose(light, rng), prior)
+        known = self.lights[number]
+        if known is not None:
+            self.lights[number] = known.updated(slopes.flux)
+            self._follow_light(number)
         if self.idealised.exact_gain and frame >= self.configuration.run.settle_frames:
             true = sensor.mean_slopes_px(wavefront)
             self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
