@@ -1,0 +1,137 @@
+"""How much of the sky has a bright enough star near: what a gain in magnitudes is for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import number_between, numbers_between, one_of
+from faintspot.errors import InputError
+from faintspot.loop.configuration import LoopConfiguration
+
+Floats = NDArray[np.float64]
+
+PLACES = {"galactic pole": 90.0, "latitude 30 degrees": 30.0, "galactic plane": 0.0}
+"""Galactic latitudes, degrees; the plane stands for the mean of all within 20 degrees of it."""
+MODEL_ERROR = 0.25
+"""Relative error of a density, about: 15 % of the formula, and what differs between regions and bands."""
+
+# Bahcall & Soneira 1980 (ApJS 44, 73), appendix B: integrated counts in V of the disk and of the spheroid,
+# stars per square degree; for 5 < V < 30 and latitudes above 20 degrees.
+_DISK = {"scale": 925.0, "alpha": -0.132, "beta": 0.035, "power": 3.0, "middle": 15.75}
+_SPHEROID = {"scale": 1050.0, "alpha": -0.18, "beta": 0.087, "power": 2.5, "middle": 17.5}
+_LOWEST_LATITUDE_DEG = 20.0
+# Stars per square degree of the whole sky brighter than magnitude 5 to 16: Tycho-2 (Hog et al. 2000) and
+# UCAC4 (Zacharias et al. 2013). Beyond, as the slope of the last magnitudes says.
+_MEAN_MAGNITUDES = np.arange(5.0, 17.0)
+_MEAN_DENSITIES = np.array(
+    [0.0423, 0.129, 0.400, 1.177, 3.379, 9.282, 25.41, 71.65, 178.1, 417.3, 954.8, 2154.9]
+)
+_FAINTEST = 21.0
+# V of a K0 dwarf, a typical star of these counts, less its magnitude in a band (Bessell & Brett 1988, PASP
+# 100, 1134; Bessell 1979).
+_V_MINUS = {"B": -0.81, "V": 0.0, "R": 0.45, "I": 0.85, "J": 1.45, "H": 1.85, "K": 1.95}
+
+
+def star_density(magnitude: ArrayLike, latitude_deg: float, band: str = "V") -> Floats:
+    """Return the number of stars per square degree that are brighter than a magnitude.
+
+    Bahcall & Soneira's (1980) model, averaged over galactic longitude; within 20 degrees of the plane, where
+    it does not hold, what catalogues' counts of the whole sky leave for there. See `MODEL_ERROR`.
+
+    Parameters
+    ----------
+    magnitude : array
+        5 to 21 in V.
+    latitude_deg : float
+        Galactic latitude, -90 to 90.
+    band : str
+        B, V, R, I, J, H or K; others than V by the colour of a K0 dwarf.
+
+    Returns
+    -------
+    array of the same shape
+
+    Raises
+    ------
+    InputError
+        For an unknown band, or values out of range.
+    """
+    latitude = abs(number_between("latitude_deg", latitude_deg, -90.0, 90.0))
+    colour = _V_MINUS[one_of("band", band, tuple(_V_MINUS))]
+    visual = numbers_between("magnitude", magnitude, 5.0 - colour, _FAINTEST - colour) + colour
+    if latitude >= _LOWEST_LATITUDE_DEG:
+        return _averaged(visual, latitude)
+    above = math.sin(math.radians(_LOWEST_LATITUDE_DEG))  # the fraction of the sky that is below
+    sines = (np.arange(8) + 0.5) / 8 * (1 - above) + above
+    away = np.mean([_averaged(visual, math.degrees(math.asin(sine))) for sine in sines], axis=0)
+    slope = math.log(_MEAN_DENSITIES[-1] / _MEAN_DENSITIES[-2])
+    within = np.interp(visual, _MEAN_MAGNITUDES, np.log(_MEAN_DENSITIES))
+    mean = np.exp(within + slope * np.maximum(visual - _MEAN_MAGNITUDES[-1], 0.0))
+    density: Floats = np.maximum((mean - (1 - above) * away) / above, away)
+    return density
+
+
+def sky_coverage(magnitude: ArrayLike, radius_arcsec: float, latitude_deg: float, band: str = "V") -> Floats:
+    """Return the fraction of the sky with a bright enough star within a radius: 1 - exp(-n pi r^2).
+
+    Parameters
+    ----------
+    magnitude, latitude_deg, band
+        See `star_density`.
+    radius_arcsec : float
+        How far from the target a star still serves, such as the isoplanatic angle.
+
+    Raises
+    ------
+    InputError
+        As `star_density`.
+    """
+    radius = number_between("radius_arcsec", radius_arcsec, 0.0, 3600.0, low_open=True) / 3600.0
+    return -np.expm1(-star_density(magnitude, latitude_deg, band) * math.pi * radius**2)
+
+
+def isoplanatic_angle_arcsec(configuration: LoopConfiguration) -> float:
+    """Return 0.314 r0 / h at the science wavelength (Fried 1982, JOSA 72, 52), r0 at its mean.
+
+    h is the layers' altitude, averaged with power 5/3 and their strength.
+
+    Raises
+    ------
+    InputError
+        When all turbulence is on the ground.
+    """
+    air = configuration.atmosphere
+    strength = np.array(air.fraction) / np.sum(air.fraction)
+    altitude = float((strength @ np.array(air.altitude_m) ** (5 / 3)) ** 0.6)
+    if altitude <= 0:
+        raise InputError("atmosphere.altitude_m: expected a layer above the ground for an isoplanatic angle")
+    r0 = float(np.mean(air.r0_m)) * (configuration.science.wavelength_m / 500e-9) ** 1.2
+    return math.degrees(0.314 * r0 / altitude) * 3600.0
+
+
+def _averaged(visual: Floats, latitude_deg: float) -> Floats:
+    """Return the model's density, averaged over longitude."""
+    longitudes = np.radians(np.arange(15.0, 360.0, 30.0))
+    mean: Floats = np.mean([_model(visual, math.radians(latitude_deg), each) for each in longitudes], axis=0)
+    return mean
+
+
+def _model(visual: Floats, latitude: float, longitude: float) -> Floats:
+    """Return the formula's density in one direction (radians)."""
+    beyond = np.clip(visual, 12.0, 20.0) - 12.0
+    tilt, gamma = 0.03 + 0.0075 * beyond, 0.36 - 0.04 * beyond
+    towards = math.cos(longitude)
+    path = math.sin(latitude) * (1.0 - tilt / math.tan(latitude) * towards)
+    centre = math.cos(latitude) * towards
+    disk = _counts(visual, **_DISK) / path ** (3.0 - 5.0 * gamma)
+    spheroid: Floats = _counts(visual, **_SPHEROID) / (1.0 - centre) ** (1.45 - 0.2 * centre)
+    return disk + spheroid
+
+
+def _counts(visual: Floats, scale: float, alpha: float, beta: float, power: float, middle: float) -> Floats:
+    away = visual - middle
+    counts: Floats = scale * 10.0 ** (beta * away) / (1.0 + 10.0 ** (alpha * away)) ** power
+    return counts
