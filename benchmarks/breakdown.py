@@ -42,6 +42,7 @@ def _denoise(count: Any, lanes: Any, table: Any, ny: Any, nx: Any, scratch: Any)
         _denoise_group(
             lanes,
             total_variation.FGP,
+            True,
             table,
             ny,
             nx,

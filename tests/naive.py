@@ -65,8 +65,12 @@ def tv_denoise(
     tolerance: float = 1e-2,
     max_iterations: int = 200,
     flat_start: bool = False,
+    lower: bool = False,
 ) -> Denoised:
-    """Constrained TV of one image: minimise TV(u) subject to ||u - g||^2 = N noise_std^2."""
+    """Constrained TV of one image: minimise TV(u) subject to ||u - g||^2 = N noise_std^2.
+
+    `lower`: a strength above 0.9 of the image's rms becomes 0.6 of that.
+    """
     g = np.asarray(g, np.float64)
     mean = g.mean()
     scale = np.max(np.abs(g - mean))  # only against overflow and underflow of squares
@@ -77,8 +81,11 @@ def tv_denoise(
     gc = (g - mean) / scale
     strength = noise_std / scale
     rms = np.sqrt(np.mean(gc**2))
-    margin = abs(strength / rms - 1.0)
-    if rms <= strength:
+    margin = abs(strength / (0.9 * rms if lower else rms) - 1.0)
+    lowered = lower and strength > 0.9 * rms
+    if lowered:
+        strength = 0.6 * rms
+    elif rms <= strength:
         return Denoised(np.full_like(g, mean), multiplier=np.inf, infeasible=True, margin=margin)
     radius = np.sqrt(g.size) * strength
     multiplier = 0.4 * strength
@@ -121,7 +128,7 @@ def tv_denoise(
     d = divergence(*p)
     multiplier = radius / np.linalg.norm(d)
     image = mean + scale * (gc - multiplier * d)
-    return Denoised(image, iteration, multiplier * scale, converged, False, p, margin)
+    return Denoised(image, iteration, multiplier * scale, converged, lowered, p, margin)
 
 
 def flat_field(g: Floats, strength: float) -> tuple[tuple[Floats, Floats], float]:
@@ -277,6 +284,7 @@ def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:
         float(tolerance),
         int(limit),
         settings.preset == "fast",
+        lower=True,
     )
     return replace(denoised, converged=denoised.converged or tolerance == 0)
 

@@ -60,6 +60,7 @@ class TestAgainstOracle:
                     preset=case.settings.preset,
                     tolerance=each("tolerance")[s],
                     max_iterations=each("max_iterations")[s],
+                    lower_strength=True,
                 )
             assert np.array_equal(stages.denoised[s], denoised)
             background = fs.brightest_pixels(denoised, each("keep_brightest")[s], rule=str(each("rule")[s]))

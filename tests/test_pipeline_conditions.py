@@ -142,6 +142,33 @@ class TestBadFrames:
         assert np.all(slopes.flags & Flag.NO_LIGHT)
 
 
+class TestTooStrong:
+    """Strengths that are too strong for the images are lowered: no slope is lost."""
+
+    @pytest.mark.parametrize("side", [8, 16])
+    @pytest.mark.parametrize("strength", [3.15, 6.0, "auto"])
+    @pytest.mark.parametrize("preset", ["accurate", "fast"])
+    def test_every_slope_without_denoising_is_one_with_it(
+        self, side: int, strength: Any, preset: str
+    ) -> None:
+        camera = fs.simulate.Detector(read_noise_e=3.0)
+        images, _ = fs.simulate.subapertures(
+            400, shape=(side, side), flux_e=70.0, detector=camera, rng=np.random.default_rng(side)
+        )
+        frame = images.reshape(-1, side)
+        layout = fs.Layout.stacked(400, (side, side), np.zeros((400, 2)))
+        calibration = fs.Calibration(read_noise_e=3.0)
+        common: Any = {"flux_e": 70.0, "spot_fwhm_px": 2.0}
+        without = fs.SlopePipeline(layout, fs.Settings("brightest", **common), calibration)(frame)
+        settings = fs.Settings("tv", noise_std=strength, preset=preset, **common)
+        slopes = fs.SlopePipeline(layout, settings, calibration)(frame)
+        assert without.valid.all()
+        assert slopes.valid.all()
+        lowered = (slopes.flags & Flag.INFEASIBLE_STRENGTH) > 0
+        assert strength == "auto" or lowered.any()
+        assert np.all(slopes.flux > 0)
+
+
 class TestWindows:
     @pytest.mark.parametrize("window", [(4, 4), (64, 64), (5, 9), (9, 5), (16, 16)])
     @pytest.mark.parametrize("n", [1, 3])

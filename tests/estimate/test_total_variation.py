@@ -283,6 +283,37 @@ class TestSpecialCases:
             assert np.allclose(result.images, 0.25)
 
 
+class TestTooStrong:
+    """Strengths that are lowered because the image's own rms is hardly larger, or smaller."""
+
+    @every_dtype
+    @every_algorithm
+    @pytest.mark.parametrize("preset", ["accurate", "fast"])
+    @given(images(), st.sampled_from([0.5, 0.899, 0.901, 1.0, 3.0, 1e30]))
+    def test_is_what_the_lowered_strength_gives(
+        self, algorithm: str, dtype: Any, preset: str, stack: Any, fraction: float
+    ) -> None:
+        stack = stack.astype(dtype)
+        strength = spread(stack) * fraction
+        how: Any = {"algorithm": algorithm, "preset": preset, "tolerance": 0, "max_iterations": 8}
+        result = fs.tv_denoise(stack, strength, lower_strength=True, full_output=True, **how)
+        for i, g in enumerate(stack):
+            expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, 8, preset == "fast", lower=True)
+            bound = 50 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype) * largest(g) + 1e-29
+            assert np.max(np.abs(result.images[i] - expected.image)) <= bound
+            if largest(g) > 1e-20:
+                assert result.iterations[i] == expected.iterations
+                assert result.infeasible[i] == expected.infeasible
+                assert expected.infeasible == (fraction > 0.9) or np.ptp(g) == 0
+
+    def test_nothing_changes_below(self) -> None:
+        g = np.random.default_rng(10).normal(size=(20, 9, 9))
+        strength = 0.89 * spread(g)
+        plain = fs.tv_denoise(g, strength, full_output=True)
+        lowered = fs.tv_denoise(g, strength, lower_strength=True, full_output=True)
+        assert all(np.array_equal(a, b) for a, b in zip(plain, lowered, strict=True))
+
+
 class TestArguments:
     def test_leading_shapes(self) -> None:
         g = np.random.default_rng(9).normal(size=(3, 4, 6, 5)).astype(np.float32)

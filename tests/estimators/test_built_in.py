@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.pipeline_cases import FIELDS
 
 import faintspot as fs
 from faintspot.estimators import Estimator, estimators, registry
@@ -68,6 +69,18 @@ class TestCentroid(EstimatorTests):
 class TestThresholded(EstimatorTests):
     def make(self) -> Estimator:
         return Thresholded(threshold_e=5.0)
+
+    @pytest.mark.parametrize("side", [8, 12, 16])
+    def test_is_the_same_at_every_width_bit_for_bit(self, side: int) -> None:
+        """Real time measures what is left over from whole groups at a smaller width."""
+        layout = fs.Layout.grid((4, 5), pixels=side)
+        calibration = fs.Calibration(100.3, gain_e_per_adu=0.51, read_noise_e=1.0)
+        frames = 100 + np.random.default_rng(side).poisson(6.0, (10, *layout.frame_shape)).astype(np.float32)
+        wide = fs.SlopePipeline(layout, Thresholded(threshold_e=0.7), calibration)
+        for width in (4, 8, 16):
+            narrow = wide.with_width(width)(frames)
+            for field in (*FIELDS, "standard_error_x", "standard_error_y"):
+                np.testing.assert_array_equal(getattr(narrow, field), getattr(wide(frames), field))
 
 
 class TestWindow(EstimatorTests):

@@ -26,7 +26,14 @@ from faintspot.cuda.flat_start import make_start_flat
 from faintspot.cuda.strips import WARP, Strips
 from faintspot.kernels.flat_start import MOMENTUM_AGE
 from faintspot.kernels.sweeps import CHAMBOLLE_STEP, FGP_STEP
-from faintspot.kernels.total_variation import CHAMBOLLE, CHECK_INTERVAL, FGP, FIRST_MULTIPLIER
+from faintspot.kernels.total_variation import (
+    CHAMBOLLE,
+    CHECK_INTERVAL,
+    FGP,
+    FIRST_MULTIPLIER,
+    HIGHEST_STRENGTH,
+    LOWERED_STRENGTH,
+)
 
 shuffle, warp_total, inverse_root = warp.shuffle, warp.total, warp.inverse_root
 largest, smallest = warp.largest, warp.smallest
@@ -269,7 +276,7 @@ def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
     ) -> Any:
         """`plane` and `pivots`: see `make_laplace`; used where the start is flat.
 
-        Return the number of iterations, and whether they converged and the strength is infeasible.
+        Return the number of iterations, and whether they converged and the strength was too strong.
         """
         g = cuda.local.array(rows, float32)
         mean, scale, squares = normalise(image, present, g)
@@ -279,12 +286,12 @@ def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
         if relative <= float32(SMALLEST_STRENGTH):
             return int32(0), True, False
         radius = math.sqrt(float32(pixels)) * relative
-        if radius >= math.sqrt(squares):
-            for r in range(rows):
-                image[r] = mean
-            return int32(0), True, True
+        norm = math.sqrt(squares)
+        lowered = radius > float32(HIGHEST_STRENGTH) * norm
+        if lowered:
+            radius = float32(LOWERED_STRENGTH) * norm
         if limit <= 0:
-            return int32(0), False, False
+            return int32(0), False, lowered
         p, q = cuda.local.array((2, rows), float32), cuda.local.array((2, rows), float32)
         inverse = start(g, plane, pivots, lane, present, in_row, in_last, radius, p, q)
         iterations, converged = iterate(
@@ -302,6 +309,6 @@ def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
         multiplier = radius / math.sqrt(squares) if squares > float32(0.0) else float32(0.0)
         for r in range(rows):
             image[r] = mean + scale * (g[r] - multiplier * d[r])
-        return iterations, converged, False
+        return iterations, converged, lowered
 
     return denoise

@@ -32,7 +32,7 @@ class Denoised(NamedTuple):
     converged: NDArray[np.bool_]
     """Whether the tolerance was reached (true where no iteration was needed)."""
     infeasible: NDArray[np.bool_]
-    """Whether the strength is at or above the image's own rms, so that the image is its mean."""
+    """Whether the strength is too strong for the image, which is then its mean; or the strength was lowered."""
 
 
 @overload
@@ -44,6 +44,7 @@ def tv_denoise(
     tolerance: float | None = ...,
     max_iterations: int | None = ...,
     preset: str = ...,
+    lower_strength: bool = ...,
     full_output: Literal[False] = ...,
 ) -> NDArray[Any]: ...
 @overload
@@ -55,6 +56,7 @@ def tv_denoise(
     tolerance: float | None = ...,
     max_iterations: int | None = ...,
     preset: str = ...,
+    lower_strength: bool = ...,
     full_output: Literal[True],
 ) -> Denoised: ...
 def tv_denoise(
@@ -65,6 +67,7 @@ def tv_denoise(
     tolerance: float | None = None,
     max_iterations: int | None = None,
     preset: str = "accurate",
+    lower_strength: bool = False,
     full_output: bool = False,
 ) -> NDArray[Any] | Denoised:
     r"""Remove the noise of each image by total-variation minimisation under a noise constraint.
@@ -98,6 +101,9 @@ def tv_denoise(
     preset : {"accurate", "fast"}
         "fast": begin at the dual field of a flat solution, which is what near the image's own rms takes so
         many iterations from zero; make 8 iterations and no test (other numbers may be given).
+    lower_strength : bool
+        Lower a strength that is too strong for an image, above 0.9 of the image's own rms, to 0.6 of that rms,
+        as `SlopePipeline` does: next to rms, too little of a spot is left.
     full_output : bool
         Return a `Denoised`: the images and, for each, iterations, multiplier, converged and infeasible.
 
@@ -106,7 +112,8 @@ def tv_denoise(
     ndarray or Denoised
         u, of the shape of `images`. The constraint holds to rounding error after any number of iterations.
         A constant image and noise_std = 0 return the image itself; where ``rms(g - mean(g)) <= noise_std``
-        no u obeys the constraint with less variation than the constant mean(g), which is returned.
+        no u obeys the constraint with less variation than the constant mean(g), which is returned unless strengths are
+        lowered.
 
     Raises
     ------
@@ -163,6 +170,7 @@ def tv_denoise(
             nx,
             settings,
             ALGORITHMS[algorithm],
+            lower_strength,
             begin,
             start,
             stop,

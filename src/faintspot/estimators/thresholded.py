@@ -73,7 +73,9 @@ class _Prepared(GravityPrepared):
     def __init__(self, estimator: Thresholded, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         columns = sensor.window[1]
-        self._widths = [width for width in WIDTHS if columns % width == 0 and width <= sensor.width]
+        # The machine's width, whatever the sub-apertures': the order of a sum depends on it.
+        widest = lanes_for(np.float32).width
+        self._widths = [width for width in WIDTHS if columns % width == 0 and width <= widest]
         if self._widths:
             self.kernel = thresholded_in_rows
 

@@ -95,6 +95,7 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         denoise_group(
             lanes,
             tables.algorithm,
+            True,  # strengths are lowered
             tables.flat_start,
             ny,
             nx,

@@ -24,6 +24,7 @@ def denoise_stack(
     nx: Any,
     settings: Any,
     algorithm: Any,
+    lowers: Any,
     table: Any,
     start: Any,
     stop: Any,
@@ -48,7 +49,9 @@ def denoise_stack(
             denoiser[total_variation.STRENGTH * width + lane] = settings[0, s]
             denoiser[total_variation.TOLERANCE * width + lane] = settings[1, s]
             counts[total_variation.LIMIT * width + lane] = int(settings[2, s])
-        denoise_group(lanes, algorithm, table, ny, nx, image, output, own.state, own.rows, denoiser, counts)
+        denoise_group(
+            lanes, algorithm, lowers, table, ny, nx, image, output, own.state, own.rows, denoiser, counts
+        )
         for lane in range(min(width, n - first)):
             s = first + lane
             scatter_image(width, output, lane, denoised, s)

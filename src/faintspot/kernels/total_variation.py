@@ -30,6 +30,9 @@ from faintspot.kernels.sweeps import IMAGE, STATE_VECTORS, sweep_chambolle, swee
 
 CHECK_INTERVAL = 5  # iterations between two convergence tests
 FIRST_MULTIPLIER = 0.4  # lambda of the first iterations, in units of the strength
+# In units of the image's own rms: a strength above the first is too strong for the image, and is lowered to
+# the second where that is asked for. Chosen by the slope error of simulated spots, docs/automatic.md.
+HIGHEST_STRENGTH, LOWERED_STRENGTH = 0.9, 0.6
 
 FGP = 0
 CHAMBOLLE = 1
@@ -152,12 +155,19 @@ def _copy_lane(width: Any, lane: Any, pixels: Any, image: Any, output: Any) -> N
 
 @compiled
 def _decide_beforehand(
-    width: Any, pixels: Any, smallest: Any, image: Any, output: Any, lane_values: Any, counts: Any
+    width: Any,
+    pixels: Any,
+    smallest: Any,
+    lowers: Any,
+    image: Any,
+    output: Any,
+    lane_values: Any,
+    counts: Any,
 ) -> Any:
     """Settle the lanes that need no iteration; return how many remain active.
 
     Constant images and strength zero (or below the rounding error of the image) return the image itself;
-    a strength at or above the image's own rms returns its mean.
+    a strength at or above the image's own rms returns its mean, unless it is lowered.
     """
     active = 0
     for lane in range(width):
@@ -175,7 +185,11 @@ def _decide_beforehand(
                 lane_values[MULTIPLIER * width + lane] = math.inf
             continue
         radius = math.sqrt(pixels) * (strength / scale)
-        if radius * radius >= lane_values[SIZE * width + lane]:
+        norm = math.sqrt(lane_values[SIZE * width + lane])
+        if lowers and radius > HIGHEST_STRENGTH * norm:
+            counts[INFEASIBLE * width + lane] = 1
+            radius = LOWERED_STRENGTH * norm
+        elif radius >= norm:
             counts[INFEASIBLE * width + lane] = 1
             lane_values[MULTIPLIER * width + lane] = math.inf
             for i in range(pixels):
@@ -225,6 +239,7 @@ def _mark_finished(width: Any, iteration: Any, measured: Any, lane_values: Any, 
 def denoise_group(
     lanes: Any,
     algorithm: Any,
+    lowers: Any,
     table: Any,
     ny: Any,
     nx: Any,
@@ -242,6 +257,8 @@ def denoise_group(
     lanes : Lanes
     algorithm : int
         FGP or CHAMBOLLE.
+    lowers : bool
+        Whether a strength above HIGHEST_STRENGTH is lowered, which INFEASIBLE then says.
     table : array
         From `flat_start_table`; without elements, the iteration starts from p = 0.
     ny, nx : int
@@ -258,7 +275,7 @@ def denoise_group(
     # Strengths below the images' rounding error count as zero; ranges whose inverse overflows, as constant.
     smallest, smallest_range = (1e-8, 1e-30) if image.itemsize == 4 else (1e-17, 1e-290)
     _prepare(lanes, image, state, ny, nx, smallest_range, lane_values)
-    active = _decide_beforehand(width, ny * nx, smallest, image, output, lane_values, counts)
+    active = _decide_beforehand(width, ny * nx, smallest, lowers, image, output, lane_values, counts)
     if active == 0:
         return
     test_change = False

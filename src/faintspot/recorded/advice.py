@@ -14,7 +14,7 @@ FLAG_MEANINGS = {
     SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
     SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
-    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std is not below the image's rms: denoised to a constant.",
+    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std was too strong for the image (above 0.9 of its rms) and was lowered.",
     SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
     SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
 }
@@ -35,8 +35,8 @@ _ADVICE = {
     ),
     SubapertureFlag.INFEASIBLE_STRENGTH: (
         _OFTEN_INFEASIBLE,
-        "were noisier on paper (noise_std) than their images are, so nothing of the spot survives denoising",
-        "lower noise_std; a good value at low read noise is sqrt(read_noise² + 0.25 × flux / pixels)",
+        "were hardly less noisy on paper (noise_std) than their whole images, so that noise_std was lowered there",
+        'lower noise_std, or set it to "auto"; where the star is that faint, compare with estimator "brightest"',
     ),
     SubapertureFlag.NOT_CONVERGED: (
         0.10,
@@ -83,8 +83,6 @@ def _of_arm(arm: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
         lines.insert(0, "No measurement is valid, so there are no slopes.")
     for flag, (least, what, advice) in _ADVICE.items():
         count = arm.flag_count(flag)
-        if flag is SubapertureFlag.INFEASIBLE_STRENGTH:  # those without light are spoken of already
-            count -= arm.flag_count(flag | SubapertureFlag.NO_LIGHT)
         fraction = count / arm.x.size
         if fraction > least:
             lines.append(f"{percentage(fraction)} of the measurements {what}. Next: {advice}.")
@@ -104,12 +102,7 @@ def _no_light(arm: MeasuredSlopes) -> list[str]:
     fraction = dark / arm.x.size
     if fraction <= 0.01:
         return []
-    both = arm.flag_count(SubapertureFlag.NO_LIGHT | SubapertureFlag.INFEASIBLE_STRENGTH)
-    advice = (
-        "check that the windows lie on the spots (faintspot layout draws them) and that the dark is right"
-    )
-    if both > dark / 2:
-        advice = (
-            "lower noise_std: in most of them it was larger than the image's own rms, which removes the spot"
-        )
-    return [f"{percentage(fraction)} of the measurements had no light. Next: {advice}."]
+    return [
+        f"{percentage(fraction)} of the measurements had no light. Next: check that the windows lie on the spots "
+        "(faintspot layout draws them) and that the dark is right."
+    ]

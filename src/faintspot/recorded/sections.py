@@ -137,7 +137,7 @@ def _arm_numbers(arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter) -
         numbers |= {
             "median iterations": f"{summary.median_iterations:.0f}" if some else "–",
             "hit the iteration limit": percentage(summary.limit_fraction),
-            "strength above the image's rms": percentage(_infeasible(arm)),
+            "strength lowered, too strong for the image": percentage(_infeasible(arm)),
         }
     if arm.n_frames == 1:
         return numbers
