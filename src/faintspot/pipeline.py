@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot import configuration
-from faintspot.checks import finite_array, number_between, numbers_between, one_of, real_array
+from faintspot.checks import number_between, numbers_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
@@ -44,7 +44,7 @@ class SlopePipeline:
         Default: frames are in electrons already.
     reference : array or Slopes, optional
         Reference positions, px from each sub-aperture's centre, subtracted from every position: (n, 2) x and
-        y, or (2 n,) all x then all y, or the slopes of one frame. Default 0.
+        y, or (2 n,) all x then all y, or the slopes of one frame; up to the frame's longer side. Default 0.
     psf : PSF, optional
         Needed by estimators that know the spot itself; tells others the spots' width.
     score : Score, optional
@@ -93,7 +93,7 @@ class SlopePipeline:
         )
         self._lanes = lanes_for(np.float32, width)
         self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
-        self._parts = psf, score, layout.offsets + _reference_positions(reference, len(layout))
+        self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
         self.preparation = self._prepared()
         """What was computed beforehand."""
         self._identity = _identity(*self._parts)
@@ -233,7 +233,8 @@ class SlopePipeline:
         frame : array
         prior : array or Slopes, optional
             Predicted slopes, px, for "map" (the mean of its prior) and "trained" (where it begins): as
-            `reference`, or one such array for every frame. Default 0.
+            `reference`, or one such array for every frame. Default 0, which is also what counts where a
+            number is not finite, or larger than the frame's longer side.
 
         Raises
         ------
@@ -276,7 +277,7 @@ class SlopePipeline:
         if self.on_device is not None and not explain:
             measured = self.on_device.measure_from_host(frames, array.dtype, variants)
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
-        predicted = None if prior is None else _prior_slopes(prior, n_frames, n)
+        predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
         task = self.preparation.task(variants, predicted)
         kernel = self.preparation.kernel(frames)
 
@@ -332,21 +333,27 @@ def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
     return frames.reshape(-1, *array.shape[-2:])
 
 
-def _reference_positions(reference: ArrayLike | Slopes | None, n: int) -> NDArray[np.float64]:
+def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:
     """Reference positions as (n, 2)."""
+    n, side = len(layout), max(layout.frame_shape)
     if reference is None:
         return np.zeros((n, 2))
-    array = finite_array("reference", reference.vector if isinstance(reference, Slopes) else reference)
+    given = reference.vector if isinstance(reference, Slopes) else reference
+    array = numbers_between("reference", given, -side, side)
     if array.shape == (2 * n,):
-        return np.stack([array[:n], array[n:]], axis=1).astype(np.float64)
+        return np.stack([array[:n], array[n:]], axis=1)
     if array.shape != (n, 2):
         raise InputError(f"reference: expected shape ({n}, 2) or ({2 * n},), got {array.shape}")
-    return array.astype(np.float64)
+    return array
 
 
-def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, n: int) -> NDArray[np.float32]:
-    """Predicted slopes as the kernel reads them: (1 or n_frames, 2, n)."""
-    array = finite_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
+def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:
+    """Predicted slopes as the kernel reads them: (1 or n_frames, 2, n).
+
+    What no frame can hold, as of a loop that has diverged, counts as not predicted.
+    """
+    n = len(layout)
+    array = real_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
     if array.shape in ((n, 2), (n_frames, n, 2)):
         array = np.moveaxis(array, -1, -2)
     elif array.shape not in ((2 * n,), (n_frames, 2 * n)):
@@ -354,7 +361,8 @@ def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, n: int) -> NDArray[n
             f"prior: expected shape ({n}, 2) or ({2 * n},), or as many for each of the {n_frames} frames, "
             f"got {array.shape}"
         )
-    return np.ascontiguousarray(array.reshape(-1, 2, n), np.float32)
+    possible = np.abs(array) <= max(layout.frame_shape)
+    return np.ascontiguousarray(np.where(possible, array, 0.0).reshape(-1, 2, n), np.float32)
 
 
 def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -> bytes:

@@ -103,6 +103,8 @@ class TestLayout:
             ("corners", {"corners": [[0, 0], [0]]}),
             ("centres: expected 2 rows", {"centres": [[1.0, 1.0]]}),
             ("centres", {"centres": [[1.0, np.inf], [1, 1]]}),
+            ("centres: expected centres up to 8 px", {"centres": [[3.5, 3.5], [1e39, 3.5]]}),
+            ("centres: expected centres up to 8 px", {"centres": [[3.5, -5.0], [11.5, 3.5]]}),
             ("cells: expected 2 rows", {"cells": [[0, 0]]}),
             ("cells", {"cells": [[0.5, 0], [0, 1]]}),
             ("geometry = 'round': expected one of 'square', 'hexagonal'", {"geometry": "round"}),

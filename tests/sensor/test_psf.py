@@ -126,6 +126,8 @@ def test_files_that_are_no_psf(tmp_path: Path) -> None:
         (np.ones(7), 2, None, "psf.samples"),
         (-np.ones((7, 7)), 2, None, "positive"),
         (np.full((7, 7), np.nan), 2, None, "finite"),
+        (np.full((7, 7), 1e300), 2, None, "psf.samples"),
+        (np.eye(7) - np.eye(7)[::-1] + 1e-12, 2, None, "light in a pixel"),
         (np.ones((7, 7)), 0, None, "oversampling"),
         (np.ones((2, 7, 7)), 2, None, "psf.index"),
         (np.ones((2, 7, 7)), 2, [0, 2], "psf.index"),

@@ -163,6 +163,8 @@ def test_bad_files(tmp_path: Path) -> None:
     [
         ({"tables": np.zeros((2, 3, 2, 2, 40, 37))}, r"score\.tables: expected shape"),
         ({"tables": np.full((2, 3, 2, 2, 3, 3), np.nan)}, r"score\.tables: expected finite"),
+        ({"tables": np.full((2, 3, 2, 2, 3, 3), -1e38)}, r"score\.tables = -1e\+38: expected"),
+        ({"standard_error_px": np.full((2, 3, 2), 1e39)}, r"standard_error_px = 1e\+39: expected"),
         ({"flux_e": [10.0, 30.0]}, "expected 3 increasing fluxes"),
         ({"flux_e": [10.0, 30.0, 20.0]}, "expected 3 increasing fluxes"),
         ({"flux_e": [0.0, 30.0, 40.0]}, "above 0"),

@@ -35,9 +35,8 @@ class MaximumAPosteriori(Likelihood):
         None,
         "Standard deviation of the prior. Default: none but the search range.",
         unit="px",
-        low=0.0,
+        low=1e-6,
         high=1e4,
-        low_open=True,
     )
     preset: str = option(
         "accurate",

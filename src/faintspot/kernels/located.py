@@ -222,13 +222,14 @@ def _begin(group: Any, scratch: Any) -> None:
             half = 0.5 * (group.nx if axis == 0 else group.ny)
             zero, reach = settings[ZERO_X + axis, s], settings[RANGE, s]
             # The window is where a spot can be; half a pixel remains of a range that lies outside.
-            low = min(max(zero - reach, -half), half - 0.5)
-            high = max(min(zero + reach, half), low)
+            # Bounds come first: NaN then becomes one.
+            low = min(max(-half, zero - reach), half - 0.5)
+            high = max(low, min(half, zero + reach))
             place = zero + group.predicted[axis, s]
             lane_values[(spot_rows.LOW_X + 2 * axis) * width + lane] = low
             lane_values[(spot_rows.HIGH_X + 2 * axis) * width + lane] = high
             lane_values[(spot_rows.PRIOR_X + axis) * width + lane] = place
-            lane_values[(spot_rows.X + axis) * width + lane] = min(max(place, low), high)
+            lane_values[(spot_rows.X + axis) * width + lane] = min(max(low, place), high)
         lane_values[spot_rows.VARIANCE * width + lane] = max(settings[VARIANCE, s], 0.0)
         lane_values[spot_rows.EXCESS * width + lane] = settings[EXCESS, s]
         lane_values[spot_rows.PRIOR_WEIGHT * width + lane] = settings[PRIOR_WEIGHT, s]

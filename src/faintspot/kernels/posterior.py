@@ -139,8 +139,8 @@ def posterior_of_group(
         x, y = (sum_x * inverse, sum_y * inverse) if known else (prior_x, prior_y)
         spread_x = math.sqrt(max(squares_x * inverse - x * x, 0.0)) if known else 0.0
         spread_y = math.sqrt(max(squares_y * inverse - y * y, 0.0)) if known else 0.0
-        lane_values[MEAN_X * width + lane] = min(max(x, low_x), high_x)
-        lane_values[MEAN_Y * width + lane] = min(max(y, low_y), high_y)
+        lane_values[MEAN_X * width + lane] = min(max(low_x, x), high_x)
+        lane_values[MEAN_Y * width + lane] = min(max(low_y, y), high_y)
         lane_values[SPREAD_X * width + lane] = spread_x
         lane_values[SPREAD_Y * width + lane] = spread_y
         lane_values[SPACING * width + lane] = spacing

@@ -10,7 +10,16 @@ import math
 from typing import Any
 
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.simd import copy_transposed, load, multiply_add, store, width_of
+from faintspot.kernels.simd import (
+    copy_transposed,
+    load,
+    maximum,
+    minimum,
+    multiply_add,
+    splat,
+    store,
+    width_of,
+)
 from faintspot.kernels.spot_rows import REST_X, X
 
 PHASES = 16
@@ -45,8 +54,11 @@ def look_up(
     for axis in range(2):
         n = nx if axis == 0 else ny
         first = -0.5 * (n - 1)
+        # Within the window, and so within the tables; NaN becomes a bound.
+        inside = maximum(load(lanes, lane_values, (X + axis) * width), splat(lanes, -0.5 * n))
+        store(lane_values, (REST_X + axis) * width, minimum(inside, splat(lanes, 0.5 * n)))
         for lane in range(width):
-            position = lane_values[(X + axis) * width + lane]
+            position = lane_values[(REST_X + axis) * width + lane]
             step = math.floor((first - position) * PHASES + 0.5)
             whole, phase = step // PHASES, step % PHASES
             starts[lane] = ((which[lane] * 2 + axis) * rank * 2 * PHASES + phase) * length + whole + margin

@@ -70,13 +70,17 @@ def apply_score(
     """
     width = width_of(lanes)
     passes, phases, side, length = tables.shape[1], tables.shape[2], tables.shape[5], tables.shape[6]
+    half_x, half_y = 0.5 * nx, 0.5 * ny
     px_per_step = 1.0 / steps_per_px
     rows_from_lanes(lanes, image, ny, nx, starts, rows)
     # All sub-apertures make a pass before the next one: nothing then waits for its own last pass.
     for number in range(passes):
         for lane in range(width):
-            step_x = math.floor((-0.5 * (nx - 1) - lane_values[X * width + lane]) * steps_per_px + 0.5)
-            step_y = math.floor((-0.5 * (ny - 1) - lane_values[Y * width + lane]) * steps_per_px + 0.5)
+            # Within the window, and so within the tables; in this order NaN becomes a bound.
+            from_x = min(max(-half_x, lane_values[X * width + lane]), half_x)
+            from_y = min(max(-half_y, lane_values[Y * width + lane]), half_y)
+            step_x = math.floor((-0.5 * (nx - 1) - from_x) * steps_per_px + 0.5)
+            step_y = math.floor((-0.5 * (ny - 1) - from_y) * steps_per_px + 0.5)
             # In floating point: dividing whole numbers takes longer than a row of the image.
             whole_x, whole_y = math.floor(step_x * px_per_step), math.floor(step_y * px_per_step)
             phase = (step_y - whole_y * phases) * phases + (step_x - whole_x * phases)
@@ -87,6 +91,6 @@ def apply_score(
             x = -0.5 * (nx - 1) - step_x * px_per_step + sum_x * inverse
             y = -0.5 * (ny - 1) - step_y * px_per_step + sum_y * inverse
             low, high = lane_values[LOW_X * width + lane], lane_values[HIGH_X * width + lane]
-            lane_values[X * width + lane] = min(max(x, low), high)
+            lane_values[X * width + lane] = min(max(low, x), high)
             low, high = lane_values[LOW_Y * width + lane], lane_values[HIGH_Y * width + lane]
-            lane_values[Y * width + lane] = min(max(y, low), high)
+            lane_values[Y * width + lane] = min(max(low, y), high)

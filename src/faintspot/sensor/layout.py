@@ -37,7 +37,7 @@ class Layout:
         Row and column of each window's first pixel.
     centres : (n, 2) array, optional
         x, y of each sub-aperture's centre in frame pixels (pixel i has its centre at i), from which positions
-        are measured. Default: the middle of the window.
+        are measured, at most the window's longer side from its middle. Default: that middle.
     cells : (n, 2) array of int, optional
         Row and column of each lenslet in its array, for maps.
     geometry : {"square", "hexagonal"}
@@ -49,7 +49,8 @@ class Layout:
     Raises
     ------
     InputError
-        For an empty layout, a window that leaves the frame, or windows that overlap.
+        For an empty layout, a window that leaves the frame, windows that overlap, or a centre far from its
+        window.
     """
 
     frame_shape: tuple[int, int]
@@ -82,6 +83,7 @@ class Layout:
             put(self, "pitch_px", number_between("layout.pitch_px", self.pitch_px, 0.0, low_open=True))
         put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
         _check_inside(corners, self.window, self.frame_shape)
+        _check_centres(centres - middle, self.window)
         _check_overlap(corners, self.window, self.frame_shape)
         for name, array in (("corners", corners), ("centres", centres.astype(np.float64)), ("cells", cells)):
             array = array.copy()
@@ -357,6 +359,16 @@ def _check_inside(corners: NDArray[np.int64], window: tuple[int, int], frame_sha
         raise InputError(
             f"layout: sub-aperture {first} (rows {row} to {row + window[0] - 1}, columns {column} to "
             f"{column + window[1] - 1}) leaves the frame of {frame_shape[0]} x {frame_shape[1]} pixels"
+        )
+
+
+def _check_centres(offsets: NDArray[np.float64], window: tuple[int, int]) -> None:
+    """Refuse centres that no spot of their window can belong to."""
+    away = np.abs(offsets).max(axis=1)
+    if away.max() > max(window):
+        raise InputError(
+            f"layout.centres: expected centres up to {max(window)} px from their windows' middles, "
+            f"got one {away.max():g} px away (sub-aperture {np.argmax(away)})"
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from faintspot.checks import finite_array, number_between, numbers_between
+from faintspot.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.errors import InputError
 from faintspot.simulate.spots import image_shape, per_spot, position_array, spots
 
@@ -21,6 +21,7 @@ _ANALYTIC_OVERSAMPLING = 8
 _HIGHEST_RANK = 8
 _RANK_TOLERANCE = 2e-3  # of the peak: what the separable terms may leave out
 _BLOCK_PIXELS = 1 << 21
+_LARGEST_FRACTION = 1e6  # of a spot's light in a pixel: beyond, samples cancel each other's light
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class PSF:
             "oversampling",
             int(number_between("psf.oversampling", self.oversampling, 1, 64, integer=True)),
         )
-        samples = finite_array("psf.samples", self.samples).astype(np.float64)
+        samples = numbers_between("psf.samples", self.samples, -LARGEST_FLOAT32, LARGEST_FLOAT32)
         samples = samples[None] if samples.ndim == 2 else samples
         if (
             samples.ndim != 3
@@ -73,7 +74,12 @@ class PSF:
         light = samples.sum(axis=(1, 2), keepdims=True)
         if np.any(light <= 0):
             raise InputError(f"psf.samples: expected a positive sum, got {light.min():g}")
-        samples *= self.oversampling**2 / light
+        samples = samples * (self.oversampling**2 / light)
+        if not np.abs(samples).max() <= _LARGEST_FRACTION:
+            raise InputError(
+                f"psf.samples: expected up to {_LARGEST_FRACTION:g} times a spot's light in a pixel, "
+                f"got {np.abs(samples).max():g}"
+            )
         samples.flags.writeable = False
         put(self, "samples", samples)
         if self.index is not None:

@@ -16,6 +16,7 @@ from faintspot.files import read_arrays, save_arrays
 from faintspot.sensor.fixed_weights import FixedWeights
 
 STARTS = ("reference", "peak")
+_LARGEST_PX = 1e6  # of a table or an error: beyond any frame
 _BLOCK_IMAGES = 4096  # images worked on at a time: bounds the memory of the gathered tables
 _FIELDS = ("tables", "flux_e", "standard_error_px", "steps_per_px", "start", "smoothing_px", "index")
 
@@ -63,7 +64,7 @@ class TrainedScore:
     index: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
-        tables = finite_array("score.tables", self.tables).astype(np.float32)
+        tables = numbers_between("score.tables", self.tables, -_LARGEST_PX, _LARGEST_PX).astype(np.float32)
         if tables.ndim != 6 or tables.shape[3] != 2 or tables.shape[4] % 2 == 0 or tables.shape[5] % 2 == 0:
             raise InputError(
                 "score.tables: expected shape (kinds, classes, passes, 2, rows, columns) with odd rows and "
@@ -72,7 +73,7 @@ class TrainedScore:
         flux = numbers_between("score.flux_e", self.flux_e, 0.0, low_open=True)
         if flux.shape != (tables.shape[1],) or np.any(np.diff(flux) <= 0):
             raise InputError(f"score.flux_e: expected {tables.shape[1]} increasing fluxes, got {flux}")
-        error = numbers_between("score.standard_error_px", self.standard_error_px, 0.0)
+        error = numbers_between("score.standard_error_px", self.standard_error_px, 0.0, _LARGEST_PX)
         if error.shape != (*tables.shape[:2], 2):
             raise InputError(
                 f"score.standard_error_px: expected shape {(*tables.shape[:2], 2)}, got {error.shape}"
