@@ -280,4 +280,14 @@ def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> int:
             bound = FLOOR_PX + relative * value + ROUNDING * change
             result = getattr(slopes, name.replace("error", "standard_error"))[s]
             assert abs(result - value) <= bound, (s, name, float(result), value, bound)
+        assert_search_limit_flagged(case, s, [expected, *shaken], slopes)
     return compared
+
+
+def assert_search_limit_flagged(case: Case, s: int, found: list[Estimate], slopes: fs.Slopes) -> None:
+    """Slopes at the search range have their flag, others have not; where rounding decides, either."""
+    reach = float(case.each("search_range_px")[s])
+    at_limit = [max(abs(each.x), abs(each.y)) >= reach - FLOOR_PX for each in found]
+    flagged = bool(slopes.flags[s] & fs.SubapertureFlag.AT_SEARCH_LIMIT)
+    if all(at_limit) or not any(at_limit):
+        assert flagged == at_limit[0], (s, found[0], reach)

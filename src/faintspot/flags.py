@@ -24,6 +24,8 @@ class SubapertureFlag(IntFlag):
     """The iteration limit came before the tolerance was reached. Not where the tolerance is 0."""
     OUTLIER_LIKELY = 64
     """The spot is so faint that more than about 1 % of such slopes are those of noise, not of the spot."""
+    AT_SEARCH_LIMIT = 128
+    """The slope ends at `search_range_px`, along x or y: the spot may be beyond."""
 
 
 INVALID = SubapertureFlag.NO_LIGHT | SubapertureFlag.TOO_MANY_BAD_PIXELS

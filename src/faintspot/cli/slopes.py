@@ -133,6 +133,7 @@ def describe(summary: Summary, output: str) -> list[str]:
         SubapertureFlag.INFEASIBLE_STRENGTH: "whose strength (noise_std) was too strong for the image and was lowered",
         SubapertureFlag.NOT_CONVERGED: "at the iteration limit (max_iterations)",
         SubapertureFlag.OUTLIER_LIKELY: "so faint that outliers are to be expected",
+        SubapertureFlag.AT_SEARCH_LIMIT: "at the limit of the search range (search_range_px)",
     }
     for flag, text in texts.items():
         count = summary.flag_counts.get(flag, 0)

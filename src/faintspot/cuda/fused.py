@@ -40,9 +40,11 @@ from faintspot.kernels.gravity import (
     TOLERANCE,
 )
 from faintspot.kernels.groups import (
+    AT_SEARCH_LIMIT,
     BAD_PIXELS,
     ERROR_SCALE,
     EXCESS,
+    LIMIT_ROUNDING_PX,
     MOST_BAD,
     NO_LIGHT,
     RANGE,
@@ -109,8 +111,11 @@ def make_store(strips: Strips) -> Any:
         valid = bits & int32(NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
         known = valid and table[VARIANCE, s] >= float32(0.0)
         reach, scale = table[RANGE, s], table[ERROR_SCALE, s]
-        numbers[X, f, s] = within(x - table[ZERO_X, s], reach) if valid else float32(0.0)
-        numbers[Y, f, s] = within(y - table[ZERO_Y, s], reach) if valid else float32(0.0)
+        away_x, away_y = x - table[ZERO_X, s], y - table[ZERO_Y, s]
+        numbers[X, f, s] = within(away_x, reach) if valid else float32(0.0)
+        numbers[Y, f, s] = within(away_y, reach) if valid else float32(0.0)
+        if valid and max(abs(away_x), abs(away_y)) >= reach - float32(LIMIT_ROUNDING_PX):
+            bits |= int32(AT_SEARCH_LIMIT)
         numbers[FLUX, f, s] = total
         numbers[ERROR_X, f, s] = scale * errors[0] if known else float32(math.inf)
         numbers[ERROR_Y, f, s] = scale * errors[1] if known else float32(math.inf)

@@ -17,6 +17,16 @@ from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.groups import SlopeArrays
 
 _NO_LIGHT = np.uint8(SubapertureFlag.NO_LIGHT)
+_AT_SEARCH_LIMIT = np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)
+
+
+def limit_slopes(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
+    """Return slopes (n, 2) within the search range; flags (n,) say which valid ones it has limited."""
+    reach = table[groups.RANGE]
+    at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX
+    flags &= ~_AT_SEARCH_LIMIT
+    flags[at_limit & (flags & INVALID == 0)] |= _AT_SEARCH_LIMIT
+    return np.clip(away, -reach[:, None], reach[:, None])
 
 
 class PythonPrepared(Prepared):
@@ -107,11 +117,11 @@ class PythonPrepared(Prepared):
         flags &= ~_NO_LIGHT
         flags[~usable & (flags & INVALID == 0)] |= _NO_LIGHT
         valid = (flags & INVALID) == 0
-        reach, scale = table[groups.RANGE], table[groups.ERROR_SCALE]
         slopes.flux[frame] = np.where(usable, light, 0.0)
-        for axis, position in enumerate((found.x, found.y)):
-            away = np.where(valid, position, 0.0) - np.where(valid, sensor.zero[:, axis], 0.0)
-            (slopes.x, slopes.y)[axis][frame] = np.clip(away, -reach, reach)
+        positions = np.stack([found.x, found.y], axis=1)
+        away = np.where(valid[:, None], positions - sensor.zero, 0.0)
+        slopes.x[frame], slopes.y[frame] = limit_slopes(away, table, flags).T
+        scale = table[groups.ERROR_SCALE]
         errors = found.standard_error_x, found.standard_error_y
         for error, result in zip(errors, (slopes.standard_error_x, slopes.standard_error_y), strict=True):
             result[frame] = np.inf if error is None else np.where(valid, scale * error, np.inf)

@@ -24,6 +24,10 @@ NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
 BAD_PIXELS = int(SubapertureFlag.BAD_PIXELS)
 SATURATED = int(SubapertureFlag.SATURATED)
+AT_SEARCH_LIMIT = int(SubapertureFlag.AT_SEARCH_LIMIT)
+
+LIMIT_ROUNDING_PX = 1e-4
+"""A slope so close to the search range has been limited by it; float32 positions are rounded to less."""
 
 # Rows of the table of per-sub-aperture settings (n_rows, n_subapertures), float32, that all estimators share:
 # reference position and how far from it a position may be; bad pixels; noise of a pixel that collects m
@@ -186,8 +190,11 @@ def store_slope(
     """Write position, flags and standard errors of one sub-aperture; the reference where it is invalid."""
     valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
     reach = settings[RANGE, s]
-    slopes.x[f, s] = within(x - settings[ZERO_X, s], reach) if valid else 0.0
-    slopes.y[f, s] = within(y - settings[ZERO_Y, s], reach) if valid else 0.0
+    away_x, away_y = x - settings[ZERO_X, s], y - settings[ZERO_Y, s]
+    slopes.x[f, s] = within(away_x, reach) if valid else 0.0
+    slopes.y[f, s] = within(away_y, reach) if valid else 0.0
+    if valid and max(abs(away_x), abs(away_y)) >= reach - LIMIT_ROUNDING_PX:
+        bits |= AT_SEARCH_LIMIT
     known = valid and settings[VARIANCE, s] >= 0.0
     scale = settings[ERROR_SCALE, s]
     slopes.standard_error_x[f, s] = scale * error_x if known else math.inf

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.checks import real_array
 from faintspot.errors import InputError
+from faintspot.estimators.python import limit_slopes
 from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.kernels import gravity, groups
 from faintspot.pipeline import SlopePipeline
@@ -28,6 +29,7 @@ TRIAL_LIMIT_S = 60.0  # a module may compile
 _TIMED_CALLS = 10
 _NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
 _TOO_MANY_BAD = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
+_OF_POSITIONS = np.uint8(SubapertureFlag.NO_LIGHT | SubapertureFlag.AT_SEARCH_LIMIT)
 
 
 class ModularPipeline:
@@ -165,7 +167,7 @@ class ModularPipeline:
             self.denoised = stages[groups.DENOISED].copy()
         if denoising is not None:
             self.slopes.iterations[:] = denoising.iterations
-            self.slopes.flags[:] |= denoising.flags & ~np.uint8(_NO_LIGHT)
+            self.slopes.flags[:] |= denoising.flags & ~_OF_POSITIONS
         if largest is not None:
             floor = self._last.settings[gravity.FLOOR] * largest
             self.slopes.flags[~(self.slopes.flux > floor)] |= _NO_LIGHT
@@ -231,17 +233,16 @@ class ModularPipeline:
     def _take_positions(self, positions: NDArray[np.float32]) -> None:
         """Slopes of positions that a module has measured."""
         table, (ny, nx) = self._last.settings, self.pipeline.layout.window
-        reach = table[groups.RANGE]
         inside = np.all(np.abs(positions) <= np.array([0.5 * nx, 0.5 * ny], np.float32), axis=1)
         self.slopes.flags[~inside] |= _NO_LIGHT
-        for axis, slope in enumerate((self.slopes.x, self.slopes.y)):
-            slope[:] = np.clip(positions[:, axis] - table[groups.ZERO_X + axis], -reach, reach)
+        away = positions - table[groups.ZERO_X : groups.ZERO_X + 2].T
+        self.slopes.x[:], self.slopes.y[:] = limit_slopes(away, table, self.slopes.flags).T
 
     def _flag(self) -> None:
         """Flag what the calibration has found and what modules returned; slope 0 where that is invalid."""
         slopes, found = self.slopes, self._first.slopes
         slopes.flags[self._unusable] |= _NO_LIGHT
-        slopes.flags[:] |= found.flags & ~np.uint8(_NO_LIGHT)
+        slopes.flags[:] |= found.flags & ~_OF_POSITIONS
         too_many = (found.flags & _TOO_MANY_BAD) != 0  # which says it all
         slopes.flags[too_many] = found.flags[too_many]
         slopes.bad_pixels[:] = found.bad_pixels

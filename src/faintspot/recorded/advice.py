@@ -17,6 +17,7 @@ FLAG_MEANINGS = {
     SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std was too strong for the image (above 0.9 of its rms) and was lowered.",
     SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
     SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
+    SubapertureFlag.AT_SEARCH_LIMIT: "The slope ends at search_range_px: the spot may be beyond.",
 }
 FLAGS_OF_DENOISING = (SubapertureFlag.INFEASIBLE_STRENGTH, SubapertureFlag.NOT_CONVERGED)
 _MOST_LISTED = 20
@@ -42,6 +43,11 @@ _ADVICE = {
         0.10,
         "hit the iteration limit before the tolerance was reached",
         "raise max_iterations, or raise tolerance if the time does not allow it",
+    ),
+    SubapertureFlag.AT_SEARCH_LIMIT: (
+        0.01,
+        "ended at the limit of the search range, which the spots may have left",
+        "raise search_range_px; where there is too little light, it is noise that ends there",
     ),
 }
 
