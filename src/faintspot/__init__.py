@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from faintspot.training import RunningPSF as RunningPSF
     from faintspot.training import learn_psf as learn_psf
     from faintspot.training import train_estimator as train_estimator
+    from faintspot.wavefront import Wavefront as Wavefront
+    from faintspot.wavefront import fit_wavefront as fit_wavefront
 
 __version__ = "0.1.0"
 
@@ -54,10 +56,12 @@ _HOMES = {
     "Stages": "faintspot.slopes",
     "SubapertureFlag": "faintspot.flags",
     "TrainedScore": "faintspot.sensor.score",
+    "Wavefront": "faintspot.wavefront",
     "brightest_pixels": "faintspot.estimate.brightest",
     "centre_of_gravity": "faintspot.estimate.centroid",
     "cramer_rao": "faintspot.estimate.bounds",
     "estimators": "faintspot.estimators",
+    "fit_wavefront": "faintspot.wavefront",
     "learn_psf": "faintspot.training",
     "measure_detector": "faintspot.sensor.photon_transfer",
     "photon_efficiency": "faintspot.estimate.bounds",

@@ -164,6 +164,20 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
 
 
 @pytest.mark.usefixtures("no_picture")
+def test_scales_on_the_sky_and_in_the_pupil(folder: Path, run: Commands) -> None:
+    np.save("a.npy", frames())
+    scales = ("--pixel-scale", 0.4, "--subaperture-size", 0.6, "--diameter", 4.2)
+    run.ok("layout", "a.npy", "-o", "new.toml", *scales)
+    layout = Layout.load("new.toml")
+    assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.4, 0.6, 4.2)
+    run.ok("layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixel-scale", 0.5)  # keeps the others
+    layout = Layout.load("new.toml")
+    assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.5, 0.6, 4.2)
+    run.refused("layout", "a.npy", "-o", "o.toml", "--diameter", 0, naming=("diameter_m = 0",))
+    assert not Path("o.toml").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
 def test_which_lenslets(folder: Path, run: Commands) -> None:
     np.save("a.npy", frames())
     arguments = ("layout", "a.npy", "--overwrite", "-o", "new.toml")

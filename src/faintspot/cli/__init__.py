@@ -21,6 +21,7 @@ _COMMANDS = {
     "slopes": "Turn recorded frames into slopes.",
     "study": "Measure how large the slope error is, by Monte-Carlo simulation.",
     "tune": "Say which estimator and settings suit a camera and a star.",
+    "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }
 
 

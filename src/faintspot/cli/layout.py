@@ -100,6 +100,16 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
     is_flag=True,
     help="Enter isolated bright pixels as bad pixels. Not for spots sharper than Nyquist sampling.",
 )
+@click.option(
+    "--pixel-scale",
+    type=float,
+    metavar="ARCSEC",
+    help="Of a pixel on the sky: for slopes in arcsec, wavefronts.",
+)
+@click.option(
+    "--subaperture-size", type=float, metavar="M", help="Side of a sub-aperture in the telescope's pupil."
+)
+@click.option("--diameter", type=float, metavar="M", help="Of the telescope's pupil.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option(
     "--overwrite",
@@ -125,6 +135,9 @@ def command(
     gain: float | None,
     read_noise: float | None,
     mask_hot_pixels: bool,
+    pixel_scale: float | None,
+    subaperture_size: float | None,
+    diameter: float | None,
     key: str | None,
     overwrite: bool,
 ) -> None:
@@ -158,6 +171,7 @@ def command(
         "roi": layout_options.numbers("--roi", roi, (4,), "X0,Y0,X1,Y1 in pixels"),
         "move_windows": move_windows,
     }
+    optics = layout_options.optics(target, pixel_scale, subaperture_size, diameter)
     with open_frames(frames, key=key) as source:
         calibration = layout_options.calibration(
             target, dark=dark, flat=flat, bad_pixels=bad_pixels, gain_e_per_adu=gain, read_noise_e=read_noise
@@ -166,7 +180,7 @@ def command(
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
         found = _found(source.description, mean, exclude, options)
-        layout = found.layout
+        layout = replace(found.layout, **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, layout, mean, hot)
     settings, noise, flux = _first_settings(layout, calibration, first)

@@ -14,6 +14,7 @@ from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
+from faintspot.tables import read_tables
 
 
 def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: str) -> list[float] | None:
@@ -69,6 +70,15 @@ def calibration(target: Path, **given: Any) -> Calibration:
         if value is not None
     }
     return replace(known, **changes)
+
+
+def optics(
+    target: Path, pixel_scale: float | None, subaperture_size: float | None, diameter: float | None
+) -> dict[str, Any]:
+    """Return the scales of a layout that were given, or else those that the configuration has already."""
+    given = {"pixel_scale_arcsec": pixel_scale, "subaperture_m": subaperture_size, "diameter_m": diameter}
+    known = read_tables(target).get("layout", {}) if target.exists() else {}
+    return {name: known.get(name) if value is None else value for name, value in given.items()}
 
 
 def dark_level(text: str) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.slopes import Slopes
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,15 @@ class StoredSlopes:
     attributes: Mapping[str, Any]
     complete: bool
     n_finished: int
+
+    @property
+    def slopes(self) -> Slopes:
+        """The variables as a pipeline gives them."""
+        return self.first(self.n_finished)
+
+    def first(self, n_frames: int) -> Slopes:
+        """Return the slopes of the first frames."""
+        return Slopes(**{item.name: self.variables[item.name][:n_frames] for item in fields(Slopes)})
 
 
 @dataclass(frozen=True)

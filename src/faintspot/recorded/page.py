@@ -14,9 +14,11 @@ from faintspot.estimators.total_variation import TotalVariation
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import MeasuredSlopes
+from faintspot.recorded.wavefront_section import wavefront_sections
 from faintspot.report.page import POSITIONS, Page, configuration_section, html_of
 from faintspot.sensor.layout import Layout
 from faintspot.slopes import Stages
+from faintspot.wavefront import Wavefront
 
 
 def slopes_report(
@@ -32,6 +34,7 @@ def slopes_report(
     warnings: Sequence[str] = (),
     why_no_stages: str = "Not drawn: no frame was given.",
     steps: Sequence[Step] = TotalVariation.steps_shown,
+    wavefronts: Mapping[str, Wavefront | str] | None = None,
 ) -> str:
     """Return the report page of a slopes run as HTML: self-contained, without scripts.
 
@@ -58,6 +61,8 @@ def slopes_report(
         What the page says in place of the frame.
     steps : sequence of Step
         Which pictures of the frame are drawn.
+    wavefronts : mapping, optional
+        Wavefronts fitted to the slopes, by arm, or why there is none. Default: no section of them.
 
     Raises
     ------
@@ -77,7 +82,11 @@ def slopes_report(
         Page(
             title=title,
             facts={**facts, "Frames": str(shape[0]), "Sub-apertures": _sensor_in_words(shape[1], layout)},
-            sections=[*all_sections(run), configuration_section(configuration)],
+            sections=[
+                *all_sections(run),
+                *wavefront_sections(wavefronts or {}, layout),
+                configuration_section(configuration),
+            ],
             warnings=[*warnings, *warnings_in_words(run.arms, run.summaries)],
             remark=POSITIONS,
         )

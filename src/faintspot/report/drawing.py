@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.errors import MissingExtraError
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.pupil import lenslet_outlines, lenslet_pitch
 
 try:
     import matplotlib
@@ -87,16 +88,7 @@ def svg(figure: Figure) -> bytes:
 
 def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
     """Return the corners of each lenslet's square or hexagon in frame pixels, (n, 4 or 6, 2)."""
-    pitch = _pitch(layout)
-    if layout.geometry == "hexagonal":
-        angles, radius = 30.0 + 60.0 * np.arange(6), pitch / np.sqrt(3)
-    else:
-        angles, radius = 45.0 + 90.0 * np.arange(4), pitch / np.sqrt(2)
-    direction = np.deg2rad(angles + layout.angle_deg)
-    gap = 0.96 if len(layout) <= MOST_WITH_GAPS else 1.0
-    ring = gap * radius * np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    shapes: NDArray[np.float64] = layout.centres[:, None, :] + ring
-    return shapes
+    return lenslet_outlines(layout, 0.96 if len(layout) <= MOST_WITH_GAPS else 1.0)
 
 
 def subaperture_map(
@@ -141,7 +133,7 @@ def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str
 def place_axes(axes: Axes, layout: Layout) -> None:
     """Set the limits of axes in frame pixels so that all sub-apertures are within."""
     shapes = subaperture_shapes(layout).reshape(-1, 2)
-    margin = 0.25 * _pitch(layout)
+    margin = 0.25 * lenslet_pitch(layout)
     low, high = shapes.min(axis=0) - margin, shapes.max(axis=0) + margin
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -158,7 +150,3 @@ def limits_of(*arrays: NDArray[Any], low: float | None = None, percent: float = 
     start = float(np.percentile(values, 100.0 - percent)) if low is None else low
     stop = float(np.percentile(values, percent))
     return (start, stop) if stop > start else (start, start + max(1e-3, abs(start)))
-
-
-def _pitch(layout: Layout) -> float:
-    return float(max(layout.window)) if layout.pitch_px is None else layout.pitch_px

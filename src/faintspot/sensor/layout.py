@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
 GEOMETRIES = ("square", "hexagonal")
+OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
+"""Fields that say how large things are on the sky and in the pupil."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,11 @@ class Layout:
         Distance between neighbouring lenslets.
     angle_deg : float
         Angle of the lenslet array's rows from +x towards +y.
+    pixel_scale_arcsec : float, optional
+        Angle on the sky that a pixel of the detector sees: it makes angles of slopes.
+    subaperture_m, diameter_m : float, optional
+        Side of a sub-aperture (the lenslets' pitch) and diameter of the telescope, in the entrance pupil.
+        Either is enough for wavefronts in nm: the lit sub-apertures then span the pupil.
 
     Raises
     ------
@@ -61,6 +68,9 @@ class Layout:
     geometry: str = "square"
     pitch_px: float | None = None
     angle_deg: float = 0.0
+    pixel_scale_arcsec: float | None = None
+    subaperture_m: float | None = None
+    diameter_m: float | None = None
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -79,8 +89,9 @@ class Layout:
                     f"layout.{name}: expected {len(corners)} rows, one per corner, got {len(array)}"
                 )
         one_of("layout.geometry", self.geometry, GEOMETRIES)
-        if self.pitch_px is not None:
-            put(self, "pitch_px", number_between("layout.pitch_px", self.pitch_px, 0.0, low_open=True))
+        for name in ("pitch_px", *OPTICS):
+            if (value := getattr(self, name)) is not None:
+                put(self, name, number_between(f"layout.{name}", value, 0.0, low_open=True))
         put(self, "angle_deg", number_between("layout.angle_deg", self.angle_deg, -360, 360))
         _check_inside(corners, self.window, self.frame_shape)
         _check_centres(centres - middle, self.window)
@@ -143,6 +154,7 @@ class Layout:
         pitch: int | tuple[int, int] | None = None,
         origin: tuple[int, int] = (0, 0),
         frame_shape: tuple[int, int] | None = None,
+        **optics: Any,
     ) -> Layout:
         """Make a regular grid of sub-apertures under an annular pupil.
 
@@ -162,12 +174,15 @@ class Layout:
             Row and column of the first window's first pixel.
         frame_shape : (int, int), optional
             Default: just large enough.
+        **optics
+            pixel_scale_arcsec, subaperture_m and diameter_m, as for `Layout`.
 
         Raises
         ------
         InputError
             When nothing is lit, or as for `Layout`.
         """
+        check_keys("", optics, OPTICS, what="argument")
         n_rows, n_columns = pair_of_numbers("shape", shape, 1, 10_000)
         window = window_size("pixels", pixels)
         step = window if pitch is None else pair_of_numbers("pitch", pitch, 1, 10_000)
@@ -184,9 +199,8 @@ class Layout:
         if frame_shape is None:
             last = np.array(start) + (np.array([n_rows, n_columns]) - 1) * step + window
             frame_shape = (int(last[0]), int(last[1]))
-        return cls(
-            frame_shape, window, np.array(start) + cells * step, cells=cells, pitch_px=float(min(step))
-        )
+        corners = np.array(start) + cells * step
+        return cls(frame_shape, window, corners, cells=cells, pitch_px=float(min(step)), **optics)
 
     @classmethod
     def stacked(cls, n: int, window: tuple[int, int], offsets: NDArray[np.float64] | None = None) -> Layout:
@@ -294,7 +308,7 @@ class Layout:
 
     @classmethod
     def from_table(cls, values: Mapping[str, Any]) -> Layout:
-        """Make a layout from a table of a configuration file, which may hold the arguments of `grid`.
+        """Make a layout from a table of a configuration file, which may hold those of `grid` as a table.
 
         Raises
         ------
@@ -304,11 +318,12 @@ class Layout:
         if "grid" not in values:
             check_fields("layout", cls, values)
             return cls(**values)
-        check_keys("layout.", values, ["grid"], what="key beside grid")
+        check_keys("layout.", values, ["grid", *OPTICS], what="key beside grid")
+        optics = {name: values[name] for name in OPTICS if name in values}
         grid = checked_table("layout.grid", values["grid"])
         check_keys("layout.grid.", grid, GRID_KEYS, required=("shape", "pixels"))
         try:
-            return cls.grid(**grid)
+            return cls.grid(**grid, **optics)
         except InputError as error:
             text = str(error)
             raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None

@@ -1,0 +1,112 @@
+"""faintspot wavefront: Zernike modes from slopes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.recorded.stored_run import open_run
+from faintspot.sensor.layout import Layout
+from faintspot.wavefront import Wavefront, fit_wavefront, save_wavefront
+from faintspot.wavefront.files import check_ending
+from faintspot.wavefront.words import mode_table, remarks, rms_table
+
+
+@click.command(short_help="Fit Zernike modes to slopes, and draw the wavefront.")
+@click.argument("slopes", metavar="SLOPES")
+@click.option(
+    "--output",
+    "-o",
+    metavar="FILE",
+    multiple=True,
+    help="Also write it: .csv, .json or .fits; several times.",
+)
+@click.option("--picture", metavar="PNG", help="Where to draw it. Default: beside the slopes.")
+@click.option(
+    "--modes",
+    type=click.IntRange(2),
+    metavar="N",
+    help="How many, from tip and tilt on. Default: by the sensor.",
+)
+@click.option(
+    "--pixel-scale", type=float, metavar="ARCSEC", help="Of a detector pixel, instead of the layout's."
+)
+@click.option("--subaperture-size", type=float, metavar="M", help="Side of a sub-aperture in the pupil.")
+@click.option("--diameter", type=float, metavar="M", help="Of the telescope's pupil.")
+def command(
+    slopes: str,
+    output: tuple[str, ...],
+    picture: str | None,
+    modes: int | None,
+    pixel_scale: float | None,
+    subaperture_size: float | None,
+    diameter: float | None,
+) -> None:
+    """Fit Zernike modes (Noll's order) to slopes, and draw the wavefront.
+
+    SLOPES is what `faintspot slopes` wrote (.zarr, .fits, .npz). Each frame is fitted by least squares over
+    its valid sub-apertures; the table shows the mean, with standard errors. In nm when the pixels' scale and
+    the size of a sub-aperture or of the telescope are known, from `faintspot layout` or the options here.
+
+    \b
+    Examples:
+      faintspot wavefront slopes.zarr
+      faintspot wavefront slopes.zarr --pixel-scale 0.38 --diameter 4.2 -o wavefront.json
+    """
+    for name in output:
+        check_ending(Path(name))
+    run = open_run(Path(slopes))
+    if run.layout is None:
+        raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
+    given = {"pixel_scale_arcsec": pixel_scale, "subaperture_m": subaperture_size, "diameter_m": diameter}
+    scales: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    layout = replace(run.layout, **scales)
+    try:
+        wavefront = fit_wavefront(run.stored.slopes, layout, modes=modes)
+    except InputError as error:
+        raise InputError(f"{slopes}: {error}") from None
+    _print(wavefront)
+    for note in run.notes:
+        click.echo(note)
+    for name in output:
+        save_wavefront(name, wavefront)
+        click.echo(name)
+    click.echo(_draw(wavefront, layout, Path(slopes), picture))
+
+
+def _print(wavefront: Wavefront) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for header, rows in (mode_table(wavefront), rms_table(wavefront)):
+        table = Table(box=None, pad_edge=False)
+        words = 2 if header[0] == "mode" else 1
+        for place, title in enumerate(header):
+            table.add_column(title, justify="left" if place < words else "right")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+        console.print()
+    for line in remarks(wavefront):
+        click.echo(line)
+
+
+def _draw(wavefront: Wavefront, layout: Layout, slopes: Path, picture: str | None) -> str:
+    """Draw it and say where; without matplotlib only a picture that was asked for fails."""
+    path = picture or str(slopes.with_name(f"{slopes.name.split('.')[0]}_wavefront.png"))
+    try:
+        from faintspot.files import write_atomically
+        from faintspot.report.drawing import png
+        from faintspot.wavefront.figure import wavefront_figure
+
+        write_atomically(path, png(wavefront_figure(wavefront, layout, slopes.name).figure))
+    except MissingExtraError as error:
+        if picture is not None:
+            raise
+        return f"no picture: {error}"
+    return f"picture: {path}"

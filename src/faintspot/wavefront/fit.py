@@ -1,0 +1,234 @@
+"""Wavefronts from slopes: Zernike modes fitted by least squares to the valid sub-apertures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.pupil import Pupil, lenslet_outlines, pupil_of
+from faintspot.slopes import Slopes
+from faintspot.wavefront.zernike import mean_gradients, zernike
+
+Floats = NDArray[np.float64]
+
+LARGEST_CONDITION = 100.0
+"""Of the gradients of the modes, each scaled to 1: beyond, noise of one mode is amplified that much."""
+_HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # by default; higher orders are seldom asked for
+_TILTS = 2
+_NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
+
+
+@dataclass(frozen=True)
+class Wavefront:
+    """Zernike coefficients of the wavefront in one frame or several.
+
+    The wavefront is the path by which light arrives late or early, less its mean, and grows towards where
+    spots are displaced to. All is over the whole disk of the pupil: a central obscuration has no modes of its
+    own.
+    """
+
+    modes: NDArray[np.int64]
+    """(k,): Noll's numbers, from 2."""
+    coefficients: Floats
+    """(n_frames, k): rms over the disk, as each mode's mean square is 1; NaN in frames not `fitted`."""
+    standard_errors: Floats
+    """(n_frames, k): of the coefficients, from the slopes' noise; NaN where that cannot be told."""
+    errors_from: str
+    """"slopes": from their standard errors; "residuals": from their scatter about the fitted modes, which
+    counts modes that are not fitted as noise."""
+    residual_px: Floats
+    """(n_frames,): rms of the slopes about the fitted modes, px per axis."""
+    unit: str
+    """"nm", or "px × sub-aperture": slopes in pixels times lengths in sub-apertures."""
+    pupil: Pupil
+    condition: float
+    """Condition number of the fit with every sub-aperture that is ever valid."""
+
+    @property
+    def fitted(self) -> NDArray[np.bool_]:
+        """(n_frames,): whether enough sub-apertures were valid to tell the modes apart."""
+        return np.asarray(np.isfinite(self.coefficients).all(axis=1))
+
+    @property
+    def mean(self) -> Floats:
+        """(k,): coefficients of the mean wavefront."""
+        mean: Floats = self.coefficients[self.fitted].mean(axis=0)
+        return mean
+
+    @property
+    def mean_standard_error(self) -> Floats:
+        """(k,): of the mean: from the scatter over frames, as if independent; of one frame, its own."""
+        kept = self.coefficients[self.fitted]
+        if len(kept) == 1:
+            error: Floats = self.standard_errors[self.fitted][0]
+        else:
+            error = kept.std(axis=0, ddof=1) / np.sqrt(len(kept))
+        return error
+
+    @property
+    def rms_of_frames(self) -> Floats:
+        """(k,): root mean square of each coefficient over the frames."""
+        rms: Floats = np.sqrt(np.mean(self.coefficients[self.fitted] ** 2, axis=0))
+        return rms
+
+    def rms(self, *, tilt: bool = True) -> Floats:
+        """Return the rms of each frame's wavefront over the disk, (n_frames,), with tip and tilt or not."""
+        return total(self.coefficients, tilt=tilt)
+
+    def sheet(self, coefficients: Floats | None = None, *, points: int = 201, tilt: bool = True) -> Floats:
+        """Return a wavefront as a map over the disk, (points, points), NaN outside.
+
+        Parameters
+        ----------
+        coefficients : (k,) array, optional
+            Default: those of the mean wavefront.
+        points : int
+            Along the diameter; rows go along y, columns along x, the outermost at the disk's edge.
+        tilt : bool
+            False leaves out tip and tilt.
+        """
+        values = self.mean if coefficients is None else coefficients
+        line = np.linspace(-1, 1, points)
+        y, x = np.meshgrid(line, line, indexing="ij")
+        inside = np.hypot(x, y) <= 1
+        sheet = np.full((points, points), np.nan)
+        sheet[inside] = 0.0
+        start = 0 if tilt else _TILTS
+        for j, value in zip(self.modes[start:], values[start:], strict=True):
+            sheet[inside] += value * zernike(int(j), x[inside], y[inside])
+        return sheet
+
+
+def total(coefficients: Floats, *, tilt: bool = True) -> Floats:
+    """Return the rms of wavefronts over the disk: the root of the sum of squares along the last axis."""
+    rms: Floats = np.sqrt(np.sum(coefficients[..., 0 if tilt else _TILTS :] ** 2, axis=-1))
+    return rms
+
+
+def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -> Wavefront:
+    """Fit Zernike modes to slopes, each frame by least squares over its valid sub-apertures.
+
+    What is compared with a slope is the mean gradient of a mode over the lenslet's square or hexagon, exactly
+    integrated; a sub-aperture that the pupil's edge cuts counts as whole.
+
+    Parameters
+    ----------
+    slopes : Slopes
+        Of one frame or several; relative to a reference, the wavefront is, too.
+    layout : Layout
+        With `pixel_scale_arcsec`, and `subaperture_m` or `diameter_m`, the wavefront is in nm.
+    modes : int, optional
+        How many, from tip and tilt on. Default: all up to the highest radial order, at most 8, of which there
+        are no more than three for four sub-apertures and that can be told apart well. What is in orders that
+        are not fitted leaks into the two highest that are.
+
+    Raises
+    ------
+    InputError
+        When slopes and layout do not fit together, no slope is valid, or the valid sub-apertures cannot tell
+        so many modes apart.
+    """
+    x, y, valid = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "valid"))
+    if x.ndim != 2 or x.shape[1] != len(layout):
+        raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
+    lit = np.asarray(valid.any(axis=0))
+    if not lit.any():
+        raise InputError("slopes: expected some to fit a wavefront to, found none that is valid")
+    pupil = pupil_of(layout)
+    gradients, condition = _chosen_gradients(modes, layout, pupil, lit)
+    unit, scale = _unit(layout, pupil)
+    errors = np.concatenate(
+        [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
+    )
+    used = np.tile(valid, 2)
+    known = bool(np.isfinite(errors[used]).all())
+    measured = np.concatenate([x, y], axis=1).astype(np.float64)
+    coefficients, standard_errors, residual = _fit(measured, used, gradients, errors if known else None)
+    return Wavefront(
+        np.arange(2, 2 + gradients.shape[1]),
+        scale * coefficients,
+        scale * standard_errors,
+        "slopes" if known else "residuals",
+        residual,
+        unit,
+        pupil,
+        condition,
+    )
+
+
+def _chosen_gradients(
+    modes: int | None, layout: Layout, pupil: Pupil, lit: NDArray[np.bool_]
+) -> tuple[Floats, float]:
+    """Return the mean gradients (2 n, k) of the modes to fit, all x, then all y, and their condition."""
+    n = int(np.count_nonzero(lit))
+    if modes is None:
+        counts = [order * (order + 3) // 2 for order in range(_HIGHEST_ORDER, 0, -1)]
+        counts, limit = [count for count in counts if count <= 0.75 * n] or [_TILTS], _USUAL_CONDITION
+    else:
+        counts = [int(number_between("modes", modes, _TILTS, 2 * n, integer=True))]
+        limit = LARGEST_CONDITION
+    outlines = (lenslet_outlines(layout) - pupil.centre_px) / pupil.radius_px
+    gradients = np.concatenate(mean_gradients(np.arange(2, 2 + counts[0]), outlines))
+    for count in counts:
+        condition = _condition(gradients[np.tile(lit, 2), :count])
+        if condition <= limit:
+            return gradients[:, :count], condition
+    raise InputError(
+        f"modes = {count}: {n} valid sub-apertures cannot tell so many apart (condition number "
+        f"{condition:.3g}, expected at most {LARGEST_CONDITION:g}): take fewer"
+    )
+
+
+def _unit(layout: Layout, pupil: Pupil) -> tuple[str, float]:
+    """Return the unit of coefficients, and what makes it of pixels times the disk's radius."""
+    if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
+        return "px × sub-aperture", pupil.radius_subapertures
+    return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
+
+
+def _condition(gradients: Floats) -> float:
+    """Return the condition number of the modes' gradients (2 n, k), each scaled to length 1."""
+    lengths = np.linalg.norm(gradients, axis=0)
+    if len(gradients) < gradients.shape[1] or not lengths.all():
+        return np.inf
+    return float(np.linalg.cond(gradients / lengths))
+
+
+def _fit(
+    slopes: Floats, valid: NDArray[np.bool_], gradients: Floats, errors: NDArray[Any] | None
+) -> tuple[Floats, Floats, Floats]:
+    """Return coefficients, their standard errors and the rms of the residuals, for a radius and px of 1.
+
+    Frames with the same valid sub-apertures share one pseudo-inverse. Without errors of the slopes, the
+    residuals say what they are.
+    """
+    frames, k = len(slopes), gradients.shape[1]
+    coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)
+    residual = np.full(frames, np.nan)
+    patterns, of_frame = np.unique(np.packbits(valid, axis=1), axis=0, return_inverse=True)
+    for number in range(len(patterns)):
+        which = np.flatnonzero(of_frame.ravel() == number)
+        used = valid[which[0]]
+        if not _condition(gradients[used]) <= LARGEST_CONDITION:
+            continue
+        inverse = np.linalg.pinv(gradients[used])
+        measured = slopes[np.ix_(which, used)]
+        fitted = measured @ inverse.T
+        left = measured - fitted @ gradients[used].T
+        coefficients[which] = fitted
+        residual[which] = np.sqrt(np.mean(left**2, axis=1))
+        freedom = measured.shape[1] - k
+        if errors is not None:
+            variance = errors[np.ix_(which, used)].astype(np.float64) ** 2
+        elif freedom > 0:
+            variance = np.broadcast_to(np.sum(left**2, axis=1, keepdims=True) / freedom, measured.shape)
+        else:
+            continue
+        standard_errors[which] = np.sqrt(variance @ (inverse**2).T)
+    return coefficients, standard_errors, residual

@@ -1,0 +1,92 @@
+"""Zernike polynomials in Noll's order, and their mean gradients over sub-apertures.
+
+Noll (1976), JOSA 66, 207: mode j has mean square 1 over the unit disk, and even j go with the cosine.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import eval_jacobi
+
+Floats = NDArray[np.float64]
+
+_NAMES = {
+    1: "piston",
+    2: "tilt along x",
+    3: "tilt along y",
+    4: "defocus",
+    5: "astigmatism, 45°",
+    6: "astigmatism, 0°",
+    7: "coma along y",
+    8: "coma along x",
+    9: "trefoil, sine",
+    10: "trefoil, cosine",
+    11: "spherical",
+}
+
+
+def noll_to_nm(j: int) -> tuple[int, int]:
+    """Return radial order n and azimuthal order m of mode j = 1, 2 ...; m < 0 stands for the sine."""
+    n = 0
+    while (n + 1) * (n + 2) // 2 < j:
+        n += 1
+    place = j - 1 - n * (n + 1) // 2
+    m = 2 * (place // 2) + 1 if n % 2 else 2 * ((place + 1) // 2)
+    return n, m if j % 2 == 0 else -m
+
+
+def mode_name(j: int) -> str:
+    """Return what a mode is called, up to spherical; else its orders."""
+    n, m = noll_to_nm(j)
+    return _NAMES.get(j, f"n = {n}, m = {m}")
+
+
+def zernike(j: int, x: ArrayLike, y: ArrayLike) -> Floats:
+    """Return mode j at points in units of the disk's radius; a polynomial, so outside the disk as well.
+
+    The radial part is the Jacobi polynomial (-1)^k r^m P_k^(m,0)(1 - 2 r^2) with k = (n - m) / 2.
+    """
+    n, signed = noll_to_nm(j)
+    m = abs(signed)
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    around = (x + 1j * y) ** m  # r^m with cosine and sine of m times the angle
+    k = (n - m) // 2
+    radial = (-1) ** k * eval_jacobi(k, m, 0, 1 - 2 * (x**2 + y**2))
+    norm = np.sqrt((n + 1) * (1 if m == 0 else 2))
+    mode: Floats = norm * radial * (around.real if signed >= 0 else around.imag)
+    return mode
+
+
+def mean_gradients(modes: ArrayLike, outlines: Floats) -> Floats:
+    """Return the mean gradient of modes over polygons, exactly.
+
+    The integral of a gradient over an area is that of the mode times the outward normal along its edge. Along
+    a straight edge the mode is a polynomial of order n, which (n + 2) // 2 Gauss-Legendre points integrate
+    without error.
+
+    Parameters
+    ----------
+    modes : (k,) array of int
+        Noll's j.
+    outlines : (n, corners, 2) array
+        x, y of each polygon's corners, going round from +x towards +y, in units of the disk's radius.
+
+    Returns
+    -------
+    (2, n, k) array
+        Along x and along y, for each unit of radius.
+    """
+    numbers = [int(j) for j in np.asarray(modes)]
+    highest = max(noll_to_nm(j)[0] for j in numbers)
+    nodes, weights = np.polynomial.legendre.leggauss((highest + 2) // 2)
+    edges = np.roll(outlines, -1, axis=1) - outlines
+    points = outlines[:, :, None] + edges[:, :, None] * (0.5 * (nodes + 1))[:, None]
+    normals = np.stack([edges[..., 1], -edges[..., 0]])  # as long as the edges
+    cross = outlines[..., 0] * edges[..., 1] - outlines[..., 1] * edges[..., 0]
+    areas = 0.5 * cross.sum(axis=1)
+    gradients = np.empty((2, len(outlines), len(numbers)))
+    for place, j in enumerate(numbers):
+        along_edges = zernike(j, points[..., 0], points[..., 1]) @ (0.5 * weights)
+        gradients[..., place] = (normals * along_edges).sum(axis=-1) / areas
+    return gradients
