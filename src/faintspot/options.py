@@ -19,6 +19,7 @@ from faintspot.checks import numbers_between, one_of
 from faintspot.errors import InputError
 
 AUTO = "auto"
+_MIXED = '{}: expected "auto" for the whole sensor or numbers for all sub-apertures, got both'
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,7 @@ class Option:
             raise InputError(f"{name}: expected a value for each sub-aperture that is named, got none")
         others = {int(index): self.checked(name, item) for index, item in value.others.items()}
         if AUTO in others.values() or (others and value.default == AUTO):
-            raise InputError(
-                f'{name}: expected "auto" for the whole sensor or numbers for all sub-apertures, got both'
-            )
+            raise InputError(_MIXED.format(name))
         return PerSubaperture(self.checked(name, value.default), MappingProxyType(others))
 
     def _checked_names(self, name: str, value: Any) -> Any:
@@ -109,6 +108,8 @@ class Option:
         except InputError as error:
             if self.automatic and isinstance(value, str):
                 raise InputError(f'{name} = {value!r}: expected a number or "auto"') from None
+            if self.automatic and np.ndim(value) == 1 and AUTO in list(value):
+                raise InputError(_MIXED.format(name)) from None
             raise error from None
 
 
@@ -275,7 +276,7 @@ def _indices(where: int | Sequence[int] | NDArray[Any]) -> NDArray[np.int64]:
         array = np.flatnonzero(array)
     if array.size == 0:
         return np.empty(0, np.int64)
-    return numbers_between("where", array, 0, integer=True).astype(np.int64)
+    return numbers_between("where", array, 0, 2**31, integer=True).astype(np.int64)
 
 
 def _locked(array: NDArray[Any]) -> NDArray[Any]:

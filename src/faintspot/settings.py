@@ -167,8 +167,9 @@ class Settings:
             For an unknown key, one of another estimator, a bad value.
         """
         if "estimator" not in document:
+            former = table_of(path, document, "settings")
             with errors_of_table(path, "settings"):
-                return cls(**without_foreign(_plain_values("settings", table_of(path, document, "settings"))))
+                return cls(**without_foreign(_plain_values("settings", former)))
         own, shared = dict(document["estimator"]), document.get("settings", {})
         with errors_of_table(path, "estimator"):
             name = own.pop("name", None)

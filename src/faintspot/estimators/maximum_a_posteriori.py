@@ -17,13 +17,18 @@ from faintspot.estimators.maximum_likelihood import Likelihood, LikelihoodPrepar
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.estimators.spot_tables import PosteriorGrid
+from faintspot.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid
 from faintspot.kernels import located
 from faintspot.kernels.groups import RANGE
 from faintspot.options import option
 from faintspot.presets import PRESETS
+from faintspot.sizes import MOST_NUMBERS, check_size
 
 Floats = NDArray[np.float64]
+
+# Levels of measured light, a tenth apart, that must fit into memory: a factor of two. Beyond what fits, the
+# nearest one's tables serve.
+_LEVELS = 8
 
 
 @register
@@ -81,15 +86,18 @@ class _Prepared(LikelihoodPrepared):
         super().__init__(estimator, sensor)
         self.needs_light = bool(np.isnan(sensor.flux_e).all())
         self._posteriors: list[PosteriorGrid] = []
+        self._levels: dict[float, int] = {}  # first table of every level of light that was measured
         self._scratch: tuple[int, Any] = (-1, None)
-        self._extent = 0.0
+        self._grid, self._spacing = NO_POSTERIOR.grid, NO_POSTERIOR.spacing
+        self.table_shape = (0, 0, 0)
+        """Of every kind's table: positions, rows, columns."""
 
     @property
     def tables(self) -> Any:
         """See `Prepared`."""
         if len(self._posteriors) > 1:
             self._posteriors = [spot_tables.joined(self._posteriors)]
-        found = self._posteriors[0] if self._posteriors else spot_tables.NO_POSTERIOR
+        found = self._posteriors[0] if self._posteriors else NO_POSTERIOR
         return located.PosteriorTables(
             self.model_tables, found.tables, found.constants, found.grid, found.spacing
         )
@@ -109,26 +117,48 @@ class _Prepared(LikelihoodPrepared):
         """See `Prepared`."""
         super().fill(table)
         table[located.PRIOR_WEIGHT] = np.nan_to_num(self.each("prior_std_px") ** -2.0)
-        self._extent = float(np.abs(self.sensor.zero).max() + table[RANGE].max())
+        sensor = self.sensor
+        reach = float(np.abs(sensor.zero).max() + table[RANGE].max())
+        self._grid, self._spacing = spot_tables.posterior_grid(
+            reach, float(self.psf.fwhm_px.min()), sensor.window
+        )
+        self.table_shape = spot_tables.posterior_shape(len(self._grid), sensor.window, sensor.width)
+        flux = np.zeros(sensor.n) if self.needs_light else sensor.flux_e
+        kinds = len(self._kinds(flux)[0]) * (_LEVELS if self.needs_light else 1)
+        check_size(
+            "map: tables of the posterior (kinds, positions, rows, columns)",
+            (kinds, *self.table_shape),
+            hint="give search_range_px, smaller windows, or one flux_e for all",
+        )
 
     def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `Prepared`."""
         super().fill_light(table, flux_e)
-        sensor, psf, floors = self.sensor, self.psf, self.each("weight_floor")
-        planes = psf.index_of(sensor.n)
-        kinds, which = np.unique(np.column_stack([planes, flux_e, floors]), axis=0, return_inverse=True)
-        grid, spacing = spot_tables.posterior_grid(self._extent, float(psf.fwhm_px.min()), sensor.window)
+        sensor = self.sensor
+        kinds, which = self._kinds(flux_e)
+        before = sum(len(part.tables) for part in self._posteriors)
+        if self._levels and (before + len(kinds)) * math.prod(self.table_shape) > MOST_NUMBERS:
+            nearest = min(self._levels, key=lambda level: abs(math.log(level / flux_e[0])))
+            table[located.KIND] = self._levels[nearest] + which
+            return
+        if self.needs_light:
+            self._levels[float(flux_e[0])] = before
         made = spot_tables.posterior_tables(
-            psf,
+            self.psf,
             kinds[:, 0].astype(np.int64),
             kinds[:, 1],
             self.variance + kinds[:, 2] * kinds[:, 1],
             sensor.excess_noise,
-            grid,
-            spacing,
+            self._grid,
+            self._spacing,
             sensor.window,
             sensor.width,
         )
-        before = sum(len(part.tables) for part in self._posteriors)
         self._posteriors.append(made)
-        table[located.KIND] = before + which.reshape(-1)
+        table[located.KIND] = before + which
+
+    def _kinds(self, flux_e: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        """Return PSF, light and floor of every kind of sub-aperture, (n_kinds, 3), and the kind of each."""
+        columns = [self.psf.index_of(self.sensor.n), flux_e, self.each("weight_floor")]
+        kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+        return kinds, which.reshape(-1)

@@ -16,6 +16,7 @@ from faintspot.kernels.located import SMALLEST_VARIANCE
 from faintspot.kernels.profiles import MARGIN, PHASES
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
+from faintspot.sizes import check_size
 
 Floats = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ _NEAR_OUTLIERS = 0.9
 _GRID_OF_FWHM = 0.25  # spacing of the posterior's grid; at most ...
 _COARSEST_OF_FWHM = 0.4
 _GRID_POSITIONS = 13  # ... and otherwise about so many positions along an axis
+_BLOCK_NUMBERS = 1 << 22  # worked on at a time: bounds the memory beside the tables
 
 
 @dataclass(frozen=True)
@@ -248,6 +250,11 @@ def posterior_grid(
     return np.column_stack([x.ravel(), y.ravel()]).astype(np.float32), spacing
 
 
+def posterior_shape(positions: int, window: tuple[int, int], width: int) -> tuple[int, int, int]:
+    """Return the shape of one table of the posterior: positions, rows, columns filled up to whole vectors."""
+    return positions, window[0], -(-window[1] // width) * width
+
+
 def posterior_tables(
     psf: PSF,
     planes: NDArray[np.int64],
@@ -260,16 +267,18 @@ def posterior_tables(
     width: int,
 ) -> PosteriorGrid:
     """Prepare the grid's tables for each triple of a PSF, a flux and a dark pixel's variance."""
-    ny, nx = window
-    padded = -(-nx // width) * width
-    tables = np.zeros((len(flux_e), len(grid), ny, padded), np.float32)
+    nx = window[1]
+    tables = np.zeros((len(flux_e), *posterior_shape(len(grid), window, width)), np.float32)
     constants = np.empty((len(flux_e), len(grid)), np.float32)
+    block = max(1, _BLOCK_NUMBERS // (window[0] * nx))
     for i, (plane, flux, v) in enumerate(zip(planes, flux_e, variance, strict=True)):
-        mean = np.maximum(psf.images(grid, window, flux, which=int(plane)), 0.0)
         v = max(v, SMALLEST_VARIANCE)
-        logarithm = np.log1p(excess * mean / v)
-        tables[i, :, :, :nx] = logarithm / excess
-        constants[i] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))
+        for start in range(0, len(grid), block):
+            part = slice(start, start + block)
+            mean = np.maximum(psf.images(grid[part], window, flux, which=int(plane)), 0.0)
+            logarithm = np.log1p(excess * mean / v)
+            tables[i, part, :, :nx] = logarithm / excess
+            constants[i, part] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))
     return PosteriorGrid(tables, constants, grid, spacing)
 
 
@@ -287,7 +296,9 @@ def score_tables(
     margin = max(window) + MARGIN
     side, length = 2 * margin + max(window), 2 * margin + max(window) + 2 * width
     kinds, classes, passes, _, rows, columns = score.tables.shape
-    result = np.zeros((kinds * classes, passes, steps, steps, 2, side, length), np.float32)
+    shape = (kinds * classes, passes, steps, steps, 2, side, length)
+    check_size("score.tables", shape, hint="train it for fewer kinds or fluxes, or use smaller windows")
+    result = np.zeros(shape, np.float32)
     flat = score.tables.reshape(kinds * classes, passes, 2, rows, columns)
     for phase_y in range(steps):
         # Node of element i: (i - margin) * steps + phase + (rows - 1) / 2.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.io.formats import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
+from faintspot.sizes import check_size, memory_bytes
 
 
 class FrameSource:
@@ -157,6 +159,12 @@ def read_array(location: str | Path) -> NDArray[Any]:
         raise InputError(f"{array.name}: expected real numbers, got dtype {array.dtype}")
     if 0 in array.shape:
         raise InputError(f"{array.name}: expected at least one value, got shape {array.shape}")
+    # What it says may be more than it has: a damaged header, or a store whose chunks were never written.
+    gigabytes, present = (n / 2**30 for n in (math.prod(array.shape) * array.dtype.itemsize, memory_bytes()))
+    if gigabytes > present:
+        raise InputError(
+            f"{array.name}: its shape {array.shape} needs {gigabytes:.3g} GiB of memory, of {present:.3g}"
+        )
     try:
         return array.read(0, array.shape[0])
     finally:
@@ -186,6 +194,7 @@ def _check_frames(array: StoredArray) -> None:
         )
     if 0 in array.shape:
         raise InputError(f"{array.name}: expected at least one frame and pixel, got shape {array.shape}")
+    check_size(f"{array.name}: its frames", array.shape[-2:], what="pixels")
 
 
 def _frame_count(array: StoredArray) -> int:

@@ -17,6 +17,7 @@ from faintspot.compare.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
 from faintspot.errors import InputError
 from faintspot.estimators.scene import Scene
 from faintspot.loop.checked_fields import LIST, NUMBER_OR_LIST, checked_section, number
+from faintspot.sizes import check_size
 from faintspot.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
 
 ARCSEC = math.pi / 180 / 3600
@@ -26,6 +27,7 @@ R0_WAVELENGTH_M = 500e-9
 
 CLOSED, OPEN = "closed", "open"
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
+_MOST_POINTS = 4096**2  # of a wavefront
 _POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
 
 
@@ -379,6 +381,14 @@ def _check_sampling(whole: LoopConfiguration) -> None:
     if not isinstance(whole.mirror.tip_tilt, bool):
         raise InputError(f"mirror.tip_tilt = {whole.mirror.tip_tilt!r}: expected true or false")
     sensor = whole.sensor
+    check_size(
+        "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS
+    )
+    check_size(
+        "sensor: (subapertures x pixels)^2", [(sensor.subapertures * sensor.pixels) ** 2], what="pixels"
+    )
+    actuators = whole.mirror.actuators or sensor.subapertures + 1
+    check_size("interaction matrix (slopes, actuators)", (2 * sensor.subapertures**2, actuators**2))
     diameter, side = whole.telescope.diameter_m, whole.subaperture_m
     if side > diameter:
         raise InputError(

@@ -18,6 +18,7 @@ from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, sensor_frames
 from faintspot.simulate.generators import spawn
+from faintspot.sizes import check_size
 
 _SPIN_NS = 150_000  # a sleep wakes up later than asked for by up to this; the rest is spun
 _BETWEEN_REPORTS_NS = 100_000_000
@@ -277,6 +278,7 @@ class Camera(Readout):
             rows_per_block=rows_per_block,
         )
         count = int(number_between("n_distinct", n_distinct, 1, integer=True))
+        check_size("n_distinct frames", (count, *layout.frame_shape), what="pixels")
         motion_rng, noise_rng = spawn(rng, 2)
         moving = SpotMotion() if motion is None else motion
         self.frames, self.truth = sensor_frames(

@@ -17,6 +17,9 @@ from faintspot.io.frames import read_array
 from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_map, read_tables, save_tables
 
 _MAPS = ("dark", "flat", "bad_pixels")
+# What the kernels square in float32, with a wide margin; no camera comes near.
+_GAINS = 1e-9, 1e9
+_LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
 
 
 @dataclass(frozen=True)
@@ -67,12 +70,16 @@ class Calibration:
         if self.flat is not None:
             put(self, "flat", _map("calibration.flat", self.flat))
         for name in ("gain_e_per_adu", "em_gain"):
-            put(self, name, number_between(f"calibration.{name}", getattr(self, name), 0.0, low_open=True))
+            put(self, name, number_between(f"calibration.{name}", getattr(self, name), *_GAINS))
         if self.read_noise_e is not None:
-            put(self, "read_noise_e", number_between("calibration.read_noise_e", self.read_noise_e, 0.0))
-        put(self, "background_e", number_between("calibration.background_e", self.background_e, 0.0))
+            noise = number_between("calibration.read_noise_e", self.read_noise_e, 0.0, _LARGEST_READ_NOISE_E)
+            put(self, "read_noise_e", noise)
+        background = number_between("calibration.background_e", self.background_e, 0.0, _LARGEST_BACKGROUND_E)
+        put(self, "background_e", background)
         if self.saturation_adu is not None:
-            level = number_between("calibration.saturation_adu", self.saturation_adu, 0.0, low_open=True)
+            level = number_between(
+                "calibration.saturation_adu", self.saturation_adu, 0.0, _LARGEST_ADU, low_open=True
+            )
             put(self, "saturation_adu", level)
         if self.bad_pixels is not None:
             put(self, "bad_pixels", _mask_or_list(self.bad_pixels))
@@ -195,7 +202,7 @@ def _map(name: str, value: Any) -> NDArray[np.float64]:
 
 def _scalar_or_map(name: str, value: Any) -> Any:
     if np.ndim(value) == 0:
-        return number_between(name, value)
+        return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
     return _map(name, value)
 
 
@@ -208,7 +215,8 @@ def _mask_or_list(value: Any) -> NDArray[Any]:
     if array.dtype != np.bool_:
         if array.size == 0:
             array = np.empty((0, 2), np.int64)
-        array = numbers_between("calibration.bad_pixels", array, 0, integer=True) if array.size else array
+        if array.size:
+            array = numbers_between("calibration.bad_pixels", array, 0, 2**31, integer=True)
         if array.ndim != 2 or array.shape[1] != 2:
             raise InputError(
                 "calibration.bad_pixels: expected a boolean map (h, w) or a list of [row, column], "

@@ -14,10 +14,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from faintspot.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.errors import InputError
 from faintspot.simulate.spots import image_shape, per_spot, position_array, spots
+from faintspot.sizes import check_size
 
 Floats = NDArray[np.float64]
 
 _ANALYTIC_OVERSAMPLING = 8
+_LARGEST_RADIUS_PX = 128.0  # the largest window seen from its opposite corner takes 91
+_LONGEST_SIDE = 4097  # beyond, singular values take minutes
 _HIGHEST_RANK = 8
 _RANK_TOLERANCE = 2e-3  # of the peak: what the separable terms may leave out
 _BLOCK_PIXELS = 1 << 21
@@ -71,6 +74,11 @@ class PSF:
             raise InputError(
                 f"psf.samples: expected (n_psfs, rows, columns), both odd and at least 5, got {samples.shape}"
             )
+        check_size("psf.samples", samples.shape)
+        if max(samples.shape[1:]) > _LONGEST_SIDE:
+            raise InputError(
+                f"psf.samples: expected at most {_LONGEST_SIDE} rows and columns, got {samples.shape}"
+            )
         light = samples.sum(axis=(1, 2), keepdims=True)
         if np.any(light <= 0):
             raise InputError(f"psf.samples: expected a positive sum, got {light.min():g}")
@@ -107,11 +115,13 @@ class PSF:
         size, elongation and angle_deg are one number each, or one for each of several PSFs.
         """
         kinds = np.broadcast_arrays(*(np.atleast_1d(value) for value in (size, elongation, angle_deg)))
-        radius = int(np.ceil(number_between("radius_px", radius_px, 1.0, 256.0)))
+        radius = int(np.ceil(number_between("radius_px", radius_px, 1.0, _LARGEST_RADIUS_PX)))
         step = 1.0 / _ANALYTIC_OVERSAMPLING
         n = len(kinds[0])
         side = 2 * radius + 1
-        samples = np.empty((n, side * _ANALYTIC_OVERSAMPLING, side * _ANALYTIC_OVERSAMPLING))
+        nodes = (n, side * _ANALYTIC_OVERSAMPLING, side * _ANALYTIC_OVERSAMPLING)
+        check_size("psf.samples", nodes, hint="give a smaller radius_px")
+        samples = np.empty(nodes)
         # A spot moved by a fraction of a pixel samples the nodes in between.
         for row in range(_ANALYTIC_OVERSAMPLING):
             for column in range(_ANALYTIC_OVERSAMPLING):

@@ -246,7 +246,7 @@ def _hot_pixels(value: Any) -> tuple[tuple[int, int, float], ...]:
     table = finite_array("hot_pixels", value)
     if table.ndim != 2 or table.shape[1] != 3:
         raise InputError(f"hot_pixels: expected (row, column, electrons) for each, got shape {table.shape}")
-    where = numbers_between("hot_pixels row or column", table[:, :2], 0, integer=True)
+    where = numbers_between("hot_pixels row or column", table[:, :2], 0, 2**31, integer=True)
     levels = numbers_between("hot_pixels electrons", table[:, 2], 0, LARGEST_MEAN_E)
     return tuple(
         (int(row), int(column), float(level)) for (row, column), level in zip(where, levels, strict=True)

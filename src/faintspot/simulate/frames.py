@@ -242,7 +242,7 @@ def _true_positions(
 
 def _window_pixels(corners: Any, window: tuple[int, int], frame: tuple[int, int]) -> NDArray[np.int64]:
     """Return the flat frame index of each window's pixels, shape (n, ny * nx)."""
-    first: NDArray[np.int64] = numbers_between("corners", corners, 0, integer=True)
+    first: NDArray[np.int64] = numbers_between("corners", corners, 0, 2**31, integer=True)
     if first.ndim != 2 or first.shape[1] != 2:
         raise InputError(f"corners: expected shape (n, 2) holding row and column, got {first.shape}")
     outside = np.flatnonzero(np.any(first + np.array(window) > np.array(frame), axis=1))

@@ -12,6 +12,7 @@ from scipy.special import ndtr, sici
 
 from faintspot.checks import finite_array, numbers_between, one_of
 from faintspot.errors import InputError
+from faintspot.sizes import check_size
 
 Floats = NDArray[np.float64]
 
@@ -152,6 +153,7 @@ def image_shape(name: str, shape: Any) -> tuple[int, int]:
     checked = numbers_between(name, shape, 1, 1 << 20, integer=True)
     if checked.shape != (2,):
         raise InputError(f"{name}: expected (rows, columns), got an array of shape {checked.shape}")
+    check_size(name, checked.tolist(), what="pixels")
     return int(checked[0]), int(checked[1])
 
 

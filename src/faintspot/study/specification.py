@@ -14,6 +14,7 @@ import tomlkit
 from faintspot.checks import number_between, one_of
 from faintspot.compare.store import fingerprint_of
 from faintspot.errors import InputError
+from faintspot.sizes import check_size
 from faintspot.study.arm_names import DEFAULT_ARMS, kind_of, knows_the_spot
 from faintspot.study.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
 from faintspot.toml_files import check_keys, checked_table, parse_file, parse_text
@@ -22,6 +23,7 @@ __all__ = ["BEST", "CORRECTED", "PROFILES", "StudySpecification", "Sweep"]
 
 BEST, CORRECTED = "best", "corrected"
 DEVICES = ("cpu", "cuda")
+_MOST_CELLS = 100_000
 _CANDIDATE_RANGES = {
     "strengths": Range("1", 0.0, 10.0, low_open=True),
     "widths": Range("px", 0.0, 10.0, low_open=True),
@@ -235,6 +237,7 @@ def _checked_sweeps(given: Any) -> tuple[Sweep, ...]:
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"sweeps: expected different names, got {name!r} {names.count(name)} times")
+    check_size("sweeps: cells", [sum(sweep.n_cells for sweep in sweeps)], _MOST_CELLS, "cells")
     return sweeps
 
 

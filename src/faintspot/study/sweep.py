@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -142,6 +143,11 @@ class Sweep:
                 f"sweep {self.name!r}: d_over_r0 = {max(self.d_over_r0):g}: expected profile 'diffraction' "
                 f"and elongation 1"
             )
+
+    @property
+    def n_cells(self) -> int:
+        """Number of combinations."""
+        return math.prod(len(getattr(self, name)) for name in PARAMETERS)
 
     def cells(self) -> list[Cell]:
         """Return the cells, the last parameter varying fastest."""

@@ -229,7 +229,7 @@ def _regions(scope: str | ArrayLike, n_subapertures: int) -> NDArray[np.int64]:
     if isinstance(scope, str):
         one_of("scope", scope, SCOPES)
         return np.arange(n_subapertures) if scope == "subaperture" else np.zeros(n_subapertures, np.int64)
-    regions = numbers_between("scope", scope, integer=True)
+    regions = numbers_between("scope", scope, -(2**31), 2**31, integer=True)
     if regions.shape != (n_subapertures,):
         raise InputError(
             f"scope: expected {n_subapertures} regions, one per sub-aperture, got {regions.shape}"

@@ -366,7 +366,7 @@ def _checked_kinds(index: ArrayLike | None, n_subapertures: int) -> NDArray[np.i
     """Kind of each sub-aperture; every kind has some."""
     if index is None:
         return np.zeros(n_subapertures, np.int64)
-    kinds = numbers_between("index", index, 0, integer=True).astype(np.int64)
+    kinds = numbers_between("index", index, 0, 2**31, integer=True).astype(np.int64)
     if kinds.shape != (n_subapertures,) or len(np.unique(kinds)) != kinds.max() + 1:
         raise InputError(
             f"index: expected {n_subapertures} kinds, counted from 0 without gaps, got shape {kinds.shape}"
