@@ -34,7 +34,7 @@ def _score(rng: np.random.Generator) -> fs.TrainedScore:
 
 def _pipelines(layout: fs.Layout) -> dict[str, fs.SlopePipeline]:
     """Return every estimator's pipeline."""
-    calibration = fs.Calibration(read_noise_e=READ_NOISE_E)
+    calibration = fs.Calibration(dark=0.0, read_noise_e=READ_NOISE_E)
     psf, score = fs.PSF.analytic(), _score(np.random.default_rng(1))
     rotated = fs.PSF.analytic(elongation=2.0, angle_deg=30.0)
 

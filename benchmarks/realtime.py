@@ -52,7 +52,7 @@ def _own_us(iterations: int) -> dict[str, float]:
     with PixelRing.create(name, layout.frame_shape, np.float32) as ring:
         engine = Engine(
             name,
-            lambda each: SlopePipeline(layout, each, Calibration(read_noise_e=1.0)),
+            lambda each: SlopePipeline(layout, each, Calibration(dark=0.0, read_noise_e=1.0)),
             settings,
             images_every=0,
         )

@@ -103,9 +103,11 @@ def spot_tasks(case: Case) -> list[Task]:
     reach = start_reach(width.max(), (ny, nx))
     noise = case.calibration.read_noise_e or 0.0
     whole = noise < 0.25 and case.calibration.em_gain == 1 and case.calibration.background_e == 0
-    whole = whole and case.settings.estimator.name != "matched"
+    background = case.settings.local_background == "on"
+    whole = whole and case.settings.estimator.name != "matched" and not background
     made = []
     for task, kind in zip(tasks(case), index, strict=True):
+        task = replace(task, background=background)
         variance = task.variance
         if whole:  # what rounding leaves: one electron more or less where the noise is beyond a half
             variance = math.erfc(0.5 / (noise * math.sqrt(2))) if noise else 0.0
@@ -159,6 +161,7 @@ def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     reach = float(np.where(np.isnan(search), np.inf, search).max())
     grid, spacing = posterior_grid(reach, float(case.psf.fwhm_px.min()), (ny, nx))
     flux = max(case.each("flux_e")[s], 1.0)
+    g = g - (g.sum() - flux) / g.size if task.background else g
     spot = exact_spots(case.psf)[case.psf.index_of(len(case.images))[s]]
     variance = max(task.variance + task.weight_floor * flux, oracle.LEAST_VARIANCE)
     known = replace(task, spot=spot, variance=variance)

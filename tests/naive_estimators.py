@@ -43,6 +43,8 @@ class Task:
     steps: int | None = None
     error_scale: float = 1.0
     whole_electrons: bool = False
+    background: bool = False
+    """Whether a constant is a fourth parameter of the fit."""
     prior: tuple[float, float] = (0.0, 0.0)
     prior_std: float = math.inf
     phases: int | None = None
@@ -106,8 +108,12 @@ def smoothed(g: ArrayLike, std_x: float, std_y: float, reach: int | None = None)
 
 
 def start(g: ArrayLike, task: Task) -> Estimate:
-    """The largest pixel of the smoothed image within the search range, and the flux that explains it."""
+    """The largest pixel of the smoothed image within the search range, and the flux that explains it.
+
+    With a background unknown, image and spot are taken as what exceeds their mean.
+    """
     g = np.asarray(g, np.float64)
+    g = g - g.mean() if task.background else g
     std_x, std_y = (START_STD_PER_FWHM * width for width in task.fwhm)
     blurred = smoothed(g, std_x, std_y, task.reach)
     (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
@@ -122,7 +128,9 @@ def start(g: ArrayLike, task: Task) -> Estimate:
     others = [item[0] for item in found if item is not best]
     flux = 1.0
     if task.spot is not None:
-        flux = max(best[0] / smoothed_peak(task.spot, std_x, std_y, task.reach), 1.0)
+        peak = smoothed_peak(task.spot, std_x, std_y, task.reach)
+        peak = max(peak - 1 / g.size, peak / 10) if task.background else peak
+        flux = max(best[0] / peak, 1.0)
     distance = best[0] - max(others, default=-math.inf)
     return Estimate(best[1], best[2], flux, margin=100 * distance / max(np.abs(blurred).max(), 1e-30))
 
@@ -167,9 +175,9 @@ def information(m: Floats, dm: list[Floats], w: Floats, task: Task, name: str) -
 
 
 def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = None) -> Estimate:
-    """Fisher scoring in x, y and flux; the standard error is that of the place before the last step.
+    """Fisher scoring in x, y, flux and, where it is unknown, background; errors as before the last step.
 
-    A move that is cut short leaves the flux to what it then should be: the flux is solved for last. Without
+    A move that is cut short leaves the others to what they then should be: they are solved for last. Without
     information on the place it stays.
     """
     assert task.spot is not None
@@ -177,12 +185,13 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
     begin = start(g, task) if begin is None else begin
     limits, margin = task.limits(g.shape), begin.margin
     x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
+    level = 0.0
     errors = (math.inf, math.inf)
     for _ in range(STEPS[name] if task.steps is None else task.steps):
         f, fx, fy = task.spot.images(x, y, g.shape)
-        m, dm = flux * f, [flux * fx, flux * fy, f]
+        m, dm = flux * f, [flux * fx, flux * fy, f] + [np.ones_like(f)] * task.background
         w = weights(m, task, begin.flux, name)
-        score = np.array([np.sum((g - m) * w * d) for d in dm])
+        score = np.array([np.sum((g - m - level) * w * d) for d in dm])
         if name == "map":
             score[:2] += (np.array(task.prior) - (x, y)) / task.prior_std**2
         i, j = information(m, dm, w, task, name)
@@ -190,15 +199,17 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
         move = np.clip(np.linalg.solve(i, score)[:2], -1.0, 1.0) if soundness(i) > 1e-5 else np.zeros(2)
         errors = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf)
         x, y = clamp(x + move[0], *limits[0]), clamp(y + move[1], *limits[1])
-        flux = max(clamp(flux + (score[2] - i[2, :2] @ move) / i[2, 2], flux / 2, flux * 2), LEAST_FLUX)
+        others = np.linalg.solve(i[2:, 2:], score[2:] - i[2:, :2] @ move)
+        flux = max(clamp(flux + others[0], flux / 2, flux * 2), LEAST_FLUX)
+        level += others[1] if task.background else 0.0
     return Estimate(x, y, flux, task.error_scale * errors[0], task.error_scale * errors[1], margin)
 
 
 def soundness(i: Floats) -> float:
-    """Determinant of the information on x and y, the flux unknown, in units of its diagonal's product."""
-    if not i[2, 2] > 0:
+    """Determinant of the information on x and y, the rest unknown, in units of its diagonal's product."""
+    if not np.linalg.det(i[2:, 2:]) > 0:
         return 0.0
-    a = i[:2, :2] - np.outer(i[:2, 2], i[2, :2]) / i[2, 2]
+    a = i[:2, :2] - i[:2, 2:] @ np.linalg.solve(i[2:, 2:], i[2:, :2])
     diagonal = a[0, 0] * a[1, 1]
     return float((diagonal - a[0, 1] ** 2) / diagonal) if min(a[0, 0], a[1, 1]) > 0 else 0.0
 

@@ -76,7 +76,9 @@ def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
     }
     score = random_score(np.random.default_rng(0), n) if estimator == "trained" else None
     psf = one_psf() if estimator in FITTED else None
-    return Case(images, settings_of(estimator, **chosen), fs.Calibration(read_noise_e=1.0), psf, score)
+    return Case(
+        images, settings_of(estimator, **chosen), fs.Calibration(dark=0.0, read_noise_e=1.0), psf, score
+    )
 
 
 class TestImages:
@@ -89,6 +91,7 @@ class TestImages:
         images = hostile_images(rng, case.images.shape)
         measured = rng.random() < 0.5
         chosen = case.settings.replace(flux_e=None) if measured else case.settings
+        chosen = with_options(chosen, local_background=str(rng.choice(["on", "off"])))
         assert_sane(replace(case, images=images, settings=chosen).measure())
 
     @EVERY
@@ -178,6 +181,7 @@ class TestSettings:
             weight_floor=extreme(0.0, 1.0),
             error_scale=extreme(1e-3, 1e3),
             steps=int(rng.choice([1, 100])),
+            local_background=str(rng.choice(["on", "off"])),
         )
         calibration = replace(case.calibration, read_noise_e=float(rng.choice([0.0, 1e-6, 1e6])))
         prior = rng.normal(0.0, 1.0, (6, 2)) * rng.choice([1.0, 1e3, 1e30])
@@ -240,7 +244,7 @@ class TestRefused:
     """One line that names the value, what was expected and where."""
 
     IMAGES = np.ones((3, 8, 8), np.float32)
-    NOISE = fs.Calibration(read_noise_e=1.0)
+    NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 
     @pytest.mark.parametrize(
         ("name", "value"),

@@ -14,7 +14,7 @@ from faintspot import configuration
 from faintspot.estimators import spot_tables
 
 LAYOUT = fs.Layout.grid((3, 4), pixels=12)
-NOISE = fs.Calibration(read_noise_e=1.0)
+NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 
 
 def frames(n: int, flux_e: float, seed: int = 1) -> tuple[Any, Any]:

@@ -196,6 +196,8 @@ class SlopePipeline:
         other = copy.copy(self)
         other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
         other.calibration = Calibration(
+            dark=None if camera.dark is None else 0.0,
+            rough_dark=camera.rough_dark,
             gain_e_per_adu=camera.em_gain,
             em_gain=camera.em_gain,
             read_noise_e=camera.read_noise_e,
@@ -217,7 +219,8 @@ class SlopePipeline:
         calibration = self.calibration
         text = (
             f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_e} "
-            f"{calibration.background_e} {calibration.em_gain} {configuration.to_text(self.settings)}"
+            f"{calibration.background_e} {calibration.em_gain} {calibration.vouches_for_dark} "
+            f"{configuration.to_text(self.settings)}"
         )
         return (
             b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()

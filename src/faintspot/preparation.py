@@ -118,7 +118,7 @@ class Preparation:
 
     def light_kernel(self, frames: NDArray[Any]) -> Direct:
         """Return the compiled function that sums up their light."""
-        return self._direct(groups.light_of_groups, frames)
+        return self._direct(self.prepared.light_kernel, frames)
 
     def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
         key = kernel, frames.dtype.str

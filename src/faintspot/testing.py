@@ -61,7 +61,7 @@ class EstimatorTests:
         return SlopePipeline(
             Layout.grid((n, 1), pixels=SIDE),
             Settings(self.make(), **shared),
-            Calibration(read_noise_e=READ_NOISE_E),
+            Calibration(dark=0.0, read_noise_e=READ_NOISE_E),
             psf=PSF.analytic("gaussian", size=SPOT_FWHM_PX / 2, radius_px=12),
             score=self.score(),
             **options,

@@ -52,7 +52,7 @@ def test_a_tilt_moves_the_spots(sensor: ShackHartmann) -> None:
     np.testing.assert_allclose(sensor.spots(FLAT, 0.5), sensor.spots(both), atol=2e-5)
     settings = fs.Settings(estimator="ml", search_range_px=3)
     pipeline = fs.SlopePipeline(
-        sensor.layout, settings, fs.Calibration(read_noise_e=1.0), psf=fs.PSF.analytic(), threads=1
+        sensor.layout, settings, fs.Calibration(dark=0.0, read_noise_e=1.0), psf=fs.PSF.analytic(), threads=1
     )
     slopes = pipeline(sensor.frame(sensor.spots(tilt)) * 1e5)
     lit = sensor.illumination > 0.9999

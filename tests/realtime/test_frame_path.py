@@ -15,7 +15,7 @@ from faintspot.realtime.frame_path import FramePath, Progress, last_rows_of_grou
 from faintspot.realtime.workers import Workers
 
 LAYOUT = fs.Layout.grid((6, 6), pixels=8, pitch=(9, 8))
-NOISE = fs.Calibration(read_noise_e=1.0)
+NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 SLOTS = 3
 SETTINGS = {
     "tv": fs.Settings(noise_std=1.0, keep_brightest=9),

@@ -66,6 +66,15 @@ def test_is_immutable_and_private() -> None:
             array[0, 0] = 1
 
 
+def test_who_vouches_for_the_dark() -> None:
+    """A dark that is left out counts as 0, but nobody says that it is."""
+    assert not fs.Calibration().vouches_for_dark
+    assert fs.Calibration(dark=0.0).vouches_for_dark
+    assert fs.Calibration(dark=np.zeros((3, 4))).vouches_for_dark
+    assert not fs.Calibration(dark=70.0, rough_dark=True).vouches_for_dark
+    assert fs.Calibration(dark=0.0) != fs.Calibration()
+
+
 def test_equality() -> None:
     dark = np.full((3, 4), np.nan)
     assert fs.Calibration(dark) == fs.Calibration(dark.copy())
@@ -82,7 +91,7 @@ def test_equality() -> None:
         ("dark", {"dark": np.nan}),
         ("dark", {"dark": "dark.fits"}),
         ("dark", {"dark": np.zeros((2, 3, 4))}),
-        ("dark", {"dark": None}),
+        ("rough_dark = 'no'", {"rough_dark": "no"}),
         ("flat", {"flat": 1.0}),
         ("flat", {"flat": np.ones((3, 4), complex)}),
         ("gain_e_per_adu = 0", {"gain_e_per_adu": 0.0}),

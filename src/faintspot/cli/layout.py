@@ -292,8 +292,8 @@ def _completed(
     edges = layout.images(mean)[:, [0, -1]]
     level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
     spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
-    if np.ndim(calibration.dark) == 0 and calibration.dark == 0.0 and level > spread > 0:
-        calibration = replace(calibration, dark=float(f"{level:.4g}"))
+    if calibration.dark is None and level > spread > 0:
+        calibration = replace(calibration, dark=float(f"{level:.4g}"), rough_dark=True)
         notes.append(
             f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
         )

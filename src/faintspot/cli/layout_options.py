@@ -69,6 +69,8 @@ def calibration(target: Path, **given: Any) -> Calibration:
         for name, value in given.items()
         if value is not None
     }
+    if "dark" in changes:
+        changes["rough_dark"] = False
     return replace(known, **changes)
 
 

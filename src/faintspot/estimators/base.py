@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.kernels.groups import COMMON_ROWS
+from faintspot.kernels.groups import COMMON_ROWS, light_of_groups
 from faintspot.options import Options, is_auto
 from faintspot.sensor.score import TrainedScore
 
@@ -210,6 +210,8 @@ class Prepared:
     """Of the table of settings."""
     needs_light: bool = False
     """Whether the light must be measured in every frame."""
+    light_kernel: Any = staticmethod(light_of_groups)
+    """Compiled function that measures it."""
     light_step: float = 1.02
     """Measured light counts in steps of this factor, so that settings vary slowly."""
     fewer_lanes_are_faster: bool = False

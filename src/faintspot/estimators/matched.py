@@ -27,6 +27,13 @@ class Fitted(Stepping):
         high=16.0,
         per_subaperture=False,
     )
+    local_background: str = option(
+        "auto",
+        "Whether a constant is fitted in every sub-aperture along with the spot, for a dark level or a sky "
+        'that is not known: "auto" where the calibration gives no dark, or a rough one.',
+        choices=("auto", "on", "off"),
+        per_subaperture=False,
+    )
 
     needs = frozenset({Need.PSF})
 

@@ -19,7 +19,7 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid
 from faintspot.kernels import located
-from faintspot.kernels.groups import RANGE
+from faintspot.kernels.groups import RANGE, light_above_edges
 from faintspot.options import option
 from faintspot.presets import PRESETS
 from faintspot.sizes import MOST_NUMBERS, check_size
@@ -85,6 +85,8 @@ class _Prepared(LikelihoodPrepared):
     def __init__(self, estimator: MaximumAPosteriori, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         self.needs_light = bool(np.isnan(sensor.flux_e).all())
+        if self.fits_background:
+            self.light_kernel = light_above_edges
         self._posteriors: list[PosteriorGrid] = []
         self._levels: dict[float, int] = {}  # first table of every level of light that was measured
         self._scratch: tuple[int, Any] = (-1, None)

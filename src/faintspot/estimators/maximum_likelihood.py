@@ -88,7 +88,8 @@ class LikelihoodPrepared(PSFPrepared):
         camera = self.sensor.calibration
         noise = camera.read_noise_photoelectrons
         low = noise is not None and noise < _WHOLE_ELECTRONS_BELOW
-        return low and camera.em_gain == 1 and camera.background_e == 0
+        whole = camera.em_gain == 1 and camera.background_e == 0 and not self.fits_background
+        return low and whole
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `Prepared`."""

@@ -48,10 +48,18 @@ class SpotPrepared(Prepared):
         """Whether images are rounded to whole electrons."""
         return False
 
+    @cached_property
+    def fits_background(self) -> bool:
+        """Whether a constant is fitted along with the spot."""
+        choice = getattr(self.estimator, "local_background", "off")
+        return choice == "on" or (choice == "auto" and not self.sensor.calibration.vouches_for_dark)
+
     @property
     def model_tables(self) -> located.ModelTables:
         """What the kernels read that follow a profile."""
-        return located.ModelTables(self.step_count, self.rounds_electrons, self.taps, self.model.tables)
+        return located.ModelTables(
+            self.step_count, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
+        )
 
     @property
     def tables(self) -> Any:
@@ -67,7 +75,10 @@ class SpotPrepared(Prepared):
         """See `Prepared`."""
         model, index = self.model, self.model.index
         table[located.MODEL] = index
-        table[located.START_LIGHT] = model.start_light[index]
+        start_light = model.start_light[index]
+        if self.fits_background:  # the image's mean, the spot's own light in it, is taken off
+            start_light = np.maximum(start_light - 1.0 / self.sensor.pixels, 0.1 * start_light)
+        table[located.START_LIGHT] = start_light
         table[located.GAIN_X], table[located.GAIN_Y] = model.gain[index].T
         table[located.LEAST_LIGHT] = self._least_light(table[RANGE])
 

@@ -18,7 +18,7 @@ from faintspot.flags import SubapertureFlag
 from faintspot.kernels.compiling import compiled, compiled_with
 from faintspot.kernels.gather import calibrate, fill_bad_pixels, gather_raw, scatter_image
 from faintspot.kernels.host import aligned_zeros
-from faintspot.kernels.simd import Lanes, load, select, splat, store, width_of
+from faintspot.kernels.simd import Lanes, load, maximum, select, splat, store, width_of
 
 NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
@@ -299,5 +299,31 @@ def light_of_groups(source: Any, start: Any, stop: Any, scratch: Any, light: Any
             g = load(lanes, scratch.image, i * width)
             total = total + select(g >= g, g, zero)
         store(scratch.results, 0, total)
+        for lane in range(min(width, n - first)):
+            light[f, first + lane] = scratch.results[lane]
+
+
+@compiled
+def light_above_edges(source: Any, start: Any, stop: Any, scratch: Any, light: Any) -> None:
+    """As `light_of_groups`, above the mean of the outermost pixels of each sub-aperture."""
+    lanes, ny, nx = source.lanes, source.ny, source.nx
+    width = width_of(lanes)
+    n = source.corners.shape[0]
+    n_groups = (n + width - 1) // width
+    zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
+    for item in range(start, stop):
+        f, first = item // n_groups, item % n_groups * width
+        gather_group(source, f, first, scratch)
+        inner, inner_count, edge, edge_count = zero, zero, zero, zero
+        for y in range(ny):
+            for x in range(nx):
+                g = load(lanes, scratch.image, (y * nx + x) * width)
+                good = g >= g
+                value, count = select(good, g, zero), select(good, one, zero)
+                if y == 0 or y == ny - 1 or x == 0 or x == nx - 1:
+                    edge, edge_count = edge + value, edge_count + count
+                else:
+                    inner, inner_count = inner + value, inner_count + count
+        store(scratch.results, 0, inner - inner_count * (edge / maximum(edge_count, one)))
         for lane in range(min(width, n - first)):
             light[f, first + lane] = scratch.results[lane]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from faintspot.kernels.background import eliminate_background
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.profiles import look_up
 from faintspot.kernels.simd import (
@@ -287,6 +288,7 @@ def fit_group(
     tables: Any,
     which: Any,
     steps: Any,
+    background: Any,
     lane_values: Any,
     starts: Any,
     profiles: Any,
@@ -300,6 +302,8 @@ def fit_group(
         See `look_up`.
     steps : int
         Always as many, so that the time is known and lanes do not depend on each other.
+    background : bool
+        Whether a constant is fitted along.
     lane_values : (LANE_ROWS * W,)
         The start (X, Y, FLUX) and everything marked "in" is read; position, light, errors and
         what is SEEN are written.
@@ -311,6 +315,8 @@ def fit_group(
             _separable_sums(lanes, image, ny, nx, profiles, lane_values)
         else:
             _general_sums(lanes, image, ny, nx, profiles, lane_values)
+        if background:
+            eliminate_background(lanes, image, ny, nx, profiles, lane_values)
         if step == steps - 1:
             for lane in range(width):
                 _store_errors(width, lane, float(lane_values[FLUX * width + lane]), lane_values)

@@ -9,6 +9,7 @@ import numpy as np
 
 from faintspot.flags import SubapertureFlag
 from faintspot.kernels import groups, spot_rows
+from faintspot.kernels.background import subtract_background
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     COMMON_ROWS,
@@ -53,6 +54,8 @@ class ModelTables(NamedTuple):
     steps: Any
     round_electrons: Any
     """Whether images are rounded to whole electrons."""
+    background: Any
+    """Whether a constant is fitted along with the spot."""
     taps: Any
     """(n_subapertures, 2, 1 + reach) float32: of the smoothing that finds the start."""
     model: Any
@@ -140,6 +143,9 @@ def locate_fitted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     """Fit position and light of the spots of a group."""
     _round(group, tables.round_electrons, scratch.image)
     _begin(group, scratch)
+    if tables.background:
+        nothing = splat(group.lanes, 0.0)
+        subtract_background(group.lanes, scratch.image, group.ny * group.nx, nothing)
     _begin_at_peak(group, tables.taps, scratch)
     _fit(group, tables, scratch)
     _finish(group, tables.steps, False, scratch)
@@ -152,6 +158,9 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
     _round(group, tables.fit.round_electrons, scratch.image)
     _begin(group, scratch)
     _expect_light(group, own.lane_values)
+    if tables.fit.background:
+        light = load(group.lanes, own.lane_values, spot_rows.FLUX * width_of(group.lanes))
+        subtract_background(group.lanes, scratch.image, group.ny * group.nx, light)
     posterior_of_group(
         group.lanes,
         scratch.image,
@@ -267,6 +276,7 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
         tables.model,
         own.models,
         tables.steps,
+        tables.background,
         lane_values,
         own.starts,
         own.profiles,

@@ -64,7 +64,7 @@ def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: 
     bright = SlopePipeline(
         layout,
         arm.settings.replace(estimator=arm.settings.estimator.for_bright_light(), flux_e=None),
-        Calibration(read_noise_e=1.0),
+        Calibration(dark=0.0, read_noise_e=1.0),
         psf=psf,
         score=arm.score,
         threads=1,

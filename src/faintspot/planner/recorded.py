@@ -125,7 +125,13 @@ def _calibration(
     if darks is None:
         facts.append("dark level taken from the frames' darkest pixels; --dark gives the camera's own")
     # Electrons for an ADU at the output; the multiplication is divided out by the calibration.
-    return Calibration(dark=dark, gain_e_per_adu=gain, em_gain=em_gain, read_noise_e=read_noise)
+    return Calibration(
+        dark=dark,
+        gain_e_per_adu=gain,
+        em_gain=em_gain,
+        read_noise_e=read_noise,
+        rough_dark=darks is None,
+    )
 
 
 def _measured(

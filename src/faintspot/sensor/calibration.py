@@ -28,8 +28,11 @@ class Calibration:
 
     Parameters
     ----------
-    dark : float or (h, w) array, ADU
-        What a frame without light holds: bias and dark current. NaN marks a bad pixel.
+    dark : float or (h, w) array, optional, ADU
+        What a frame without light holds: bias and dark current. NaN marks a bad pixel. Default: not known,
+        counted as 0; 0 says that there is none.
+    rough_dark : bool
+        Whether `dark` is only near the truth, such as the background of frames with light in them.
     flat : (h, w) array, optional
         Relative response of each pixel, 1 on average. NaN, zero or negative marks a bad pixel.
     gain_e_per_adu : float
@@ -55,7 +58,7 @@ class Calibration:
         For a value out of range, or arrays of different shapes.
     """
 
-    dark: Any = 0.0
+    dark: Any = None
     flat: Any = None
     gain_e_per_adu: float = 1.0
     em_gain: float = 1.0
@@ -63,10 +66,14 @@ class Calibration:
     saturation_adu: float | None = None
     read_noise_e: float | None = None
     background_e: float = 0.0
+    rough_dark: bool = False
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
+        if self.dark is not None:
+            put(self, "dark", _scalar_or_map("calibration.dark", self.dark))
+        if not isinstance(self.rough_dark, bool):
+            raise InputError(f"calibration.rough_dark = {self.rough_dark!r}: expected true or false")
         if self.flat is not None:
             put(self, "flat", _map("calibration.flat", self.flat))
         for name in ("gain_e_per_adu", "em_gain"):
@@ -104,6 +111,11 @@ class Calibration:
     def excess_noise(self) -> float:
         """Factor of the multiplication register on the variance of the electrons: 2, or 1 without one."""
         return 2.0 if self.em_gain > 1 else 1.0
+
+    @property
+    def vouches_for_dark(self) -> bool:
+        """Whether the level of a frame without light is known; else estimators may fit it."""
+        return self.dark is not None and not self.rough_dark
 
     @property
     def read_noise_photoelectrons(self) -> float | None:
@@ -162,7 +174,7 @@ class Calibration:
                 )
         maps = np.empty((2, *frame_shape), np.float32)
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
-            maps[0] = self.dark
+            maps[0] = 0.0 if self.dark is None else self.dark
             gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
             if self.flat is not None:
                 usable = np.isfinite(self.flat) & (self.flat > 0)

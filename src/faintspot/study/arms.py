@@ -71,6 +71,7 @@ class CellArms:
         self._within_px = min(self.search_range_px, cell.pixels / 2)
         self.kinds = {arm: kind_of(arm) for arm in specification.arms}
         self._calibration = Calibration(
+            dark=0.0,
             read_noise_e=cell.read_noise_e * cell.em_gain,
             em_gain=cell.em_gain,
             background_e=cell.background_e,
