@@ -146,8 +146,8 @@ def check_promise(
     mean = _simulated(question, fitted, share * light).reshape(images.shape)
     camera, alike = question.detector, []
     for each in exposures:
-        exposed = camera.to_electrons(camera.expose(mean, each)) - question.background_e
-        alike.append(_measure(question, arm, exposed))
+        exposed = np.asarray(camera.to_electrons(camera.expose(mean, each)), np.float64)
+        alike.append(_measure(question, arm, exposed - question.background_e))
     return Promise(
         share * light,
         _error_of(alike[0] - alike[1], 2),
