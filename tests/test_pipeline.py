@@ -277,3 +277,15 @@ class TestSettings:
         }
         assert len(prints) == 7
         assert fs.SlopePipeline(layout, settings, threads=1).fingerprint() in prints
+
+
+def test_slopes_at_the_search_range_are_flagged() -> None:
+    layout = fs.Layout.grid((1, 3), pixels=12)
+    frame = np.zeros(layout.frame_shape, np.float32)
+    for column in (6, 12 + 9, 24 + 5):
+        frame[6, column] = 100.0
+    limited = fs.Settings(estimator="brightest", keep_brightest=1, rule="threshold", search_range_px=2.0)
+    slopes = fs.SlopePipeline(layout, limited)(frame)
+    assert slopes.x.tolist() == [0.5, 2.0, -0.5]
+    assert ((slopes.flags & Flag.AT_SEARCH_LIMIT) != 0).tolist() == [False, True, False]
+    assert slopes.valid.all()

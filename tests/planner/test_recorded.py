@@ -68,6 +68,25 @@ def test_a_single_frame_does_not_tell_the_gain() -> None:
         question_from_frames(frames[0], darks[:, :10], layout=LAYOUT)
 
 
+def test_light_that_differs_between_subapertures_is_simulated_so() -> None:
+    rng = np.random.default_rng(6)
+    light = np.where(np.arange(36) % 2, 500.0, 1500.0)
+    frames, _ = sensor_frames(
+        LAYOUT.corners,
+        LAYOUT.window,
+        LAYOUT.frame_shape,
+        12,
+        flux_e=light,
+        positions=rng.uniform(-0.6, 0.6, (12, 36, 2)),
+        detector=CAMERA,
+        rng=rng,
+    )
+    question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
+    assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
+    assert question.relative_light is not None
+    np.testing.assert_allclose(question.relative_light, light / 1000.0, rtol=0.06)  # 6 frames, 2 % each
+
+
 def test_unreliable_gain_is_not_used() -> None:
     frames = read_array(f"{shared_file('data/ciao_bench_60x224x224.npz')}:frames")
     with pytest.raises(InputError, match=r"gain_e_per_adu.*disagree"):

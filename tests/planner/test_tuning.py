@@ -124,3 +124,19 @@ def test_only_a_question_is_answered() -> None:
         tune({"read_noise_e": 3.0})  # type: ignore[arg-type]
     with pytest.raises(InputError, match="realisations"):
         tune(Question(**CAMERA), realisations=3)
+
+
+def test_a_plugin_that_refuses_the_scene_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True, eq=False, kw_only=True)
+    class Refusing(Estimator):
+        name: ClassVar[str] = "refusing"
+        label: ClassVar[str] = "refusing"
+        method: ClassVar[str] = "none"
+
+        def for_scene(self, scene: Scene) -> Estimator:
+            raise InputError("scene: too bright for me")
+
+    monkeypatch.setattr(registry, "_kinds", {**estimators(), "refusing": Refusing})
+    answer = tune(Question(**CAMERA), rng=np.random.default_rng(1), **QUICK)
+    assert "too bright for me" in answer.left_out["refusing"]
+    assert "refusing" not in [result.arm.name for result in answer.results]

@@ -70,7 +70,12 @@ _VALUES: tuple[tuple[str, Any, str | None, str], ...] = (
     ("frame_rate_hz", float, "HZ", "Frames per second."),
     ("throughput", float, "T", f"Of atmosphere, telescope and optics. Default: {DEFAULT_THROUGHPUT:g}."),
     ("quantum_efficiency", float, "Q", f"Default: {DEFAULT_QUANTUM_EFFICIENCY:g}."),
-    ("search_range_px", float, "PX", "Spots are within plus and minus this. Default: FWHM / 2, at least 1."),
+    (
+        "search_range_px",
+        float,
+        "PX",
+        "Spots are within plus and minus this. Default: from the frames, or FWHM / 2.",
+    ),
     (
         "budget",
         str,

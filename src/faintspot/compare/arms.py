@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
+
+import numpy as np
 
 from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.scene import Scene
@@ -13,6 +16,8 @@ from faintspot.options import AUTO
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import Score
 from faintspot.settings import Settings
+from faintspot.simulate.detector import Detector
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
 
 
 class Knowledge(IntEnum):
@@ -122,6 +127,45 @@ def arm_for_scene(
     )
 
 
+def score_for_scene(
+    scene: Scene,
+    detector: Detector,
+    rng: np.random.Generator,
+    *,
+    flux_e: Any = None,
+    search_range_px: float | None = None,
+    realisations: int = 20_000,
+) -> TrainedScore:
+    """Train a score on simulated spots of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    detector : Detector
+    rng : numpy.random.Generator
+    flux_e : float or (float, float), optional
+        As `faintspot.train_estimator`. Default: the scene's.
+    search_range_px : float, optional
+        Default: half the window.
+    realisations : int
+    """
+    from faintspot.training.simulation import train_estimator
+
+    return train_estimator(
+        flux_e=scene.flux_e if flux_e is None else flux_e,
+        detector=detector,
+        shape=scene.window,
+        profile=scene.profile,
+        size=scene.spot_fwhm_px / math.sqrt(scene.elongation) / FWHM_OF_SIZE_1_PX[scene.profile],
+        elongation=scene.elongation,
+        d_over_r0=scene.d_over_r0,
+        position_range_px=scene.position_range_px,
+        search_range_px=search_range_px,
+        realisations=realisations,
+        rng=rng,
+    )
+
+
 def tuned_options(arm: Arm, scene: Scene) -> dict[str, list[Any]]:
     """Return what an arm may choose from in a scene; the usual value of each option is the first."""
     return {
@@ -137,4 +181,4 @@ def _rounded(values: Mapping[Any, Any]) -> dict[Any, Any]:
     }
 
 
-__all__ = ["Arm", "Knowledge", "arm_for_scene", "tuned_options"]
+__all__ = ["Arm", "Knowledge", "arm_for_scene", "score_for_scene", "tuned_options"]

@@ -26,7 +26,8 @@ def limit_slopes(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[
     at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX
     flags &= ~_AT_SEARCH_LIMIT
     flags[at_limit & (flags & INVALID == 0)] |= _AT_SEARCH_LIMIT
-    return np.clip(away, -reach[:, None], reach[:, None])
+    slopes: NDArray[Any] = np.clip(away, -reach[:, None], reach[:, None])
+    return slopes
 
 
 class PythonPrepared(Prepared):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from faintspot.checks import number_between
+from faintspot.compare.arms import score_for_scene
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.registry import estimator_named, estimators
@@ -278,16 +280,8 @@ def _psf(size: float, elongation: float, radius_px: float) -> PSF:
 @functools.lru_cache(maxsize=4)
 def _trained_score(configuration: LoopConfiguration) -> TrainedScore:
     """Train the score on spots of the weakest seeing: when unsure, the larger d / r0 is better."""
-    from faintspot.training import train_estimator
-
-    sensor = configuration.sensor
-    return train_estimator(
-        flux_e=configuration.photons,
-        detector=make_detector(configuration),
-        shape=(sensor.pixels, sensor.pixels),
-        size=configuration.spot_width_px / 2,
-        d_over_r0=configuration.d_over_r0,
-        position_range_px=configuration.position_range_px(),
-        realisations=_TRAINING_SPOTS,
-        rng=np.random.default_rng([configuration.run.seed, _TRAINING_SEED]),
-    )
+    scene = configuration.scene
+    # Spots are elongated along another direction in each sub-aperture; it is trained on round ones.
+    scene = replace(scene, elongation=1.0, spot_fwhm_px=scene.spot_fwhm_px / math.sqrt(scene.elongation))
+    rng = np.random.default_rng([configuration.run.seed, _TRAINING_SEED])
+    return score_for_scene(scene, make_detector(configuration), rng, realisations=_TRAINING_SPOTS)

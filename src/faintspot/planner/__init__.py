@@ -9,6 +9,8 @@ from faintspot.lazy import lazy_attributes
 if TYPE_CHECKING:
     from faintspot.compare.photometry import Photometry as Photometry
     from faintspot.planner.answer import Answer as Answer
+    from faintspot.planner.promise import Promise as Promise
+    from faintspot.planner.promise import check_promise as check_promise
     from faintspot.planner.question import Question as Question
     from faintspot.planner.recorded import question_from_frames as question_from_frames
     from faintspot.planner.tuning import tune as tune
@@ -16,12 +18,22 @@ if TYPE_CHECKING:
 _HOMES = {
     "Answer": "faintspot.planner.answer",
     "Photometry": "faintspot.compare.photometry",
+    "Promise": "faintspot.planner.promise",
     "Question": "faintspot.planner.question",
+    "check_promise": "faintspot.planner.promise",
     "question_from_frames": "faintspot.planner.recorded",
     "tune": "faintspot.planner.tuning",
 }
 
-__all__ = ["Answer", "Photometry", "Question", "question_from_frames", "tune"]
+__all__ = [
+    "Answer",
+    "Photometry",
+    "Promise",
+    "Question",
+    "check_promise",
+    "question_from_frames",
+    "tune",
+]
 
 
 __getattr__ = lazy_attributes(__name__, _HOMES)

@@ -16,11 +16,13 @@ from faintspot.compare.curves import Curve
 from faintspot.compare.statistics import Estimate, SlopeStatistics
 from faintspot.errors import InputError
 from faintspot.estimators.registry import FORMER_NAMES
+from faintspot.planner.promise import Promise
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import Score
 from faintspot.settings import Settings
+from faintspot.tables import save_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,6 +79,8 @@ class Answer:
     """Spots that were scored at each flux."""
     left_out: dict[str, str]
     """Arms that were not tried, and why."""
+    promise: Promise | None = None
+    """The recommended arm's slope error, checked on the recording, where there is one."""
 
     @property
     def flux_e(self) -> Floats:
@@ -156,7 +160,8 @@ class Answer:
     def save(self, path: str | Path) -> None:
         """Write the recommended settings as a configuration file; what else it holds stays.
 
-        PSF and score lie beside it. Without a layout the file holds the other tables only.
+        PSF and score lie beside it; the table [promise] says what the recording made of it, if any. Without a
+        layout the file holds the other tables only.
 
         Raises
         ------
@@ -167,6 +172,7 @@ class Answer:
         for item in (self.question.layout, best.settings, self.calibration, best.psf, best.score):
             if item is not None:
                 configuration.save(path, item)
+        save_tables(path, {"promise": None if self.promise is None else self.promise.to_table()})
 
     def figure(self) -> Figure:
         """Draw R against the star's brightness.

@@ -14,6 +14,7 @@ from faintspot.settings import Settings
 
 BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
 
+CONTRADICTED = "THE RECORDING CONTRADICTS THE PROMISE"
 _HELPS_ABOVE_MAG = 0.02
 _LOW_GAIN = 0.9
 _SMALLEST_ERROR_MAG = 0.01  # that is shown
@@ -74,7 +75,30 @@ def recommendation(answer: Answer) -> list[str]:
             f"({settings_in_words(alternative.settings)}), "
             f"{gain_in_words(answer, alternative.over_brightest)} over brightest pixels"
         )
-    return lines + _limiting(answer)
+    return lines + _limiting(answer) + promise_lines(answer)
+
+
+def promise_lines(answer: Answer) -> list[str]:
+    """Say what the recording makes of the promised error."""
+    promise = answer.promise
+    if promise is None:
+        return []
+    text = (
+        f"checked on frames kept for it, thinned to {plain_number(promise.flux_e)} electrons: predicted R "
+        f"{_with_error(promise.predicted)}, measured {_with_error(promise.measured)} px; pixels are "
+        f"{promise.noise_ratio:.2f} times as noisy as taken"
+    )
+    if math.isfinite(promise.frame_to_frame.value):
+        text += f"; from frame to frame, movement included, {_with_error(promise.frame_to_frame)} px"
+    if not promise.contradicted:
+        return [text]
+    why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
+    expected = f"expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px"
+    return [text, f"{CONTRADICTED}: {expected}{why}"]
+
+
+def _with_error(value: Estimate) -> str:
+    return f"{value.value:.4f} ± {value.standard_error:.4f}"
 
 
 def foundations(answer: Answer) -> list[str]:

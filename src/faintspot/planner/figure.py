@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.planner import answer_text
 from faintspot.report.drawing import GREY, LIGHT_GREY, new_figure, plain_ticks, styled
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ def tune_figure(answer: Any) -> Figure:
     _electrons_above(axes, answer)
     plain_ticks(axes.yaxis, _TICKS)
     axes.grid(which="major", color=LIGHT_GREY, lw=0.7)
+    if answer.promise is not None and answer.promise.contradicted:
+        axes.set_title(answer_text.promise_lines(answer)[-1], color="#b00020", loc="left")
     axes.set_xlabel(answer.magnitude_label)
     axes.set_ylabel("slope error R, mean |error| per axis (px)")
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)

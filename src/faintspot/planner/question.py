@@ -7,6 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from faintspot.checks import number_between, one_of
 from faintspot.compare.photometry import (
     DEFAULT_BAND,
@@ -84,6 +87,11 @@ class Question:
     budget : str or float, optional
         Slope error R that is allowed, "0.1", "0.1px", "0.05arcsec" or "50mas": asks for the limiting
         magnitude.
+    relative_light : (n,) array, optional
+        Light of sub-apertures in units of their mean. Default: all have the same.
+    recording : (n_frames, h, w) array, ADU, optional
+        Frames, not used for what is said here, on which to check what is promised; needs `layout` and
+        `calibration`.
     layout : Layout, optional
     calibration : Calibration, optional
         Maps (dark, flat, bad pixels) to write beside the settings.
@@ -117,6 +125,8 @@ class Question:
     quantum_efficiency: float = DEFAULT_QUANTUM_EFFICIENCY
     search_range_px: Any = None
     budget: Any = None
+    relative_light: NDArray[np.float64] | None = None
+    recording: NDArray[Any] | None = None
     layout: Layout | None = None
     calibration: Calibration | None = None
     facts: tuple[str, ...] = ()

@@ -1,9 +1,11 @@
-"""The question from recorded frames: layout, camera, PSF and light are measured."""
+"""The question from recorded frames: layout, camera, PSF, light and the spots' range are measured."""
 
 from __future__ import annotations
 
+import math
 import warnings
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,20 +18,33 @@ from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.photon_transfer import DetectorMeasurement, measure_detector
 from faintspot.sensor.psf import PSF
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
+
+if TYPE_CHECKING:
+    from faintspot.training.psf_learning import LearntPSF
+    from faintspot.training.spot_transfer import SpotTransfer
 
 _SPOTS_TO_LEARN_FROM = 2000
+_BEYOND = 0.01  # of the spots, that may be so far out by noise
+_QUANTILE = 2.58  # standard deviations of normal noise within which all but so many are
+_RANGE_MARGIN = 1.15
+_SURELY = 3.0  # standard errors
+_FEWEST_FOR_LIGHT = 4  # images of each sub-aperture that tell its light
 
 
 def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **given: Any) -> Question:
     """Return the question that recorded frames answer for the most part.
 
     The layout is found (`Layout.from_frame`), gain, read noise and dark level are measured
-    (`faintspot.measure_detector`), the PSF is learnt (`faintspot.learn_psf`) and so is the spots' light.
+    (`faintspot.measure_detector`; about fitted spots, where these move too much for it). The PSF is learnt
+    (`faintspot.learn_psf`) from every second frame, and fitted to its spots together with the background that
+    all share: this tells their light, how it differs between sub-apertures, and how far the spots move. The
+    other frames are kept to check on them what is promised (`faintspot.planner.check_promise`).
 
     Parameters
     ----------
     frames : (n, h, w) or (h, w) array, ADU
-        Of a steady light where the gain is to be measured.
+        Consecutive ones where the gain is to be measured.
     darks : (n, h, w) or (h, w) array, optional
         Frames without light.
     **given
@@ -50,6 +65,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
     if dark_stack is not None and dark_stack.shape[1:] != stack.shape[1:]:
         raise InputError(f"darks: expected frames of {stack.shape[1:]}, got {dark_stack.shape[1:]}")
     facts: list[str] = []
+    given = {name: value for name, value in given.items() if value is not None}
     layout = given.pop("layout", None)
     if layout is None:
         dark_mean = 0.0 if dark_stack is None else dark_stack.mean(axis=0)
@@ -58,21 +74,29 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
         facts.append(f"{len(layout)} sub-apertures of {ny} x {nx} px found in the frames")
     given.pop("pixels", None)
     calibration = _calibration(stack, dark_stack, layout, given, facts)
-    images = _electrons(stack, layout, calibration)
+    given["em_gain"] = calibration.em_gain
+    learning, kept = (stack[0::2], stack[1::2]) if len(stack) > 1 else (stack, None)
+    fitted, used = _fitted(learning, layout, calibration, given, facts)
+    calibration = _without_background(calibration, fitted, darks is not None, given, facts)
     if given.get("flux_e") is None and given.get("magnitude") is None:
-        given["flux_e"] = float(images.sum(axis=(-2, -1)).mean())
+        given["flux_e"] = float(fitted.flux_e.mean())
+        sums = float(_electrons(used, layout, calibration).sum(axis=(-2, -1)).mean())
         facts.append(
-            f"light measured: {given['flux_e']:.0f} electrons per sub-aperture and frame, on average"
+            f"light measured by fitting spots and background: {given['flux_e']:.0f} electrons per "
+            f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
         )
-    if given.get("psf") is None and given.get("fwhm_px") is None:
-        given["psf"] = _learnt(stack, layout, calibration, facts)
+    given["relative_light"] = _relative_light(fitted, len(layout), facts)
+    if given.get("search_range_px") is None:
+        given["search_range_px"] = _range(fitted, layout, facts)
     values = {
         "gain_e_per_adu": calibration.gain_e_per_adu,
         "em_gain": calibration.em_gain,
         "read_noise_e": calibration.read_noise_e,
     }
+    values["background_e"] = calibration.background_e
     earlier = tuple(given.pop("facts", ()))
-    return Question(**{**given, **values}, layout=layout, calibration=calibration, facts=(*earlier, *facts))
+    parts = {"layout": layout, "calibration": calibration, "recording": kept}
+    return Question(**{**given, **values, **parts}, facts=(*earlier, *facts))
 
 
 def _stack(name: str, value: Any) -> NDArray[Any]:
@@ -92,44 +116,45 @@ def _calibration(
     """Dark, gain and read noise: measured, or given."""
     em_gain = float(given.get("em_gain") or 1.0)
     found = _measured(stack, darks, layout, em_gain)
-    gain = given.get("gain_e_per_adu")
-    if gain is None:
-        if found is None or found.gain_e_per_adu is None or not found.reliable:
-            reason = (
-                "a single frame is not enough"
-                if found is None or found.gain_e_per_adu is None
-                else found.notes[-1]
-            )
-            raise InputError(
-                f"gain_e_per_adu: expected a value, as the frames do not tell the gain: {reason}"
-            )
-        gain = found.gain_e_per_adu
-        facts.append(f"gain measured: {gain:.3g} +- {found.gain_e_per_adu_error:.2g} electrons per ADU")
-    dark: Any = 0.0
+    gain, read_noise = given.get("gain_e_per_adu"), given.get("read_noise_e")
+    dark: Any = float(np.median(layout.images(stack)[..., [0, -1], :]))
     if darks is not None:
         dark = darks.mean(axis=0)
     elif found is not None:
         dark = found.dark_level_adu
-    else:
-        dark = float(np.median(layout.images(stack)[..., [0, -1], :]))
-    read_noise = given.get("read_noise_e")
+    read_noise_adu = pixel_noise(layout.images(stack)) if found is None else found.read_noise_adu
+    how = "from the darkest pixels of the frames" if darks is None or len(darks) < 2 else "from the darks"
+    if gain is None:
+        if found is None or found.gain_e_per_adu is None or found.gain_e_per_adu_error is None:
+            raise InputError(
+                "gain_e_per_adu: expected a value, as the frames do not tell the gain: a single frame is not "
+                "enough"
+            )
+        gain, error, way = found.gain_e_per_adu, found.gain_e_per_adu_error, "from frame to frame"
+        about_spots = _measured_on_spots(stack, dark, layout, em_gain)
+        if isinstance(about_spots, str):
+            if not found.reliable:
+                raise InputError(
+                    "gain_e_per_adu: expected a value, as the frames do not tell the gain: "
+                    f"{found.notes[-1]}; about fitted spots: {about_spots}"
+                )
+        else:  # where it is possible, it is the better one: movement and faint light do not bias it
+            gain, error = about_spots.gain_e_per_adu, about_spots.gain_e_per_adu_error
+            way = "about fitted spots, wherever they move"
+            if darks is None or len(darks) < 2:
+                read_noise_adu, how = about_spots.read_noise_adu, "in the pixels about the fitted spots"
+        facts.append(f"gain measured {way}: {gain:.3g} +- {error:.2g} electrons per ADU")
     if read_noise is None:
-        read_noise_adu = found.read_noise_adu if found is not None else pixel_noise(layout.images(stack))
         read_noise = float(f"{read_noise_adu * gain:.3g}")
-        how = (
-            "from the darks"
-            if darks is not None and len(darks) > 1
-            else "from the darkest pixels of the frames"
-        )
         facts.append(f"read noise measured {how}: {read_noise:g} electrons")
-    if darks is None:
-        facts.append("dark level taken from the frames' darkest pixels; --dark gives the camera's own")
+    background = float(given.get("background_e") or 0.0)
     # Electrons for an ADU at the output; the multiplication is divided out by the calibration.
     return Calibration(
         dark=dark,
         gain_e_per_adu=gain,
         em_gain=em_gain,
         read_noise_e=read_noise,
+        background_e=background,
         rough_dark=darks is None,
     )
 
@@ -146,21 +171,116 @@ def _measured(
     return None
 
 
+def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: float) -> SpotTransfer | str:
+    """What the noise about fitted spots tells, or why it does not."""
+    from faintspot.training.spot_transfer import measure_on_spots
+
+    some = _some(stack, layout)
+    images = layout.images(some) - layout.images(np.broadcast_to(dark, stack.shape[1:]))
+    try:
+        images = images.reshape(-1, *layout.window)
+        measured = measure_on_spots(images, em_gain=em_gain, rng=np.random.default_rng(1))
+    except InputError as error:
+        return str(error)
+    return measured if measured.problem is None else measured.problem
+
+
+def _some(frames: NDArray[Any], layout: Layout) -> NDArray[Any]:
+    """Frames from all of a recording, as many as hold enough spots."""
+    count = min(len(frames), max(1, _SPOTS_TO_LEARN_FROM // len(layout)))
+    some: NDArray[Any] = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    return some
+
+
 def _electrons(stack: NDArray[Any], layout: Layout, calibration: Calibration) -> NDArray[np.float64]:
     dark, electrons_per_adu = layout.images(calibration.maps(layout.frame_shape))
     images: NDArray[np.float64] = (layout.images(stack) - dark) * electrons_per_adu
     return images
 
 
-def _learnt(stack: NDArray[Any], layout: Layout, calibration: Calibration, facts: list[str]) -> PSF:
-    """Learn the PSF from the first frames."""
-    from faintspot.training.psf_learning import learn_psf
+def _fitted(
+    frames: NDArray[Any],
+    layout: Layout,
+    calibration: Calibration,
+    given: dict[str, Any],
+    facts: list[str],
+) -> tuple[LearntPSF, NDArray[Any]]:
+    """Fit spots and background in some of the frames, returned as well; learn the PSF if need be."""
+    from faintspot.training.psf_learning import fit_spots, learn_psf_from_images
 
-    count = max(1, _SPOTS_TO_LEARN_FROM // len(layout))
+    used = _some(frames, layout)
+    images = _electrons(used, layout, calibration).reshape(-1, *layout.window)
+    plain = replace(calibration, dark=0.0, gain_e_per_adu=1.0, em_gain=1.0)
+    plain = replace(plain, read_noise_e=calibration.read_noise_photoelectrons)
+    if given.get("psf") is not None:
+        return fit_spots(images, given["psf"], calibration=plain), used
+    if given.get("fwhm_px") is not None:
+        profile = given.get("profile") or "diffraction"
+        size = given["fwhm_px"] / FWHM_OF_SIZE_1_PX[profile]
+        assumed = PSF.analytic(profile, size=size, radius_px=max(layout.window))
+        return fit_spots(images, assumed, calibration=plain), used
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        psf = learn_psf(stack[:count], layout, calibration=calibration, rng=np.random.default_rng(1))
-    width, used = float(psf.fwhm_px.mean()), min(count, len(stack)) * len(layout)
-    facts.append(f"PSF learnt from {used} spots: {width:.2f} px wide, pixel included")
+        fitted = learn_psf_from_images(images, calibration=plain, rng=np.random.default_rng(1))
+    given["psf"] = fitted.psf
+    width = float(fitted.psf.fwhm_px.mean())
+    facts.append(f"PSF learnt from {len(images)} spots: {width:.2f} px wide, pixel included")
     facts += [str(warning.message) for warning in caught]
-    return psf
+    return fitted, used
+
+
+def _without_background(
+    calibration: Calibration, fitted: LearntPSF, has_darks: bool, given: dict[str, Any], facts: list[str]
+) -> Calibration:
+    """Take the fitted background off with the dark; above the camera's own, it is light with noise."""
+    background = float(fitted.background_e[0])
+    adu = background * calibration.em_gain / calibration.gain_e_per_adu
+    calibration = replace(calibration, dark=calibration.dark + adu)
+    if not has_darks:
+        facts.append(
+            f"dark level fitted with the spots: {float(calibration.dark):.4g} ADU; --dark tells sky and "
+            "camera apart"
+        )
+        return calibration
+    facts.append(f"background fitted with the spots: {background:.2g} electrons per pixel above the darks")
+    if given.get("background_e") is None:
+        calibration = replace(calibration, background_e=float(f"{max(background, 0.0):.3g}"))
+    return calibration
+
+
+def _relative_light(fitted: LearntPSF, n: int, facts: list[str]) -> NDArray[np.float64] | None:
+    """Light of every sub-aperture over the mean, where there are images enough to tell it from noise."""
+    each = fitted.flux_e.reshape(-1, n)
+    if len(each) < _FEWEST_FOR_LIGHT or each.mean() <= 0:
+        return None
+    light: NDArray[np.float64] = np.maximum(each.mean(axis=0), 0.0) / each.mean()
+    scatter = float(np.sqrt(np.mean(each.var(axis=0, ddof=1)) / len(each)) / each.mean())
+    if light.std() < _SURELY * scatter:
+        return None
+    low, high = np.quantile(light, [0.05, 0.95])
+    facts.append(f"light of the sub-apertures: {low:.2f} to {high:.2f} times the mean in nine of ten")
+    light /= light.mean()
+    return light
+
+
+def _range(fitted: LearntPSF, layout: Layout, facts: list[str]) -> float:
+    """How far spots are from their reference: quantiles of the measured, less noise, and a margin."""
+    n = len(layout)
+    positions = fitted.positions.reshape(-1, n, 2) - layout.offsets
+    error = fitted.standard_error_px.reshape(positions.shape)
+    farthest = 0.0
+    for axis in range(2):
+        place, noise = positions[..., axis].ravel(), error[..., axis].ravel()
+        good = noise < np.quantile(noise, 0.9)  # the faintest tell more of noise than of movement
+        middle = float(np.median(place[good]))
+        sides = np.abs(np.quantile(place[good], [_BEYOND / 2, 1 - _BEYOND / 2]) - middle)
+        quantile = _QUANTILE * float(np.sqrt(np.mean(noise[good] ** 2)))
+        reach = math.sqrt(max(float(sides.max()) ** 2 - quantile**2, 0.0))
+        farthest = max(farthest, abs(middle) + reach)
+    limit = min(layout.window) / 2
+    found = min(max(1.0, float(f"{_RANGE_MARGIN * farthest:.3g}")), limit)
+    facts.append(
+        f"search range: 99 % of the spots are within {farthest:.2f} px of the reference on each axis, noise "
+        "taken off"
+    )
+    return found

@@ -108,8 +108,17 @@ class SimulatedSpots:
 def unit_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Return images (n, ny, nx) of spots and their positions (n, 2), px.
 
-    A spot that is not speckled and in the middle of its window leaves 1 e- in it.
+    A spot that is not speckled and in the middle of its window leaves 1 e- in it, on average where
+    sub-apertures differ in their light.
     """
+    images, positions = _even_spots(question, n, rng)
+    if question.relative_light is not None:
+        images = images * spawn(rng, 1)[0].choice(question.relative_light, n)[:, None, None]
+    return images, positions
+
+
+def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return such spots, all of the same light."""
     position_rng, phase_rng = spawn(rng, 2)
     half, shape = question.search_range_px, question.shape
     positions = position_rng.uniform(-half, half, (n, 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
-from faintspot.compare.arms import Arm, arm_for_scene, tuned_options
+from faintspot.compare.arms import Arm, arm_for_scene, score_for_scene, tuned_options
 from faintspot.compare.choosing import Choice, coordinate_search, corrected_badness
 from faintspot.compare.curves import Curve, limiting_flux, magnitude_gain
 from faintspot.compare.statistics import (
@@ -29,13 +29,14 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
 from faintspot.estimators.thresholded import Thresholded
 from faintspot.planner.answer import Answer, ArmResult
+from faintspot.planner.promise import check_promise
 from faintspot.planner.question import Question
 from faintspot.planner.simulated import Sample, SimulatedSpots
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.simulate.generators import spawn
 from faintspot.slopes import Slopes
-from faintspot.training.simulation import CLASS_WIDTH, train_estimator
+from faintspot.training.simulation import CLASS_WIDTH
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -49,6 +50,7 @@ _TIE_ERRORS = 2.0  # standard errors of the difference within which two arms are
 _ERROR_TOLERANCE = 0.05  # of the standard errors, below which they need no factor
 _SEARCHED_E = (0.1, 1e7)  # electrons within which the limiting flux is sought
 _SEARCH_STEPS = 4  # fluxes that are added at a time
+_BOUND_SHARES = 9  # quantiles of the sub-apertures' light that the bound is averaged over
 _TRAINING_SHARE = 0.75  # of the scored spots, to train each class on
 
 
@@ -108,7 +110,10 @@ def tune(
     while question.budget_px is not None and (further := _further(answer, trial.steps)):
         trial.add(further)
         answer = trial.answer(resampling_rng)
-    return answer
+    if question.recording is None:
+        return answer
+    best = answer.best
+    return replace(answer, promise=check_promise(question, best.arm, best.statistics.error.value))
 
 
 def _further(answer: Answer, steps: Sequence[int]) -> list[int]:
@@ -181,14 +186,25 @@ class _Trial:
             score = _trained(self._question, middle, count, classes, self._score_rng)
         self._advance(classes)
         for step, flux, rng in zip(steps, fluxes, spawn(self._noise_rng, len(fluxes)), strict=True):
-            choosing, scoring = self._spots.exposed(flux, rng)
+            samples = self._spots.exposed(flux, rng)
             self._scored[step] = {}
-            for name, kind in self._kinds.items():
-                scene = self._question.scene(flux)
-                arm = arm_for_scene(kind, scene, psf=self._psf, score=score)
-                axes = tuned_options(arm, scene)
-                self._scored[step][name] = _chosen_and_scored(arm, axes, self._spots, choosing, scoring)
+            for name, kind in list(self._kinds.items()):
+                try:
+                    self._scored[step][name] = self._tried(kind, flux, samples, score)
+                except InputError as error:
+                    if name in (BrightestPixels.name, Thresholded.name):  # what all are compared with
+                        raise
+                    self._left_out[name] = f"it refuses {flux:.3g} electrons per spot: {error}"
+                    del self._kinds[name]
                 self._advance(1)
+
+    def _tried(
+        self, kind: type[Estimator], flux_e: float, samples: tuple[Sample, Sample], score: TrainedScore | None
+    ) -> _Scored:
+        """Choose an estimator's options on the first sample, and score it on the second."""
+        scene = self._question.scene(flux_e)
+        arm = arm_for_scene(kind, scene, psf=self._psf, score=score)
+        return _chosen_and_scored(arm, tuned_options(arm, scene), self._spots, *samples)
 
     @cached_property
     def _psf(self) -> PSF:
@@ -257,17 +273,13 @@ def _trained(
 ) -> TrainedScore:
     """Train the score for fluxes around one, which is in the middle of a class."""
     reach = CLASS_WIDTH ** (classes / 2)
-    return train_estimator(
+    return score_for_scene(
+        question.scene(flux_e),
+        question.detector,
+        rng,
         flux_e=(flux_e / reach, flux_e * reach),
-        detector=question.detector,
-        shape=question.shape,
-        profile=question.profile,
-        size=question.size,
-        d_over_r0=question.d_over_r0,
-        position_range_px=question.search_range_px,
         search_range_px=question.search_range_px,
         realisations=realisations,
-        rng=rng,
     )
 
 
@@ -344,12 +356,15 @@ def _bound(question: Question, flux: Floats) -> Floats:
     form: dict[str, Any] = {"profile": question.profile, "size": question.size}
     if question.psf is not None:
         form = {"psf": question.psf}
+    shares = np.ones(1)
+    if question.relative_light is not None:
+        shares = np.quantile(question.relative_light, (np.arange(_BOUND_SHARES) + 0.5) / _BOUND_SHARES)
     errors = cramer_rao(
-        flux,
+        np.outer(flux, shares).ravel(),
         shape=question.shape,
         detector=question.detector,
         position_range_px=question.search_range_px,
         **form,
     )
-    bound: Floats = MEAN_ABSOLUTE * errors.mean(axis=-1)
+    bound: Floats = MEAN_ABSOLUTE * errors.mean(axis=-1).reshape(len(flux), -1).mean(axis=1)
     return bound

@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import estimators
-from faintspot.compare.arms import Arm
+from faintspot.compare.arms import Arm, score_for_scene
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.scene import Scene
 from faintspot.sensor.calibration import Calibration
@@ -22,7 +23,6 @@ from faintspot.simulate import Detector
 from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
 from faintspot.slopes import Slopes
 from faintspot.study.arm_names import Kind, keeps_every_k, kind_of
-from faintspot.training import train_estimator
 
 if TYPE_CHECKING:
     from faintspot.study.specification import StudySpecification
@@ -164,18 +164,9 @@ class CellArms:
         """Trained on spots of a seed of their own."""
         cell = self.cell
         entropy = [*cell.seed(self._specification.seed).entropy, _TRAINING]  # type: ignore[misc]
-        return train_estimator(
-            flux_e=self.light_e,
-            detector=detector_of(cell),
-            shape=(cell.pixels, cell.pixels),
-            profile=cell.profile,
-            size=cell.size,
-            elongation=cell.elongation,
-            d_over_r0=cell.d_over_r0,
-            position_range_px=cell.position_range_px,
-            search_range_px=self._within_px,
-            rng=np.random.default_rng(np.random.SeedSequence(entropy)),
-        )
+        rng = np.random.default_rng(np.random.SeedSequence(entropy))
+        scene = replace(self.scene, position_range_px=cell.position_range_px)
+        return score_for_scene(scene, detector_of(cell), rng, search_range_px=self._within_px)
 
 
 @functools.lru_cache(maxsize=16)

@@ -24,6 +24,7 @@ from faintspot.training.psf_rounds import (
     learn,
     measured_width,
     psf_of,
+    registered,
 )
 from faintspot.training.registration import Registered, Stack
 
@@ -31,6 +32,7 @@ SCOPES = ("sensor", "subaperture")
 
 _SHARED_ROUNDS = 2  # in which all spots have one PSF, before each region gets its own
 _PSFS_AT_ONCE = 32
+_BACKGROUND_ROUNDS = 4  # of spots and background in turn
 _COUNTABLE_E = 0.25  # read noise below which images hold whole electrons
 
 
@@ -167,6 +169,40 @@ def learn_psf_from_images(
     return _learn(
         stack, numbers, start, checked_options(shape, oversampling, radius_px, rounds), rng, progress
     )
+
+
+def fit_spots(images: ArrayLike, psf: PSF, *, calibration: Calibration | None = None) -> LearntPSF:
+    """Measure single spots whose PSF is known, with a constant background that all of them share.
+
+    Parameters
+    ----------
+    images : (n, ny, nx) array
+    psf : PSF
+        The first is that of all spots.
+    calibration : Calibration, optional
+        As in `learn_psf_from_images`.
+
+    Returns
+    -------
+    LearntPSF
+        With the PSF that was given.
+    """
+    stack = image_stack(images, Calibration() if calibration is None else calibration)
+    n, shape = len(stack.images), (stack.images.shape[1], stack.images.shape[2])
+    index = np.zeros(n, np.int64)
+    known = PSF(psf.samples[:1], psf.oversampling)
+    options = Options(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2)
+    border = np.ones(shape, dtype=bool)
+    border[1:-1, 1:-1] = False
+    state, wings = State(known, np.zeros(1)), np.zeros((n, *shape))
+    for _ in range(_BACKGROUND_ROUNDS):
+        background = float(np.median(np.mean((stack.images - wings)[:, border], axis=1)))
+        state = registered(stack, index, replace(state, background_e=np.array([background])), options)
+        assert state.found is not None
+        wings = known.images(state.found.positions, shape, state.found.flux_e)
+    found = state.found
+    assert found is not None
+    return LearntPSF(known, state.background_e, found.positions, found.flux_e, found.error_px, (state.form,))
 
 
 def frame_stack(frames: ArrayLike, layout: Layout, calibration: Calibration) -> Stack:
