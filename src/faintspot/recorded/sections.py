@@ -84,10 +84,11 @@ def all_sections(run: Run) -> list[Section]:
     """Return the sections in the order of the page."""
     makers: list[Callable[[Run], Section]] = [
         _key_numbers,
-        _frame,
         _flux,
         _slopes,
     ]
+    if run.stages or run.why_no_stages:
+        makers.insert(1, _frame)
     if any(arm.is_denoised for arm in run.arms):
         makers.append(_iterations)
     if run.arms[0].n_frames > 1:
