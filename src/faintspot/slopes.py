@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.flags import INVALID
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from faintspot.sensor.layout import Layout
 
 RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
 
@@ -42,6 +48,37 @@ class Slopes:
     def vector(self) -> NDArray[np.float32]:
         """All x, then all y, along the last axis: what a reconstructor multiplies."""
         return np.concatenate([self.x, self.y], axis=-1)
+
+    def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
+        """Return an xarray.Dataset with dimensions frame and subaperture, units as attributes.
+
+        Parameters
+        ----------
+        layout : Layout, optional
+            Of these sub-apertures: for centre_x, centre_y (px), row and column as coordinates.
+        unit : {"px", "arcsec"}
+            Of positions and their standard errors; arcsec needs a layout with `pixel_scale_arcsec`.
+
+        Raises
+        ------
+        InputError
+            When the layout has another number of sub-apertures, or no scale that is needed.
+        MissingExtraError
+            When xarray is not installed.
+        """
+        from faintspot.io.labelled import dataset_of
+
+        return dataset_of(self, layout, unit)
+
+    def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
+        """Return a pandas.DataFrame with a row for each frame and sub-aperture, its index.
+
+        Columns have the names of .csv files, as x_px; `layout` and `unit` are those of `to_xarray`, and so
+        are the errors.
+        """
+        from faintspot.io.labelled import table_of_slopes
+
+        return table_of_slopes(self, layout, unit)
 
 
 @dataclass(frozen=True)

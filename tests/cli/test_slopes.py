@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.cli.cli_cases import LAYOUT, SETTINGS, Commands, assert_equal, expected, simulated
+from tests.cli.cli_cases import CONFIGURATION, LAYOUT, SETTINGS, Commands, assert_equal, expected, simulated
 
-from faintspot import SlopePipeline, SubapertureFlag
+from faintspot import InputError, SlopePipeline, SubapertureFlag
 from faintspot.io import read_slopes
 
 fits = pytest.importorskip("astropy.io.fits")
@@ -211,3 +211,29 @@ def test_memory_is_bounded(folder: Path) -> None:
         assert "128 frames" in answer
     largest_kb = int(answer.split("VmHWM:")[1].split()[0])
     assert 1024 * largest_kb < 700_000_000
+
+
+@pytest.mark.parametrize("name", ["a.zarr", "a.fits", "a.npz", "a.csv"])
+def test_slopes_in_arcsec(folder: Path, run: Commands, name: str) -> None:
+    scaled = "[layout]\npixel_scale_arcsec = 0.25\n[layout.grid]"
+    (folder / "faintspot.toml").write_text(CONFIGURATION.replace("[layout.grid]", scaled))
+    frames = simulated(3)
+    np.save("frames.npy", frames)
+    run.ok("slopes", "frames.npy", "-o", name, "--unit", "arcsec")
+    in_px = expected(frames)
+    found = read_slopes(name, unit="arcsec")
+    np.testing.assert_allclose(found.variables["x"], 0.25 * in_px.x, rtol=1e-6)
+    np.testing.assert_array_equal(found.variables["flux"], in_px.flux)
+    assert found.attributes["unit"] == "arcsec"
+    if name.endswith(".csv"):  # without attributes
+        with pytest.raises(InputError, match="pixel_scale_arcsec"):
+            read_slopes(name)
+        return
+    np.testing.assert_allclose(read_slopes(name).variables["y"], in_px.y, rtol=1e-6, atol=1e-7)
+    run.refused("slopes", "frames.npy", "-o", name, naming=(name, "another run"))
+
+
+def test_arcsec_need_a_scale(folder: Path, run: Commands) -> None:
+    np.save("frames.npy", simulated(3))
+    run.refused("slopes", "frames.npy", "--unit", "arcsec", naming=("unit", "pixel_scale_arcsec"))
+    assert not Path("slopes.zarr").exists()

@@ -8,11 +8,12 @@ import click
 
 from faintspot.errors import InputError
 from faintspot.io.locations import split_location
+from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.stored_results import holds_loop_results
 from faintspot.study.stored_results import study_attributes
 
 
-@click.command(short_help="Make a web page of pictures and tables from slopes, a study or a loop.")
+@click.command(short_help="Make a web page of pictures and tables from slopes, a study, a loop or telemetry.")
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER_ARM]")
 @click.option(
     "--output", "-o", metavar="HTML", help="Page to write. Default: the first file's name with .html."
@@ -28,13 +29,15 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
     flux and validity maps, slope arrows, iterations and slope jitter, in one file without any links outside.
 
     The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
-    So does the folder of a closed-loop experiment (`faintspot loop`).
+    So does the folder of a closed-loop experiment (`faintspot loop`). Telemetry (`faintspot realtime record`)
+    gives rates, latencies, lost frames, slopes, settings that changed, and what arms in turn differ by.
 
     \b
     Examples:
       faintspot report slopes.zarr
       faintspot report slopes.zarr plain.zarr -o comparison.html
       faintspot report paper.zarr
+      faintspot report night.zarr
       faintspot report canary -o canary.html
     """
     from faintspot.report import report_of_stored, report_of_study, write_report
@@ -57,6 +60,10 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
         return
     if len(paths) == 1 and study_attributes(paths[0]) is not None:
         html = report_of_study(paths[0])
+    elif len(paths) == 1 and holds_telemetry(paths[0]):
+        from faintspot.recorded.telemetry_page import report_of_telemetry
+
+        html = report_of_telemetry(paths[0])
     else:
         html = report_of_stored(paths, frames=[Path(path) for path in frames] or None)
     target = output or str(paths[0].with_suffix(".html"))

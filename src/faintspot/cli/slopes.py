@@ -9,6 +9,7 @@ import click
 
 from faintspot.cli.progress import progress_bar
 from faintspot.flags import SubapertureFlag
+from faintspot.io.slopes_format import UNITS
 from faintspot.presets import PRESETS
 from faintspot.recorded import Summary, measure_recorded
 from faintspot.written_changes import parse_changes
@@ -46,6 +47,12 @@ from faintspot.written_changes import parse_changes
     "--device", default="cpu", show_default=True, help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`)."
 )
 @click.option(
+    "--unit",
+    type=click.Choice(UNITS),
+    default="px",
+    help="Of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
+)
+@click.option(
     "--reference",
     metavar="FILE",
     help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE or FILE:ARRAY.",
@@ -65,6 +72,7 @@ def command(
     no_denoise: bool,
     preset: str | None,
     device: str,
+    unit: str,
     reference: str | None,
     key: str | None,
     threads: int | None,
@@ -77,8 +85,9 @@ def command(
     They are read block by block, so that their size does not matter. Interrupted and started again, the
     command goes on where it stopped.
 
-    The output holds x, y (px from the sub-aperture's centre, 0 where not valid), flux (e-), valid, flags,
-    iterations and bad_pixels of every frame and sub-aperture. A .zarr store opens with xarray.open_zarr.
+    The output holds x, y (px, or arcsec, from the sub-aperture's centre, 0 where not valid), flux (e-),
+    valid, flags, iterations and bad_pixels of every frame and sub-aperture. A .zarr store opens with
+    xarray.open_zarr.
 
     \b
     Examples:
@@ -100,6 +109,7 @@ def command(
             denoise=not no_denoise,
             preset=preset,
             device=device,
+            unit=unit,
             reference=reference,
             key=key,
             threads=threads,

@@ -8,7 +8,7 @@ from typing import IO
 import numpy as np
 
 from faintspot.io.file_format import FileFormat
-from faintspot.io.slopes_format import VARIABLES, StoredSlopes, with_absent
+from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, with_absent
 from faintspot.io.slopes_writer import Begun
 
 _LINES = 1 << 12
@@ -23,7 +23,10 @@ class Csv(FileFormat):
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write floats with the fewest digits that give them back."""
-        names = [*_INDEX, *(variable.csv_name for variable in VARIABLES.values())]
+        names = [
+            *_INDEX,
+            *(column_name(name, str(slopes.attributes.get("unit", "px"))) for name in VARIABLES),
+        ]
         stream.write((",".join(names) + "\n").encode())
         count, width = slopes.variables["x"].shape
         step = max(1, _LINES // width)
@@ -45,13 +48,21 @@ class Csv(FileFormat):
         """Read the whole table."""
         with path.open(encoding="utf-8") as stream:
             names = stream.readline().strip().split(",")
+        unit = next((unit for unit in UNITS if column_name("x", unit) in names), "px")
         table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
         width = int(table[:, names.index("subaperture")].max()) + 1
         variables = with_absent(
             {
-                name: table[:, names.index(variable.csv_name)].reshape(-1, width).astype(variable.dtype)
+                name: table[:, names.index(column)].reshape(-1, width).astype(variable.dtype)
                 for name, variable in VARIABLES.items()
-                if variable.csv_name in names
+                if (column := column_name(name, unit)) in names
             }
         )
-        return StoredSlopes(variables, {}, {}, True, len(variables["x"]))
+        attributes = {} if unit == "px" else {"unit": unit}
+        return StoredSlopes(variables, {}, attributes, True, len(variables["x"]))
+
+
+def column_name(name: str, unit: str) -> str:
+    """Return the heading of a variable's column."""
+    column = VARIABLES[name].csv_name
+    return f"{column.removesuffix('_px')}_{unit}" if VARIABLES[name].units == "px" else column

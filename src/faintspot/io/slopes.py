@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import finite_array, number_between
+from faintspot.checks import finite_array, number_between, one_of
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.files import output_errors
 from faintspot.io.file_format import FileFormat
@@ -19,11 +20,14 @@ from faintspot.io.output_lock import OutputLock
 from faintspot.io.slopes_folder import is_partial, partial_folder, read_partial
 from faintspot.io.slopes_format import (
     RESERVED_ATTRIBUTES,
+    UNITS,
     VARIABLES,
     Run,
     SlopeWriter,
     StoredSlopes,
     json_values,
+    pixels_in,
+    scaled_positions,
 )
 from faintspot.io.slopes_writer import BlockWriter, FinishedWriter
 from faintspot.io.zarr_files import Zarr
@@ -98,13 +102,20 @@ def create_writer(
             raise
 
 
-def read_slopes(path: str | Path) -> StoredSlopes:
+def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
     """Read slopes that `create_writer` wrote; of a .zarr store or a ".partial" folder what is finished.
+
+    Parameters
+    ----------
+    path : str or Path
+    unit : {"px", "arcsec"}
+        Of positions and their standard errors, whichever the file holds; attributes["unit"] says it again.
 
     Raises
     ------
     InputError
-        When there is no such file, it is damaged, or it does not hold slopes.
+        When there is no such file, it is damaged, it does not hold slopes, or it does not say the scale of
+        pixels that another unit needs.
     MissingExtraError
         When the package that reads the format is not installed.
     """
@@ -113,10 +124,21 @@ def read_slopes(path: str | Path) -> StoredSlopes:
         partial = partial_folder(path)
         hint = f"; an unfinished run has left {partial}" if is_partial(partial) else ""
         raise InputError(f"{path}: no such file{hint}")
+    one_of("unit", unit, UNITS)
     if is_partial(path):
-        return _read(path, read_partial)
-    form = Zarr() if path.is_dir() else slope_format(path)
-    return _read(path, form.read)
+        stored = _read(path, read_partial)
+    else:
+        form = Zarr() if path.is_dir() else slope_format(path)
+        stored = _read(path, form.read)
+    before = str(stored.attributes.get("unit", "px"))
+    if unit == before:
+        return stored
+    try:
+        factor = pixels_in(unit, stored.attributes) / pixels_in(before, stored.attributes)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    variables = scaled_positions(stored.variables, factor)
+    return replace(stored, variables=variables, attributes={**stored.attributes, "unit": unit})
 
 
 def _read(path: Path, read: Callable[[Path], _What]) -> _What:

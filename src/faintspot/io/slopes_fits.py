@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip, pieces
-from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, with_absent
+from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of, with_absent
 
 fits = load_fits()
 _BLOCK_BYTES = 2880
@@ -40,8 +40,7 @@ def write_fits(stream: IO[bytes], slopes: StoredSlopes) -> None:
     )
     _write_header(stream, primary, 0)
     for name, array in slopes.variables.items():
-        variable = VARIABLES[name]
-        _write_image(stream, name, array, variable.units, variable.long_name)
+        _write_image(stream, name, array, unit_of(name, slopes.attributes), VARIABLES[name].long_name)
     for name, array in slopes.coordinates.items():
         _write_image(stream, name, array, COORDINATE_UNITS.get(name, "1"), "of each sub-aperture")
     text = np.frombuffer(json.dumps(dict(slopes.attributes)).encode(), np.uint8)

@@ -48,6 +48,9 @@ REQUIRED = frozenset(name for name, variable in VARIABLES.items() if variable.if
 
 RESERVED_ATTRIBUTES = frozenset({"n_frames", "n_subapertures", "finished_frames", "complete", "coordinates"})
 
+UNITS = ("px", "arcsec")
+"""Of positions, in files and when they are read."""
+
 COORDINATE_UNITS: Mapping[str, str] = {"centre_x": "px", "centre_y": "px"}
 
 
@@ -58,8 +61,8 @@ class StoredSlopes:
     Attributes
     ----------
     variables : mapping
-        x, y (px), flux (e-), valid, flags, iterations, bad_pixels, standard_error_x, standard_error_y (px),
-        each (n_finished, n_subapertures).
+        x, y (px, or as attributes["unit"] says), flux (e-), valid, flags, iterations, bad_pixels,
+        standard_error_x, standard_error_y (as x), each (n_finished, n_subapertures).
     coordinates : mapping
         Per sub-aperture (n_subapertures,), as centre_x and centre_y (px in the frame).
     attributes : mapping
@@ -84,6 +87,33 @@ class StoredSlopes:
     def first(self, n_frames: int) -> Slopes:
         """Return the slopes of the first frames."""
         return Slopes(**{item.name: self.variables[item.name][:n_frames] for item in fields(Slopes)})
+
+
+def unit_of(name: str, attributes: Mapping[str, Any]) -> str:
+    """Return the unit of a variable in a file with such attributes."""
+    units = VARIABLES[name].units
+    return str(attributes.get("unit", units)) if units == "px" else units
+
+
+def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
+    """Return a pixel in a unit of positions; InputError when its scale is needed and not known."""
+    if unit == "px":
+        return 1.0
+    scale = attributes.get("pixel_scale_arcsec")
+    if scale is None:
+        raise InputError(
+            "unit = 'arcsec': expected slopes whose layout has pixel_scale_arcsec "
+            "(faintspot layout --pixel-scale)"
+        )
+    return float(scale)
+
+
+def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> dict[str, NDArray[Any]]:
+    """Return variables with positions and their errors times a factor."""
+    return {
+        name: values * np.float32(factor) if factor != 1 and VARIABLES[name].units == "px" else values
+        for name, values in variables.items()
+    }
 
 
 @dataclass(frozen=True)

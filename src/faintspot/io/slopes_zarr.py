@@ -22,7 +22,7 @@ from faintspot.errors import InputError
 from faintspot.files import sync_file, sync_folder
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, with_absent
+from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, unit_of, with_absent
 from faintspot.io.slopes_writer import Begun
 from faintspot.io.zarr_store import is_store, replace_attributes
 
@@ -191,7 +191,7 @@ def _create_arrays(path: Path, run: Run) -> None:
             chunk_key_encoding=_CHUNK_NAMES,
             fill_value=np.nan if variable.dtype == "float32" else 0,
             dimension_names=("frame", "subaperture"),
-            attributes={"units": variable.units, "long_name": variable.long_name},
+            attributes={"units": unit_of(name, run.attributes), "long_name": variable.long_name},
         )
     for name, values in run.coordinates.items():
         array = group.create_array(

@@ -22,10 +22,10 @@ from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.io.zarr_store import is_store, replace_attributes
+from faintspot.io.zarr_store import TELEMETRY, is_store, replace_attributes
 
 zarr = load_zarr()
-FORMAT = "faintspot telemetry"
+FORMAT = TELEMETRY
 _FRAMES, _IMAGES = "finished_frames", "finished_images"
 _CHUNK_NUMBERS, _CHUNK_BYTES = 1 << 16, 1 << 22
 _UNITS = {

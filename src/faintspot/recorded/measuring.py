@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 import faintspot
 from faintspot import configuration
+from faintspot.checks import one_of
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
 from faintspot.io.frames import FrameSource, open_frames
+from faintspot.io.labelled import layout_coordinates
 from faintspot.io.locations import split_location
 from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
-from faintspot.io.slopes_format import VARIABLES
+from faintspot.io.slopes_format import UNITS, VARIABLES, pixels_in, scaled_positions
 from faintspot.pipeline import SlopePipeline
 from faintspot.settings import with_preset, without_denoising
 from faintspot.slopes import Slopes
@@ -63,6 +65,7 @@ def measure_recorded(
     preset: str | None = None,
     changes: Mapping[str, Any] | None = None,
     device: str = "cpu",
+    unit: str = "px",
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
@@ -90,6 +93,8 @@ def measure_recorded(
         "accurate" or "fast", instead of that in the configuration.
     device : str
         "cpu" or "cuda", see `SlopePipeline`.
+    unit : {"px", "arcsec"}
+        Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
         slopes of which they are the mean; see `faintspot.io.references.read_reference`.
@@ -134,7 +139,8 @@ def measure_recorded(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
-        attributes = _attributes(pipeline, source, frames, configuration_file, key)
+        attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
+        factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
         summary = Summary(source.n_frames, len(layout))
@@ -144,18 +150,13 @@ def measure_recorded(
             n_frames=source.n_frames,
             n_subapertures=len(layout),
             attributes=attributes,
-            coordinates={
-                "centre_x": layout.centres[:, 0],
-                "centre_y": layout.centres[:, 1],
-                "row": layout.cells[:, 0],
-                "column": layout.cells[:, 1],
-            },
+            coordinates=layout_coordinates(layout),
             overwrite=overwrite,
         ) as writer:
             summary.resumed_at = writer.finished()
             for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
                 slopes = pipeline(block)
-                writer.append(start, slopes_as_variables(slopes))
+                writer.append(start, scaled_positions(slopes_as_variables(slopes), factor))
                 summary.add(slopes)
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
@@ -185,6 +186,7 @@ def _attributes(
     frames: Sequence[str | Path],
     configuration_file: str | Path,
     key: str | None,
+    unit: str,
 ) -> dict[str, Any]:
     """What the output says about its origin; the fingerprint tells whether a run may be continued."""
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
@@ -194,14 +196,18 @@ def _attributes(
         faintspot.__version__,
         text,
         str(key),
+        *([] if unit == "px" else [unit]),
         *paths,
         *(_version(split_location(path)[0]) for path in frames),
         str((source.n_frames, source.shape, source.dtype)),
     ):
         state.update(part.encode() + b"\0")
     state.update(pipeline.fingerprint())
+    scale = pipeline.layout.pixel_scale_arcsec
     return {
         "title": "Shack-Hartmann slopes",
+        "unit": unit,
+        **({} if scale is None else {"pixel_scale_arcsec": scale}),
         "configuration": text,
         "configuration_file": str(Path(configuration_file).resolve()),
         **_files_of_the_spot(configuration_file),

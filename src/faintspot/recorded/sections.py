@@ -84,10 +84,11 @@ def all_sections(run: Run) -> list[Section]:
     """Return the sections in the order of the page."""
     makers: list[Callable[[Run], Section]] = [
         _key_numbers,
-        _frame,
         _flux,
         _slopes,
     ]
+    if run.stages or run.why_no_stages:
+        makers.insert(1, _frame)
     if any(arm.is_denoised for arm in run.arms):
         makers.append(_iterations)
     if run.arms[0].n_frames > 1:
@@ -96,7 +97,8 @@ def all_sections(run: Run) -> list[Section]:
 
 
 def _key_numbers(run: Run) -> Section:
-    columns = [_arm_numbers(*arm) for arm in zip(run.arms, run.summaries, run.jitters, strict=True)]
+    scale = None if run.layout is None else run.layout.pixel_scale_arcsec
+    columns = [_arm_numbers(*arm, scale) for arm in zip(run.arms, run.summaries, run.jitters, strict=True)]
     notes = []
     if run.truth is not None:
         errors, note = _truth_numbers(run, run.truth)
@@ -127,7 +129,9 @@ def _about_the_numbers(run: Run) -> str:
     )
 
 
-def _arm_numbers(arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter) -> dict[str, str]:
+def _arm_numbers(
+    arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter, scale: float | None
+) -> dict[str, str]:
     numbers = {
         "valid measurements": percentage(summary.valid_fraction),
         "median flux": _number(summary.median_flux_e, "e-", 3),
@@ -141,6 +145,8 @@ def _arm_numbers(arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter) -
         }
     if arm.n_frames == 1:
         return numbers
+    if scale is not None:
+        numbers["slope jitter, median, in arcsec"] = _number(median(scatter.px) * scale, "arcsec", 3)
     return numbers | {
         "slope jitter, rms of all sub-apertures": _number(rms(scatter.px), "px", 3),
         "slope jitter, median": _number(median(scatter.px), "px", 3),

@@ -1,0 +1,77 @@
+"""The pictures of a recorded night: latencies, and arms in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from faintspot.io.telemetry import Telemetry
+from faintspot.recorded.telemetry_numbers import ArmDifference, arm_names
+from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, styled
+from faintspot.report.figure_data import FigureWithData
+
+_BINS = 80
+_MOST_TIMES = 400  # points of the course in time
+
+
+@styled
+def latency_figure(telemetry: Telemetry) -> FigureWithData:
+    """Draw how often each latency occurred, by arm, and its course in time."""
+    figure = new_figure(WIDTH, 4.6)
+    left, right = figure.subplots(1, 2)
+    latency = 1e6 * telemetry.latency_s
+    low, high = float(latency.min()), float(latency.max())
+    edges = np.geomspace(max(low, 0.1), max(high, low + 1, 1.0) * 1.001, _BINS + 1)
+    rows = []
+    for place, (arm, name) in enumerate(zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True)):
+        counts = np.histogram(latency[telemetry.arm == arm], edges)[0]
+        left.stairs(counts, edges, color=ARM_COLOURS[place % len(ARM_COLOURS)], label=name, lw=1.5)
+        rows += [
+            (name, f"{a:.4g}", f"{b:.4g}", int(n)) for a, b, n in zip(edges, edges[1:], counts, strict=False)
+        ]
+    left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
+    if len(np.unique(telemetry.arm)) > 1:
+        left.legend(frameon=False)
+    parts = np.array_split(np.arange(len(latency)), min(_MOST_TIMES, len(latency)))
+    time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
+    middle = [float(time[part].mean()) for part in parts]
+    right.plot(middle, [latency[part].max() for part in parts], color=GREY, lw=1, label="longest")
+    right.plot(middle, [np.median(latency[part]) for part in parts], color="black", lw=1.3, label="median")
+    right.set(yscale="log", xlabel="time since the first frame (s)", ylabel="latency (µs)")
+    right.legend(frameon=False)
+    caption = (
+        "Left: how often each latency occurred. Right: median and longest of stretches of "
+        f"{len(parts[0])} frames. Look for a second hump and for spikes at regular times: another program "
+        "that takes the processor."
+    )
+    return FigureWithData("latency", "Latency", caption, figure, ("arm", "from_us", "to_us", "frames"), rows)
+
+
+@styled
+def arms_figure(telemetry: Telemetry, found: Mapping[str, Sequence[ArmDifference]]) -> FigureWithData:
+    """Draw by how much every arm differs from the first, a panel for each quantity."""
+    figure = new_figure(WIDTH, 1.6 + 0.45 * len(arm_names(telemetry)))
+    rows = []
+    for panel, (name, compared) in zip(figure.subplots(1, len(found)), found.items(), strict=True):
+        others = [arm for arm in compared if arm.difference is not None]
+        for place, arm in enumerate(others):
+            of = arm.difference
+            assert of is not None
+            spread = np.nan_to_num([[of.value - of.low], [of.high - of.value]])
+            colour = ARM_COLOURS[(place + 1) % len(ARM_COLOURS)]
+            panel.errorbar([of.value], [place], xerr=spread, fmt="o", color=colour, capsize=3)
+            rows.append((name, arm.arm, of.value, of.low, of.high, of.count))
+        panel.axvline(0, color=GREY, lw=1)
+        panel.set_yticks(
+            range(len(others)),
+            [arm.arm for arm in others] if not panel.get_subplotspec().colspan.start else [],
+        )
+        panel.set_ylim(len(others) - 0.4, -0.6)
+        panel.set_title(name, fontsize=10)
+        panel.tick_params(axis="x", labelsize=9)
+        panel.locator_params(axis="x", nbins=4)
+    first = next(iter(found.values()))[0].arm
+    caption = f"Each arm less {first!r}, with 95 % intervals; the grey line is no difference."
+    header = ("quantity", "arm", "difference", "low", "high", "pieces")
+    return FigureWithData("arms", "Differences of the arms", caption, figure, header, rows)

@@ -1,0 +1,141 @@
+"""The numbers of a recorded night: rates, latencies, lost frames, and arms in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.compare.statistics import Estimate, mean_by_blocks
+from faintspot.io.telemetry import Telemetry
+
+Floats = NDArray[np.float64]
+
+PERCENTILES = (50.0, 99.0, 99.9, 100.0)
+_TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the air changes slowly
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When frames came and how long they took."""
+
+    rate_hz: float
+    """Of the camera: one over the median interval between frames of consecutive numbers; NaN without."""
+    longest_interval_s: float
+    """Between consecutive numbers."""
+    latency_s: Floats
+    """At `PERCENTILES`."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Frames that are not in the record."""
+
+    after_frame: int
+    lost: int
+
+
+@dataclass(frozen=True)
+class ArmDifference:
+    """A quantity in one arm, and by how much it differs from the first arm, turn by turn."""
+
+    arm: str
+    mean: Estimate
+    difference: Estimate | None
+    """None of the first arm."""
+
+
+def timing(telemetry: Telemetry) -> Timing:
+    """Return the timing of the frames recorded."""
+    interval = np.diff(telemetry.last_row_time_ns)[np.diff(telemetry.frame) == 1] / 1e9
+    some = interval.size > 0
+    return Timing(
+        float(1 / np.median(interval)) if some and np.median(interval) > 0 else np.nan,
+        float(interval.max()) if some else np.nan,
+        np.percentile(telemetry.latency_s, PERCENTILES),
+    )
+
+
+def gaps(telemetry: Telemetry) -> list[Gap]:
+    """Return where frame numbers are missing; a camera that began anew (smaller numbers) lost none there."""
+    step = np.diff(telemetry.frame)
+    return [Gap(int(telemetry.frame[i]), int(step[i]) - 1) for i in np.flatnonzero(step > 1)]
+
+
+def arm_names(telemetry: Telemetry) -> list[str]:
+    """Return the names of the arms that have frames in the record, by number; one without interleaving."""
+    names = telemetry.attributes.get("arms") or ["slopes"]
+    return [names[arm] if arm < len(names) else f"arm {arm}" for arm in np.unique(telemetry.arm)]
+
+
+def quantities(telemetry: Telemetry) -> dict[str, Floats]:
+    """Return what arms are compared in, by its name with unit, a number for each frame; NaN where none is.
+
+    The rms of slopes is taken about each sub-aperture's mean in the arm, which a change of arm may shift.
+    """
+    valid = telemetry.valid
+    count = valid.sum(axis=1)
+    squares = np.zeros(len(valid))
+    for arm in np.unique(telemetry.arm):
+        rows = telemetry.arm == arm
+        used = valid[rows]
+        for axis in (telemetry.x, telemetry.y):
+            values = np.where(used, axis[rows], 0.0).astype(np.float64)
+            mean = values.sum(axis=0) / np.maximum(used.sum(axis=0), 1)
+            squares[rows] += np.sum(np.where(used, values - mean, 0.0) ** 2, axis=1)
+    some = np.where(count > 0, count, np.nan)
+    flux = np.where(valid, telemetry.flux, 0.0).sum(axis=1) / some
+    return {
+        "rms of slopes about their mean (px)": np.sqrt(squares / (2 * some)),
+        "flux (e-)": flux,
+        "valid (%)": 100.0 * valid.mean(axis=1),
+        "latency (µs)": 1e6 * telemetry.latency_s,
+    }
+
+
+def arms_in_turn(telemetry: Telemetry, values: Floats) -> list[ArmDifference]:
+    """Compare the arms in a number for each frame; each turn with the first arm's turn of the same count.
+
+    Intervals come from a bootstrap of blocks of ten neighbouring turns.
+    """
+    by_turn = [_by_turn(telemetry.arm, arm, values) for arm in np.unique(telemetry.arm)]
+    first = by_turn[0]
+    compared = []
+    for place, (name, own) in enumerate(zip(arm_names(telemetry), by_turn, strict=True)):
+        length = min(len(own), len(first))
+        difference = None if place == 0 else _mean(own[:length] - first[:length], len(by_turn) - 1)
+        compared.append(ArmDifference(name, _mean(own), difference))
+    return compared
+
+
+def _by_turn(arms: NDArray[np.int64], arm: int, values: Floats) -> Floats:
+    """Return the mean of each turn of an arm: of frames of its, one after the other; NaN without any."""
+    number = np.cumsum(np.concatenate([[0], np.diff(arms) != 0]))[arms == arm]
+    own = values[arms == arm]
+    _, turn = np.unique(number, return_inverse=True)
+    kept = np.isfinite(own)
+    count = np.bincount(turn, weights=kept)
+    sums = np.bincount(turn, weights=np.where(kept, own, 0.0))
+    return np.asarray(np.divide(sums, count, out=np.full(len(count), np.nan), where=count > 0))
+
+
+def _mean(values: Floats, comparisons: int = 1) -> Estimate:
+    kept = values[np.isfinite(values)]
+    return mean_by_blocks(kept, _TURNS_TOGETHER, comparisons=comparisons) if kept.size else Estimate(np.nan)
+
+
+def change_rows(telemetry: Telemetry) -> Sequence[tuple[int, float, str, str]]:
+    """Return frame, seconds from the first frame, what and where of every change; NaN before the first."""
+    rows = []
+    start = telemetry.last_row_time_ns[0]
+    for change in telemetry.changes:
+        place = int(np.searchsorted(telemetry.frame, change["frame"]))
+        inside = place < len(telemetry.frame) and change["frame"] >= telemetry.frame[0]
+        seconds = float(telemetry.last_row_time_ns[place] - start) / 1e9 if inside else np.nan
+        what = ", ".join(f"{name} = {value}" for name, value in change["changes"].items())
+        where = change["where"]
+        shown = "all" if where is None else where if isinstance(where, str) else ", ".join(map(str, where))
+        rows.append((int(change["frame"]), seconds, what, shown))
+    return rows

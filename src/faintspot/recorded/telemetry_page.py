@@ -1,0 +1,197 @@
+"""The report page of telemetry that was recorded of a running engine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from faintspot.compare.statistics import Estimate
+from faintspot.errors import InputError
+from faintspot.io.telemetry import Telemetry, read_telemetry
+from faintspot.recorded.advice import warnings_in_words
+from faintspot.recorded.sections import all_sections, make_run
+from faintspot.recorded.statistics import MeasuredSlopes
+from faintspot.recorded.telemetry_figures import arms_figure, latency_figure
+from faintspot.recorded.telemetry_numbers import (
+    PERCENTILES,
+    arm_names,
+    arms_in_turn,
+    change_rows,
+    gaps,
+    quantities,
+    timing,
+)
+from faintspot.recorded.wavefront_section import wavefront_sections
+from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
+from faintspot.sensor.layout import Layout
+from faintspot.slopes import Slopes
+from faintspot.wavefront import Wavefront, fit_wavefront
+
+_MOST_GAPS, _MOST_CHANGES = 20, 200
+
+
+def report_of_telemetry(path: str | Path) -> str:
+    """Return the report page (HTML) of a store that `faintspot realtime record` has written.
+
+    Raises
+    ------
+    InputError
+        When it is no such store, damaged, or without frames.
+    MissingExtraError
+        When matplotlib, jinja2 or zarr is not installed.
+    """
+    telemetry = read_telemetry(path, images=False)
+    if len(telemetry.frame) == 0:
+        raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
+    layout = Layout(**telemetry.attributes["layout"])
+    arms = [MeasuredSlopes.of("all frames", telemetry)]
+    run = make_run(arms, layout, {}, None, 0, "", ())
+    sections = [_timing(telemetry), _lost(telemetry)]
+    if len(arm_names(telemetry)) > 1:
+        sections.append(_arms(telemetry))
+    sections += [_changes(telemetry), *all_sections(run), *wavefront_sections(_wavefronts(telemetry), layout)]
+    settings = str(telemetry.attributes.get("settings", ""))
+    return html_of(
+        Page(
+            title=f"Telemetry of {Path(path).name}",
+            facts=_facts(telemetry, Path(path)),
+            sections=[*sections, configuration_section(settings)],
+            warnings=[*_warnings(telemetry), *warnings_in_words(run.arms, run.summaries)],
+            remark=POSITIONS,
+        )
+    )
+
+
+def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:
+    seconds = float(telemetry.last_row_time_ns[-1] - telemetry.last_row_time_ns[0]) / 1e9
+    begun = np.datetime64(round(telemetry.unix_time_s[0] * 1e3), "ms")
+    ended = telemetry.attributes.get("ended_because", "not known; it may still go on")
+    facts = {
+        "Store": str(path),
+        "Engine": str(telemetry.attributes.get("name", "not stored")),
+        "Begun": f"{begun} UTC, by the wall clock",
+        "Frames": f"{len(telemetry.frame)} in {seconds:.1f} s",
+        "Sub-apertures": str(telemetry.x.shape[1]),
+        "Ended": str(ended),
+    }
+    names = arm_names(telemetry)
+    return facts | ({"In turn": ", ".join(names)} if len(names) > 1 else {})
+
+
+def _warnings(telemetry: Telemetry) -> list[str]:
+    lines = []
+    lost = sum(gap.lost for gap in gaps(telemetry))
+    if lost:
+        share = 100 * lost / (lost + len(telemetry.frame))
+        lines.append(f"{lost} frames ({share:.2g} %) are not in the record; see Lost frames.")
+    if telemetry.attributes.get("dropped_changes"):
+        lines.append(
+            "Changes of settings were lost to the record: settings are not known after the last one listed."
+        )
+    return lines
+
+
+def _timing(telemetry: Telemetry) -> Section:
+    found = timing(telemetry)
+    latency = 1e6 * telemetry.latency_s
+    rows = []
+    for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
+        own = latency[telemetry.arm == arm]
+        rows.append([name, str(len(own)), *(f"{value:.1f}" for value in np.percentile(own, PERCENTILES))])
+    header = ["", "frames", "median (µs)", "99 % (µs)", "99.9 % (µs)", "longest (µs)"]
+    table = Table(header, rows, caption="Latency: from a frame's last row to its slopes.")
+    rate = "not known: no two frames have consecutive numbers"
+    if np.isfinite(found.rate_hz):
+        rate = (
+            f"{found.rate_hz:.5g} frames a second (median interval of consecutive numbers; the longest is "
+            f"{1e3 * found.longest_interval_s:.3g} ms)"
+        )
+    return Section("timing", "Rate and latency", [f"Rate: {rate}."], [table], [latency_figure(telemetry)])
+
+
+def _lost(telemetry: Telemetry) -> Section:
+    found = gaps(telemetry)
+    lost = sum(gap.lost for gap in found)
+    dropped = {
+        name: telemetry.attributes.get(f"dropped_{name}", 0) for name in ("records", "images", "changes")
+    }
+    rows = [
+        ["frame numbers that are missing", str(lost)],
+        ["of them overwritten before the recorder read them", str(dropped["records"])],
+        ["gaps", str(len(found))],
+        ["longest gap, frames", str(max((gap.lost for gap in found), default=0))],
+        ["images lost to the record", str(dropped["images"])],
+        ["changes of settings lost to the record", str(dropped["changes"])],
+    ]
+    text = [
+        "Missing numbers that the recorder did not lose were lost before: by the camera, on the way, or by "
+        "an engine that was too slow."
+    ]
+    tables = [Table(["", "number"], rows)]
+    if found:
+        listed = [[str(gap.after_frame), str(gap.lost)] for gap in found[:_MOST_GAPS]]
+        caption = f"The first {len(listed)} of {len(found)} gaps."
+        tables.append(Table(["after frame", "frames lost"], listed, caption, folded="Where"))
+    return Section("lost", "Lost frames", text, tables)
+
+
+def _arms(telemetry: Telemetry) -> Section:
+    rows = []
+    found = {name: arms_in_turn(telemetry, values) for name, values in quantities(telemetry).items()}
+    for name, compared in found.items():
+        for arm in compared:
+            difference = "–" if arm.difference is None else _in_words(arm.difference)
+            rows.append([name, arm.arm, _with_error(arm.mean), difference])
+    first = next(iter(found.values()))[0].arm
+    header = ["", "arm", "mean ± standard error", f"less {first!r} (95 %)"]
+    text = [
+        "The arms took turns on the same air. Each turn is compared with the first arm's next to it; "
+        "intervals come from a bootstrap of blocks of ten neighbouring turns, and with several arms all hold "
+        "together. Smaller slopes are better only in a closed loop, and only if both arms have the same "
+        "centroid gain."
+    ]
+    return Section("arms", "Arms in turn", text, [Table(header, rows)], [arms_figure(telemetry, found)])
+
+
+def _in_words(estimate: Estimate) -> str:
+    if not np.isfinite(estimate.low):
+        return "too few turns"
+    value, low, high = (
+        f"{number:+.3g}".replace("-", "−") for number in (estimate.value, estimate.low, estimate.high)
+    )
+    return f"{value} ({low} to {high})"
+
+
+def _with_error(estimate: Estimate) -> str:
+    error = f"{estimate.standard_error:.2g}" if np.isfinite(estimate.standard_error) else "?"
+    return f"{estimate.value:.4g} ± {error}"
+
+
+def _changes(telemetry: Telemetry) -> Section:
+    title = "Changes of settings"
+    found = change_rows(telemetry)
+    if not found:
+        return Section("changes", title, ["None: the settings are those at the end of this page."])
+    rows = [
+        [str(frame), f"{seconds:.3f}" if np.isfinite(seconds) else "before", where, what]
+        for frame, seconds, what, where in found[:_MOST_CHANGES]
+    ]
+    caption = f"The first {len(rows)} of {len(found)} changes." if len(rows) < len(found) else ""
+    table = Table(["from frame", "at (s)", "sub-apertures", "change"], rows, caption, words=True)
+    return Section("changes", title, tables=[table])
+
+
+def _wavefronts(telemetry: Telemetry) -> dict[str, Wavefront | str]:
+    """Fit the wavefronts of every arm, or return why that cannot be done."""
+    layout = Layout(**telemetry.attributes["layout"])
+    names = ("x", "y", "flux", "flags", "iterations", "standard_error_x", "standard_error_y")
+    found: dict[str, Wavefront | str] = {}
+    for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
+        own = {of: getattr(telemetry, of)[telemetry.arm == arm] for of in names}
+        slopes = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
+        try:
+            found[name] = fit_wavefront(slopes, layout)
+        except InputError as error:
+            found[name] = str(error)
+    return found

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from faintspot import InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
+from faintspot.simulate import sensor_frames
+
+LAYOUT = Layout.grid((2, 3), pixels=8, pixel_scale_arcsec=0.5)
+
+
+@pytest.fixture(scope="module")
+def slopes() -> Slopes:
+    frames, _ = sensor_frames(
+        LAYOUT.corners, LAYOUT.window, LAYOUT.frame_shape, 4, rng=np.random.default_rng(1)
+    )
+    return SlopePipeline(LAYOUT, Settings(estimator="brightest", keep_brightest=8))(frames)
+
+
+def test_a_dataset_has_names_and_units(slopes: Slopes) -> None:
+    pytest.importorskip("xarray")
+    dataset = slopes.to_xarray(LAYOUT, unit="arcsec")
+    assert dict(dataset.sizes) == {"frame": 4, "subaperture": 6}
+    np.testing.assert_allclose(dataset.x, 0.5 * slopes.x)
+    np.testing.assert_array_equal(dataset.valid, slopes.valid)
+    np.testing.assert_array_equal(dataset.centre_x, LAYOUT.centres[:, 0])
+    assert [dataset[name].attrs["units"] for name in ("x", "standard_error_y", "flux", "centre_y")] == [
+        "arcsec",
+        "arcsec",
+        "e-",
+        "px",
+    ]
+    in_px = slopes.to_xarray()
+    np.testing.assert_array_equal(in_px.x, slopes.x)
+    assert in_px.x.attrs["units"] == in_px.attrs["unit"] == "px"
+
+
+def test_a_table_has_a_row_for_each_slope(slopes: Slopes) -> None:
+    pytest.importorskip("pandas")
+    table = slopes.to_pandas(LAYOUT)
+    assert table.index.names == ["frame", "subaperture"]
+    assert table.loc[(3, 5), "y_px"] == slopes.y[3, 5]
+    assert table.loc[(3, 5), "centre_x_px"] == LAYOUT.centres[5, 0]
+    assert slopes.to_pandas(LAYOUT, unit="arcsec").loc[(2, 1), "x_arcsec"] == 0.5 * slopes.x[2, 1]
+    one = replace(slopes, **{name: values[0] for name, values in vars(slopes).items()})
+    assert len(one.to_pandas()) == 6
+
+
+def test_refused(slopes: Slopes, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="pixel_scale_arcsec"):
+        slopes.to_pandas(replace(LAYOUT, pixel_scale_arcsec=None), unit="arcsec")
+    with pytest.raises(InputError, match="expected 6 sub-apertures"):
+        slopes.to_pandas(LAYOUT[1:])
+    with pytest.raises(InputError, match="unit = 'mas'"):
+        slopes.to_pandas(LAYOUT, unit="mas")
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtraError, match=r"faintspot\[study\]"):
+        slopes.to_xarray()
+    with pytest.raises(MissingExtraError, match=r"faintspot\[study\]"):
+        slopes.to_pandas()

@@ -1,0 +1,103 @@
+"""The page of recorded telemetry, from a store whose lost frames and differences are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.recorded.recorded_cases import Page
+
+from faintspot.errors import InputError
+from faintspot.io.telemetry import Telemetry, TelemetryStore, read_telemetry
+from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
+from faintspot.recorded.telemetry_numbers import arms_in_turn, change_rows, gaps, quantities, timing
+from faintspot.recorded.telemetry_page import report_of_telemetry
+from faintspot.sensor.layout import Layout
+
+LAYOUT = Layout.grid((4, 4), pixels=8)
+N = len(LAYOUT)
+EVERY, FRAMES = 5, 2000
+LOST = slice(700, 712)
+RMS_PX, FLUX_E = {0: 0.20, 1: 0.16}, {0: 300.0, 1: 280.0}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Make a store of 2000 frames at 1 kHz, twelve of them lost, with two arms, five frames each in turn."""
+    rng = np.random.default_rng(3)
+    records = np.zeros(FRAMES, record_type(N))
+    number = np.arange(FRAMES)
+    arm = number // EVERY % 2
+    records["frame"], records["arm"] = number + 10, arm
+    records["last_row_time_ns"] = 1_000_000 * number
+    records["published_time_ns"] = records["last_row_time_ns"] + 50_000 + 10_000 * arm
+    wave = 0.3 + np.sin(number / 300)[:, None]  # of the air, the same in both arms; taken off over many turns
+    for axis in "xy":
+        records[axis] = 0.5 + np.vectorize(RMS_PX.get)(arm)[:, None] * rng.normal(size=(FRAMES, N))
+        records[f"standard_error_{axis}"] = 0.1
+    records["flux"] = np.vectorize(FLUX_E.get)(arm)[:, None] + 50 * wave
+    attributes = {
+        "name": "bench",
+        "layout": layout_values(LAYOUT),
+        "settings": '[estimator]\nname = "tv"\n',
+        "arms": ["none", "tv"],
+        "dropped_records": 3,
+    }
+    kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
+    store = TelemetryStore(tmp_path / "night.zarr", *kinds, attributes)
+    changes = [{"frame": 510, "number": 1, "changes": {"noise_std": 2.5}, "where": [1, 2]}]
+    kept = np.delete(records, LOST)
+    store.append(kept, np.empty(0, kinds[1]), {"changes": changes, "ended_because": "seconds"})
+    return store.path
+
+
+@pytest.fixture
+def night(path: Path) -> Telemetry:
+    return read_telemetry(path)
+
+
+def test_rates_and_lost_frames(night: Telemetry) -> None:
+    found = timing(night)
+    assert found.rate_hz == pytest.approx(1000)
+    assert found.longest_interval_s == pytest.approx(1e-3)
+    assert found.latency_s[-1] == pytest.approx(60e-6)
+    assert [(gap.after_frame, gap.lost) for gap in gaps(night)] == [(709, 12)]
+    assert change_rows(night) == [(510, pytest.approx(0.5), "noise_std = 2.5", "1, 2")]
+
+
+def test_arms_in_turn_differ_as_they_were_made(night: Telemetry) -> None:
+    values = quantities(night)
+    rms = arms_in_turn(night, values["rms of slopes about their mean (px)"])
+    flux = arms_in_turn(night, values["flux (e-)"])
+    assert [arm.arm for arm in rms] == ["none", "tv"]
+    assert rms[0].difference is None
+    for compared, true in ((rms, RMS_PX[1] - RMS_PX[0]), (flux, FLUX_E[1] - FLUX_E[0])):
+        difference = compared[1].difference
+        assert difference is not None
+        assert difference.high < 0
+        # 5 % of it: 200 turns of 5 frames of 32 slopes have 0.5 %, the wave of the air differs between turns.
+        assert difference.value == pytest.approx(true, rel=0.05)
+    # The wave is common to both arms: in the difference it hardly counts, in the means it does.
+    assert flux[1].difference.standard_error < 0.2 * flux[1].mean.standard_error  # type: ignore[union-attr]
+
+
+def test_page(path: Path) -> None:
+    page = Page(report_of_telemetry(path))
+    assert page.ids[:4] == ["timing", "lost", "arms", "changes"]
+    assert {"numbers", "flux", "slopes", "jitter", "wavefront", "configuration"} <= set(page.ids)
+    assert "frame" not in page.ids
+    for words in (
+        "1000 frames a second",
+        "noise_std = 2.5",
+        "12 frames (0.6 %) are not in the record",
+        "bench",
+    ):
+        assert words in page.text
+
+
+def test_without_frames(tmp_path: Path) -> None:
+    kinds = record_type(N), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
+    TelemetryStore(tmp_path / "empty.zarr", *kinds, {"layout": layout_values(LAYOUT)})
+    with pytest.raises(InputError, match="no frame is recorded yet"):
+        report_of_telemetry(tmp_path / "empty.zarr")
