@@ -114,9 +114,26 @@ def read_slopes(path: str | Path) -> StoredSlopes:
         hint = f"; an unfinished run has left {partial}" if is_partial(partial) else ""
         raise InputError(f"{path}: no such file{hint}")
     if is_partial(path):
-        return _read(path, read_partial)
+        return _read(path, lambda folder: _consistent(read_partial(folder)))
     form = Zarr() if path.is_dir() else slope_format(path)
-    return _read(path, form.read)
+    return _read(path, lambda file: _consistent(form.read(file)))
+
+
+def _consistent(slopes: StoredSlopes) -> StoredSlopes:
+    """Return slopes whose quantities are all there for all frames; ValueError otherwise."""
+    shape = slopes.variables["x"].shape
+    for name, variable in VARIABLES.items():
+        array = slopes.variables[name]
+        if array.shape != shape or len(shape) != 2 or array.dtype != variable.dtype:
+            raise ValueError(
+                f"{name}: expected {variable.dtype} of {shape}, got {array.dtype} of {array.shape}"
+            )
+    for name, array in slopes.coordinates.items():
+        if array.shape != shape[1:] or array.dtype.kind not in "biuf":
+            raise ValueError(f"{name}: expected one number for each of {shape[1:]} sub-apertures")
+    if not isinstance(slopes.attributes, dict):
+        raise ValueError("attributes: expected a table")
+    return slopes
 
 
 def _read(path: Path, read: Callable[[Path], _What]) -> _What:
