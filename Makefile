@@ -1,10 +1,12 @@
 # make demo   simulate a faint star, measure it with and without denoising, write a report
 # make test   lint, types, tests
+# make fuzz   hostile values at every door for MINUTES=60; a finding names its seed
 # make bench  speed against other packages, as ratios in one run, as a page (about 15 minutes)
 # make bench-compare  what changed since the run before, beyond noise (or: OLD=file NEW=file)
 # make clean  remove what these made
 
 PYTHON ?= python3
+MINUTES ?= 60
 VENV := .venv
 BIN := $(VENV)/bin
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
@@ -12,7 +14,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint types unit bench bench-compare clean
+.PHONY: demo test lint types unit fuzz bench bench-compare clean
 
 demo: $(VENV)/installed
 	$(BIN)/faintspot demo
@@ -28,6 +30,9 @@ types: $(VENV)/installed
 
 unit: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+fuzz: $(VENV)/installed
+	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
 bench: $(VENV)/installed-benchmarks
 	$(BIN)/python -m benchmarks

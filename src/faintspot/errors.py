@@ -8,6 +8,9 @@ class InputError(ValueError):
     The command line prints it and exits with code 2.
     """
 
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.splitlines()))  # values that it shows may have several
+
 
 class MissingExtraError(ImportError):
     """An optional dependency is absent; the message names the extra that installs it."""

@@ -108,7 +108,7 @@ class Option:
         except InputError as error:
             if self.automatic and isinstance(value, str):
                 raise InputError(f'{name} = {value!r}: expected a number or "auto"') from None
-            if self.automatic and np.ndim(value) == 1 and AUTO in list(value):
+            if self.automatic and isinstance(value, list | tuple) and AUTO in value:
                 raise InputError(_MIXED.format(name)) from None
             raise error from None
 

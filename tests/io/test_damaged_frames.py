@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import json
+import pickle
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,3 +103,30 @@ def test_any_damage_is_one_line_or_harmless(tmp_path: Path, name: str) -> None:
     for message in messages:
         assert "\n" not in message
         assert path.name in message
+
+
+@pytest.mark.parametrize("dtype", ["<f4", "|O"])
+@pytest.mark.parametrize(
+    "codecs",
+    [
+        {"filters": [{"id": "pickle"}], "compressor": None},
+        {"filters": None, "compressor": {"id": "pickle"}},
+        {"filters": [{"id": "shuffle", "elementsize": 4}, {"id": "pickle"}], "compressor": {"id": "zlib"}},
+    ],
+)
+def test_nothing_in_a_store_is_unpickled(tmp_path: Path, codecs: dict[str, Any], dtype: str) -> None:
+    """A pickled object may run any code when it is loaded: here it would make a file."""
+    path, made = tmp_path / "a.zarr", tmp_path / "made"
+    path.mkdir()
+    shape = {"zarr_format": 2, "shape": [1, 2, 2], "chunks": [1, 2, 2], "order": "C", "fill_value": 0}
+    (path / ".zarray").write_text(json.dumps({**shape, "dtype": dtype, **codecs}))
+
+    class Hostile:
+        def __reduce__(self) -> Any:
+            return Path.touch, (made,)
+
+    (path / "0.0.0").write_bytes(pickle.dumps(Hostile()))
+    with pytest.raises(InputError) as error, open_frames([path]) as source:
+        source.block(0, 1)
+    assert_message(error, "a.zarr")
+    assert not made.exists()

@@ -126,10 +126,10 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
         raise InputError(f"{path}: no such file{hint}")
     one_of("unit", unit, UNITS)
     if is_partial(path):
-        stored = _read(path, read_partial)
+        stored = _read(path, lambda folder: _consistent(read_partial(folder)))
     else:
         form = Zarr() if path.is_dir() else slope_format(path)
-        stored = _read(path, form.read)
+        stored = _read(path, lambda file: _consistent(form.read(file)))
     before = str(stored.attributes.get("unit", "px"))
     if unit == before:
         return stored
@@ -139,6 +139,23 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
         raise InputError(f"{path}: {error}") from None
     variables = scaled_positions(stored.variables, factor)
     return replace(stored, variables=variables, attributes={**stored.attributes, "unit": unit})
+
+
+def _consistent(slopes: StoredSlopes) -> StoredSlopes:
+    """Return slopes whose quantities are all there for all frames; ValueError otherwise."""
+    shape = slopes.variables["x"].shape
+    for name, variable in VARIABLES.items():
+        array = slopes.variables[name]
+        if array.shape != shape or len(shape) != 2 or array.dtype != variable.dtype:
+            raise ValueError(
+                f"{name}: expected {variable.dtype} of {shape}, got {array.dtype} of {array.shape}"
+            )
+    for name, array in slopes.coordinates.items():
+        if array.shape != shape[1:] or array.dtype.kind not in "biuf":
+            raise ValueError(f"{name}: expected one number for each of {shape[1:]} sub-apertures")
+    if not isinstance(slopes.attributes, dict):
+        raise ValueError("attributes: expected a table")
+    return slopes
 
 
 def _read(path: Path, read: Callable[[Path], _What]) -> _What:

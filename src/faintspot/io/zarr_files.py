@@ -45,7 +45,10 @@ class Zarr(FileFormat):
         except Exception as error:  # broken metadata makes zarr raise many things
             where = f"{path}:{key}" if key else str(path)
             raise InputError(f"{where}: cannot be opened as a Zarr array ({one_line(error)})") from None
-        return _ZarrArray(f"{path}:{node.path}" if node.path else str(path), node)
+        name = f"{path}:{node.path}" if node.path else str(path)
+        if any(getattr(codec, "codec_id", "") == "pickle" for codec in (*node.filters, *node.compressors)):
+            raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+        return _ZarrArray(name, node)
 
     def require(self) -> None:
         """Raise MissingExtraError when zarr is absent."""

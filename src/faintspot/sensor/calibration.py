@@ -213,7 +213,7 @@ def _map(name: str, value: Any) -> NDArray[np.float64]:
 
 
 def _scalar_or_map(name: str, value: Any) -> Any:
-    if np.ndim(value) == 0:
+    if real_array(name, value).ndim == 0:
         return number_between(name, value, -_LARGEST_ADU, _LARGEST_ADU)
     return _map(name, value)
 

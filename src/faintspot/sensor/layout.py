@@ -350,7 +350,10 @@ def _index(chosen: Any, length: int) -> NDArray[np.int64]:
     if isinstance(chosen, slice):
         index = np.arange(length)[chosen]
     else:
-        array = np.asarray(chosen)
+        try:
+            array = np.asarray(chosen)
+        except ValueError:  # rows of different lengths
+            array = np.empty((0, 0))
         if array.ndim != 1:
             raise InputError("layout[...]: expected a mask, a slice or a list of numbers")
         if array.dtype == np.bool_:

@@ -277,14 +277,21 @@ class PSF:
             When it cannot be read or is no PSF.
         """
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                return cls(arrays["samples"], int(arrays["oversampling"]), arrays.get("index"))
+            # numpy.load leaves a file that it opened itself open when the archive is damaged.
+            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                stored = {
+                    name: arrays[name] for name in ("samples", "oversampling", "index") if name in arrays
+                }
         except FileNotFoundError:
             raise InputError(f"{path}: no such file") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, InputError):
-                raise InputError(f"{path}: {error}") from None
-            raise InputError(f"{path}: not a PSF ({error})") from None
+        except Exception:  # a damaged archive raises whatever its decoder meets
+            raise InputError(f"{path}: expected a PSF (.npz), got something else") from None
+        if "samples" not in stored or "oversampling" not in stored:
+            raise InputError(f"{path}: expected a PSF: samples and oversampling, found {', '.join(stored)}")
+        try:
+            return cls(**stored)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
 
 
 def _outer(u: Floats, s: Floats, vt: Floats, rank: int) -> Floats:

@@ -1,0 +1,245 @@
+"""Damaged and lying files of every format: a result, or an InputError in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tests.fuzz.refused import refused_in_one_line
+
+import faintspot as fs
+from faintspot import configuration
+from faintspot.io import open_frames, read_array, read_slopes
+from faintspot.io.references import read_reference
+from faintspot.loop.configuration import LoopConfiguration, load_loop
+from faintspot.planner.camera_file import read_camera
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.study.specification import StudySpecification
+
+_NUMBER = re.compile(rb"\d+(\.\d*)?([eE][-+]?\d+)?")
+_WORDS = (b"1e300", b"-1", b"nan", b"-inf", b"0", b"0.5", b"9" * 30, b'"x"', b"[]", b"{}", b"true", b"null")
+_STUDY = """name = "s"
+seed = 3
+realisations = 40
+arms = ["tv", "brightest"]
+fixed_k = [5]
+[sweeps.light]
+flux_e = { from = 10, to = 100, points = 3, spacing = "log" }
+pixels = 8
+"""
+_CAMERA = """[camera]
+read_noise_e = 1.0
+pixels = 8
+[spot]
+fwhm_px = 2.0
+[star]
+flux_e = 100.0
+[layout.grid]
+shape = [3, 3]
+pixels = 8
+"""
+
+
+def run(seed: int) -> None:
+    """Damage one file, and read it."""
+    rng = np.random.default_rng(seed)
+    name = list(READERS)[seed % len(READERS)]
+    originals = _originals()
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        path = Path(folder) / name
+        kin = originals.glob("faintspot.*") if name.startswith("faintspot.") else [originals / name]
+        for original in kin:
+            copy = shutil.copytree if original.is_dir() else shutil.copyfile
+            copy(original, path.with_name(original.name))
+        _damage(rng, path)
+        refused_in_one_line(lambda: READERS[name](path))
+
+
+# Sound files ------------------------------------------------------------------------------------------
+
+
+def _read_frames(path: Path) -> None:
+    with open_frames([path]) as frames:
+        frames.block(0, 1)
+        frames.block(frames.n_frames - 1, frames.n_frames)
+    read_array(path)
+
+
+def _read_configuration(path: Path) -> None:
+    configuration.has(path, "settings")
+    fs.SlopePipeline(**_parts(configuration.load_all(path)))
+
+
+def _parts(found: configuration.Configuration) -> dict[str, Any]:
+    return found._asdict()
+
+
+def _read_telemetry(path: Path) -> None:
+    from faintspot.io import read_telemetry, write_aot
+
+    telemetry = read_telemetry(path)
+    write_aot(path.with_name("aot.fits"), telemetry)
+
+
+def _frame_readers() -> dict[str, Callable[[Path], Any]]:
+    from tests.io import frame_files
+
+    return {f"frames.{form}": _read_frames for form in frame_files.FORMATS}
+
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    **_frame_readers(),
+    **{f"slopes.{form}": read_slopes for form in ("zarr", "npz", "fits", "fits.gz", "csv")},
+    ".slopes.npz.partial": read_slopes,
+    "reference.npz": read_reference,
+    "telemetry.zarr": _read_telemetry,
+    "psf.npz": PSF.load,
+    "score.npz": TrainedScore.load,
+    "faintspot.toml": _read_configuration,
+    "faintspot.calibration.npz": lambda path: _read_configuration(path.with_name("faintspot.toml")),
+    "study.toml": StudySpecification.from_file,
+    "loop.toml": load_loop,
+    "camera.toml": read_camera,
+}
+
+
+@cache
+def _originals() -> Path:
+    """Return a folder with a sound file of each, which stays as long as the process."""
+    from tests.estimator_cases import random_score
+    from tests.io import frame_files, slope_files, test_telemetry
+
+    from faintspot.io.telemetry import TelemetryStore
+
+    keep = tempfile.TemporaryDirectory()
+    _kept.append(keep)
+    folder = Path(keep.name)
+    for name in READERS:
+        if name.startswith("frames."):
+            frame_files.save(folder / name, frame_files.cube(5))
+        elif name.startswith("slopes."):
+            slope_files.write(folder / name, slope_files.result(20))
+    slope_files.write(folder / "reference.npz", slope_files.result(20))
+    with contextlib.suppress(KeyboardInterrupt), slope_files.writer_for(folder / "other.npz", 20) as writer:
+        writer.append(0, slope_files.part(slope_files.result(20), 0, 12))
+        raise KeyboardInterrupt
+    (folder / ".other.npz.partial").rename(folder / ".slopes.npz.partial")
+    store = TelemetryStore(
+        folder / "telemetry.zarr", test_telemetry.RECORD, test_telemetry.IMAGE, test_telemetry.ATTRIBUTES
+    )
+    store.append(
+        test_telemetry.records_of(10, 5), test_telemetry.images_of(10), {"changes": test_telemetry.CHANGES}
+    )
+    psf, score = PSF.analytic(radius_px=5), random_score(np.random.default_rng(0), 9)
+    psf.save(folder / "psf.npz")
+    score.save(folder / "score.npz")
+    path = folder / "faintspot.toml"
+    layout = fs.Layout.grid((3, 3), pixels=8)
+    camera = fs.Calibration(
+        np.full((24, 24), 20.0), bad_pixels=np.eye(24, dtype=bool), read_noise_e=1.0, background_e=2.0
+    )
+    chosen = fs.Settings("map", flux_e=100.0, search_range_px=2.0, prior_std_px=1.0).replace(
+        where=3, flux_e=50.0
+    )
+    for item in (layout, camera, chosen, psf, score):
+        configuration.save(path, item)
+    (folder / "study.toml").write_text(_STUDY)
+    (folder / "camera.toml").write_text(_CAMERA)
+    (folder / "loop.toml").write_text(LoopConfiguration().to_text())
+    return folder
+
+
+_kept: list[Any] = []
+
+# Damage -----------------------------------------------------------------------------------------------
+
+
+def _damage(rng: np.random.Generator, path: Path) -> None:
+    """Damage a file, or one of a store's; of arrays in a .npz file also what they hold."""
+    if path.is_dir():
+        inside = sorted(file for file in path.rglob("*") if file.is_file())
+        described = [file for file in inside if file.suffix == ".json" or file.name.startswith(".z")]
+        chosen = described if described and rng.random() < 0.6 else inside
+        file = chosen[rng.integers(len(chosen))]
+        if rng.random() < 0.1:
+            file.unlink()
+        else:
+            file.write_bytes(_damaged(rng, file.read_bytes()))
+        return
+    if path.suffix == ".npz" and rng.random() < 0.5:
+        with np.load(path) as archive:
+            arrays = dict(archive)
+        name = str(rng.choice(list(arrays)))
+        arrays[name] = _other_array(rng, arrays[name])
+        np.savez(path, **arrays)
+        return
+    path.write_bytes(_damaged(rng, path.read_bytes()))
+
+
+def _damaged(rng: np.random.Generator, content: bytes) -> bytes:
+    """Return other bytes: bits flipped, numbers or parts changed, cut off, or doubled."""
+    for _ in range(1 + int(rng.geometric(0.6))):
+        if not content:
+            return content
+        first, last = sorted(int(n) for n in rng.integers(0, len(content) + 1, 2))
+        kind = rng.integers(8)
+        if kind == 0:
+            some = bytearray(content)
+            for place in rng.integers(0, len(some), 1 + int(rng.integers(4))):
+                some[place] ^= 1 << int(rng.integers(8))
+            content = bytes(some)
+        elif kind == 1:
+            content = content[:first]
+        elif kind == 2:
+            content = content[:first] + content[min(last, first + 16) :]
+        elif kind == 3:
+            content = content[:first] + content[first : first + 64] + content[first:]
+        elif kind == 4:
+            content = content[:first] + rng.bytes(int(rng.integers(1, 9))) + content[first:]
+        elif kind == 5 and content.isascii():
+            content = content[:first] + b"[" * 5000 + content[first:]
+        else:
+            content = _other_number(rng, content, same_length=bool(kind == 6))
+    return content
+
+
+def _other_number(rng: np.random.Generator, content: bytes, same_length: bool) -> bytes:
+    """Replace one number of a text, or of the text within the first kilobytes of a file."""
+    numbers = list(_NUMBER.finditer(content[:20_000]))
+    if not numbers:
+        return content
+    found = numbers[rng.integers(len(numbers))]
+    size = found.end() - found.start()
+    if same_length:
+        new = bytes([int(rng.choice(list(b"0123456789")))]) * size
+    else:
+        new = _WORDS[rng.integers(len(_WORDS))]
+    return content[: found.start()] + new + content[found.end() :]
+
+
+def _other_array(rng: np.random.Generator, array: Any) -> Any:
+    """Return an array of another type, shape or other values."""
+    others: list[Callable[[], Any]] = [
+        lambda: np.array("text"),
+        lambda: array.astype(complex) if array.dtype.kind in "biuf" else array,
+        lambda: np.full(array.shape, np.nan),
+        lambda: np.full(array.shape, rng.choice([1e300, -1e300, 1e38, 0.0, -1.0, 2.0**62])),
+        lambda: array[None],
+        lambda: array.reshape(-1),
+        lambda: array.reshape(-1)[:1],
+        lambda: np.empty((0, *array.shape), array.dtype),
+        lambda: np.repeat(array[None], 2, 0),
+        lambda: np.zeros((1, 1, 1, 2, 1, 1)),
+        lambda: np.array(b"\xff\x00"),
+    ]
+    return others[rng.integers(len(others))]()

@@ -1,0 +1,183 @@
+"""Public functions with any values, by Hypothesis: a result, or an InputError in one line."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import hypothesis
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays_of
+from tests.fuzz.refused import refused_in_one_line
+
+import faintspot as fs
+from faintspot.estimators import estimators
+from faintspot.settings import option_names
+
+_EXAMPLES = 100
+
+NUMBERS = st.one_of(
+    st.integers(-3, 40),
+    st.floats(-3, 40),
+    st.floats(),
+    st.sampled_from([1e300, -1e300, 2**31, 2**63, 10**40, 1e-300, True, None, "auto", "x", "", b"1", 1j]),
+)
+_KINDS: Any = st.sampled_from([np.dtype(kind) for kind in ("f4", "f8", "i8", "u2", "?", "c8", "U3")])
+ARRAYS: Any = arrays_of.arrays(
+    _KINDS,
+    arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=12),
+)
+PAIRS = st.lists(st.lists(st.one_of(st.integers(-2, 30), NUMBERS), min_size=1, max_size=3), max_size=9)
+ANYTHING = st.one_of(
+    NUMBERS, ARRAYS, PAIRS, st.lists(NUMBERS, max_size=9), st.dictionaries(st.text(max_size=3), NUMBERS)
+)
+SOUND = fs.Layout.grid((3, 3), pixels=8)
+
+
+def some_of(**fields: Any) -> Any:
+    """Keyword arguments, some of which are left out."""
+    return st.fixed_dictionaries({}, optional=fields)
+
+
+def any_settings(name: Any, options: dict[str, Any]) -> None:
+    made = refused_in_one_line(lambda: fs.Settings(name, **options))
+    if made is not None:
+        refused_in_one_line(lambda: fs.SlopePipeline(SOUND, made, fs.Calibration(read_noise_e=1.0), psf=_PSF))
+        refused_in_one_line(lambda: made.replace(where=[0, 3], search_range_px=2.0))
+
+
+def any_layout(frame_shape: Any, window: Any, corners: Any, others: dict[str, Any]) -> None:
+    refused_in_one_line(lambda: fs.Layout(frame_shape, window, corners, **others))
+    refused_in_one_line(lambda: fs.Layout((40, 40), (8, 8), corners))
+    refused_in_one_line(lambda: fs.Layout((40, 40), (8, 8), np.array([[0, 0], [8, 9]]), **others))
+    refused_in_one_line(lambda: SOUND[corners])
+
+
+def any_grid(shape: Any, others: dict[str, Any]) -> None:
+    refused_in_one_line(lambda: fs.Layout.grid(shape, **{"pixels": 8, **others}))
+    refused_in_one_line(lambda: fs.Layout.grid((3, 3), **{"pixels": 8, **others}))
+
+
+def any_calibration(fields: dict[str, Any]) -> None:
+    made = refused_in_one_line(lambda: fs.Calibration(**fields))
+    if made is not None:
+        refused_in_one_line(lambda: made.maps((8, 12)))
+        refused_in_one_line(lambda: fs.SlopePipeline(SOUND, fs.Settings("ml"), made, psf=_PSF))
+
+
+def any_psf(samples: Any, oversampling: Any, index: Any, positions: Any, shape: Any) -> None:
+    made = refused_in_one_line(lambda: fs.PSF(samples, oversampling, index))
+    for psf in (made, _PSF):
+        if psf is not None:
+            refused_in_one_line(partial(psf.images, positions, shape))
+            refused_in_one_line(partial(psf.blurred, oversampling))
+    if made is not None:
+        refused_in_one_line(
+            lambda: fs.SlopePipeline(
+                SOUND, fs.Settings("map", flux_e=99.0), fs.Calibration(read_noise_e=1.0), psf=made
+            )
+        )
+
+
+def any_frame(frame: Any, prior: Any, reference: Any) -> None:
+    refused_in_one_line(lambda: _PIPELINE(frame))
+    refused_in_one_line(lambda: _PIPELINE(np.zeros((24, 24), np.float32), prior))
+    refused_in_one_line(lambda: fs.SlopePipeline(SOUND, fs.Settings("centroid"), reference=reference))
+    refused_in_one_line(lambda: fs.tv_denoise(frame, prior))
+    refused_in_one_line(lambda: fs.centre_of_gravity(frame))
+
+
+_PSF = fs.PSF.analytic("gaussian", radius_px=5)
+_PIPELINE = fs.SlopePipeline(SOUND, fs.Settings("brightest", keep_brightest=5))
+CHECKS: tuple[tuple[Callable[..., None], tuple[Any, ...]], ...] = (
+    (
+        any_settings,
+        (
+            st.sampled_from([*estimators(), "x", None]),
+            st.dictionaries(st.sampled_from(option_names()[1:]), ANYTHING, max_size=4),
+        ),
+    ),
+    (
+        any_layout,
+        (
+            ANYTHING,
+            ANYTHING,
+            ANYTHING,
+            some_of(
+                centres=ANYTHING, cells=ANYTHING, pitch_px=ANYTHING, angle_deg=ANYTHING, geometry=ANYTHING
+            ),
+        ),
+    ),
+    (
+        any_grid,
+        (
+            ANYTHING,
+            some_of(
+                pixels=ANYTHING,
+                outer_radius=ANYTHING,
+                inner_radius=ANYTHING,
+                pitch=ANYTHING,
+                origin=ANYTHING,
+                frame_shape=ANYTHING,
+            ),
+        ),
+    ),
+    (
+        any_calibration,
+        (
+            some_of(
+                **dict.fromkeys(
+                    (
+                        "dark",
+                        "flat",
+                        "gain_e_per_adu",
+                        "em_gain",
+                        "bad_pixels",
+                        "saturation_adu",
+                        "read_noise_e",
+                        "background_e",
+                    ),
+                    ANYTHING,
+                )
+            ),
+        ),
+    ),
+    (
+        any_psf,
+        (
+            ANYTHING,
+            ANYTHING,
+            ANYTHING,
+            ANYTHING,
+            ANYTHING,
+        ),
+    ),
+    (
+        any_frame,
+        (
+            ANYTHING,
+            ANYTHING,
+            ANYTHING,
+        ),
+    ),
+)
+
+
+def run(seed: int) -> None:
+    """Try a hundred values of one function."""
+    check, values = CHECKS[seed % len(CHECKS)]
+    quietly = settings(
+        deadline=None,
+        max_examples=_EXAMPLES,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+        phases=(Phase.generate, Phase.shrink),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", module="hypothesis")
+        hypothesis.seed(seed)(quietly(given(*values)(check)))()  # type: ignore[no-untyped-call]
