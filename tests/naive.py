@@ -188,8 +188,8 @@ def calibrate(frame: ArrayLike, calibration: fs.Calibration) -> Floats:
     raw = np.asarray(frame).astype(np.float64)
     electrons = np.full(raw.shape, np.nan)
     for i, j in np.ndindex(raw.shape):
-        dark = 0.0 if calibration.dark is None else calibration.dark
-        dark = dark[i, j] if np.ndim(dark) else dark
+        level = np.asarray(0.0 if calibration.dark is None else calibration.dark)
+        dark = level[i, j] if level.ndim else level
         flat = 1.0 if calibration.flat is None else calibration.flat[i, j]
         if not (np.isfinite(raw[i, j]) and np.isfinite(dark) and np.isfinite(flat) and flat > 0):
             continue

@@ -26,6 +26,7 @@ import faintspot as fs
 from faintspot.estimators import estimators, measure
 from faintspot.kernels import groups
 from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
 
 Flag = fs.SubapertureFlag
 SEEDS = st.integers(0, 2**32 - 1)
@@ -217,8 +218,8 @@ class TestSettings:
 
     def test_a_score_that_overflows(self) -> None:
         case = random_case(4, "trained", n=6)
-        assert case.score is not None
-        score = replace(case.score, tables=np.sign(case.score.tables) * 1e6)
+        assert isinstance(case.score, TrainedScore)
+        score = replace(case.score, tables=np.sign(case.score.tables) * np.float32(1e6))
         images = np.float32(1e35) * case.images
         assert_sane(replace(case, score=score, images=images).measure())
 

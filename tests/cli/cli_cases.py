@@ -55,7 +55,7 @@ class Commands:
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
 
-    def __call__(self, *arguments: str | Path | int) -> Result:
+    def __call__(self, *arguments: str | Path | float) -> Result:
         self._capsys.readouterr()
         code: Any = 0
         try:
@@ -65,7 +65,7 @@ class Commands:
         captured = self._capsys.readouterr()
         return Result(int(code or 0), captured.out, captured.err)
 
-    def ok(self, *arguments: str | Path | int) -> Result:
+    def ok(self, *arguments: str | Path | float) -> Result:
         """Run a command that must succeed."""
         result = self(*arguments)
         assert result.code == 0, result.err

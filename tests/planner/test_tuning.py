@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
@@ -133,7 +133,7 @@ def test_a_plugin_that_refuses_the_scene_is_left_out(monkeypatch: pytest.MonkeyP
         label: ClassVar[str] = "refusing"
         method: ClassVar[str] = "none"
 
-        def for_scene(self, scene: Scene) -> Estimator:
+        def for_scene(self, scene: Scene) -> Self:
             raise InputError("scene: too bright for me")
 
     monkeypatch.setattr(registry, "_kinds", {**estimators(), "refusing": Refusing})

@@ -31,7 +31,8 @@ def slopes_of_modes(layout: Layout, coefficients: NDArray[Any]) -> NDArray[np.fl
     pupil = pupil_of(layout)
     outlines = (lenslet_outlines(layout) - pupil.centre_px) / pupil.radius_px
     gradients = mean_gradients(np.arange(2, 2 + coefficients.shape[1]), outlines)
-    return np.einsum("ank,fk->fan", gradients, coefficients)
+    positions: NDArray[np.float64] = np.einsum("ank,fk->fan", gradients, coefficients)
+    return positions
 
 
 def flagged(slopes: Slopes, where: Any) -> Slopes:

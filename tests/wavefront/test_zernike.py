@@ -69,7 +69,7 @@ def test_mean_gradients_are_those_of_many_points(corners: int) -> None:
     x, y, step = x[inside], y[inside], 1e-5
     modes = np.arange(2, 37)
     found = mean_gradients(modes, outline[None])[:, 0]
-    for place, j in enumerate(modes):
+    for place, j in enumerate(modes.tolist()):
         along_x = (zernike(j, x + step, y) - zernike(j, x - step, y)) / (2 * step)
         along_y = (zernike(j, x, y + step) - zernike(j, x, y - step)) / (2 * step)
         # 1e-3 of the largest: the points do not fill the polygon's edge exactly.

@@ -14,7 +14,7 @@ from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.scene import Scene
 from faintspot.options import AUTO
 from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
+from faintspot.sensor.score import Score, TrainedScore
 from faintspot.settings import Settings
 from faintspot.simulate.detector import Detector
 from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
