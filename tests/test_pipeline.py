@@ -286,6 +286,6 @@ def test_integers_with_a_mask_saturate_as_without() -> None:
     mask = np.zeros(frame.shape, bool)
     mask[0, 0] = True
     pipeline = fs.SlopePipeline(layout, fs.Settings(estimator="brightest", keep_brightest=8))
-    for given in (frame, np.ma.array(frame, mask=mask)):
-        saturated = (pipeline(given).flags & int(fs.SubapertureFlag.SATURATED)) != 0
+    for item in (frame, np.ma.array(frame, mask=mask)):
+        saturated = (pipeline(item).flags & int(fs.SubapertureFlag.SATURATED)) != 0
         assert saturated.tolist() == [True, False]
