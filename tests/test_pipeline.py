@@ -289,3 +289,16 @@ def test_slopes_at_the_search_range_are_flagged() -> None:
     assert slopes.x.tolist() == [0.5, 2.0, -0.5]
     assert ((slopes.flags & Flag.AT_SEARCH_LIMIT) != 0).tolist() == [False, True, False]
     assert slopes.valid.all()
+
+
+def test_integers_with_a_mask_saturate_as_without() -> None:
+    layout = fs.Layout.grid((1, 2), pixels=8)
+    frame = np.full(layout.frame_shape, 10, np.uint16)
+    frame[3:5, 3:5] = frame[3:5, 11:13] = 60000
+    frame[3, 3] = 65535
+    mask = np.zeros(frame.shape, bool)
+    mask[0, 0] = True
+    pipeline = fs.SlopePipeline(layout, fs.Settings(estimator="brightest", keep_brightest=8))
+    for item in (frame, np.ma.array(frame, mask=mask)):
+        saturated = (pipeline(item).flags & int(fs.SubapertureFlag.SATURATED)) != 0
+        assert saturated.tolist() == [True, False]

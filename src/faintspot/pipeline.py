@@ -244,7 +244,7 @@ class SlopePipeline:
         InputError
             For a frame that is not real or not of the layout's shape, or a prior of the wrong shape.
         """
-        return self._run(self._checked(frame), prior, explain=False)[0]
+        return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
         """Return the sub-aperture images after every step, for pictures and for finding faults.
@@ -252,7 +252,7 @@ class SlopePipeline:
         Estimators that work on the calibrated image itself leave it as it is in every step.
         """
         array = self._checked(frame)
-        slopes, stages = self._run(array, prior, explain=True)
+        slopes, stages = self._run(array, _camera_type(frame), prior, explain=True)
         calibrated, denoised, background = stages.reshape(3, *slopes.x.shape, *self.layout.window)
         return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
 
@@ -266,7 +266,11 @@ class SlopePipeline:
         return array
 
     def _run(
-        self, array: NDArray[Any], prior: ArrayLike | Slopes | None, explain: bool
+        self,
+        array: NDArray[Any],
+        dtype: np.dtype[Any],
+        prior: ArrayLike | Slopes | None,
+        explain: bool,
     ) -> tuple[Slopes, NDArray[np.float32]]:
         """Compute the slopes, and the stages where asked for."""
         frames = kernel_frames(array)
@@ -275,10 +279,10 @@ class SlopePipeline:
         prepared = self.preparation.prepared
         rows = STAGE_ROWS if explain or isinstance(prepared, PythonPrepared) else 0
         stages = np.empty((rows, n_frames, n, self.layout.pixels), np.float32)
-        source = self.source(frames, array.dtype)
+        source = self.source(frames, dtype)
         variants = self._variants(source)
         if self.on_device is not None and not explain:
-            measured = self.on_device.measure_from_host(frames, array.dtype, variants)
+            measured = self.on_device.measure_from_host(frames, dtype, variants)
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
         task = self.preparation.task(variants, predicted)
@@ -348,6 +352,11 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
     if array.shape != (n, 2):
         raise InputError(f"reference: expected shape ({n}, 2) or ({2 * n},), got {array.shape}")
     return array
+
+
+def _camera_type(frame: ArrayLike) -> np.dtype[Any]:
+    """Return the type of a frame's pixels as they were given: integers with a mask become floats later."""
+    return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
 
 
 def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:

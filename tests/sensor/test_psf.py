@@ -145,3 +145,7 @@ def test_images_refuse_what_does_not_fit() -> None:
     for positions, options in (([[np.nan, 0]], {}), ([1.0, 2.0, 3.0], {}), ([[0, 0]], {"which": 1})):
         with pytest.raises(InputError):
             psf.images(positions, (8, 8), **options)
+
+
+def test_its_text_is_short() -> None:
+    assert repr(PSF.analytic(radius_px=10.0)) == "PSF(1 of 20.1 x 20.1 px, oversampling 8)"

@@ -46,7 +46,7 @@ def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
     if array.ndim == 3:
         array = array.mean(axis=0)
     inside = layout.images(array)
-    write_atomically(path, png(_layout_figure(array, inside, layout)))
+    write_atomically(path, png(_layout_figure(array, inside, layout), tight=False))
 
 
 def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
@@ -63,6 +63,17 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
     points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
     boxes, line = _window_outlines(layout), min(max(points / 14, 0.2), 0.9)  # lines never hide the spots
     axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors="#E69F00", linewidths=line))
+    axes.set_xlabel("column (px)")
+    axes.set_ylabel("row (px)")
+    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
+    plural = "" if len(layout) == 1 else "s"
+    axes.set_title(
+        f"{len(layout)} sub-aperture{plural} of {layout.window[0]} x {layout.window[1]} px, "
+        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
+    )
+    # Numbers, which take long, come when the layout is found, so that they are drawn once.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     font = min(points / 3.0, 13.0)
     if font >= 4 and len(layout) <= _MOST_NUMBERED:
         for number, (row, column) in enumerate(layout.corners):
@@ -76,14 +87,6 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
                 clip_on=True,
                 path_effects=[patheffects.withStroke(linewidth=1.6, foreground="black")],
             )
-    axes.set_xlabel("column (px)")
-    axes.set_ylabel("row (px)")
-    pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
-    plural = "" if len(layout) == 1 else "s"
-    axes.set_title(
-        f"{len(layout)} sub-aperture{plural} of {layout.window[0]} x {layout.window[1]} px, "
-        f"{layout.geometry}{pitch}, angle {layout.angle_deg:.2f}°"
-    )
     return figure
 
 

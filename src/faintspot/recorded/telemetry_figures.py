@@ -12,7 +12,7 @@ from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, style
 from faintspot.report.figure_data import FigureWithData
 
 _BINS = 80
-_MOST_TIMES = 400  # points of the course in time
+_MOST_TIMES, _FEWEST_TOGETHER = 400, 50  # points of the course in time, frames in each
 
 
 @styled
@@ -33,7 +33,8 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
     left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
     if len(np.unique(telemetry.arm)) > 1:
         left.legend(frameon=False)
-    parts = np.array_split(np.arange(len(latency)), min(_MOST_TIMES, len(latency)))
+    stretches = min(_MOST_TIMES, max(1, len(latency) // _FEWEST_TOGETHER))
+    parts = np.array_split(np.arange(len(latency)), stretches)
     time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
     middle = [float(time[part].mean()) for part in parts]
     right.plot(middle, [latency[part].max() for part in parts], color=GREY, lw=1, label="longest")

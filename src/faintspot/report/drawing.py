@@ -70,10 +70,11 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 @styled  # ticks are made only now
-def png(figure: Figure) -> bytes:
-    """Return a figure as a PNG picture."""
+def png(figure: Figure, *, tight: bool = True) -> bytes:
+    """Return a figure as a PNG picture; `tight` cuts the margins, for which all is drawn twice."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight", pad_inches=0.15)
+    cut: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15} if tight else {}
+    figure.savefig(stream, format="png", dpi=DOTS_PER_INCH, **cut)
     return stream.getvalue()
 
 

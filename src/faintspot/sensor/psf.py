@@ -99,6 +99,13 @@ class PSF:
         elif len(samples) > 1:
             raise InputError(f"psf.index: expected the PSF of each sub-aperture, as there are {len(samples)}")
 
+    def __repr__(self) -> str:
+        """Say how many there are, and how large; not every sample."""
+        n, rows, columns = self.samples.shape
+        size = f"{rows / self.oversampling:.3g} x {columns / self.oversampling:.3g} px"
+        of = "" if self.index is None else f" for {len(self.index)} sub-apertures"
+        return f"PSF({n} of {size}{of}, oversampling {self.oversampling})"
+
     @classmethod
     def analytic(
         cls,
