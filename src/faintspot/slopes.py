@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.flags import INVALID
 
-RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
+RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4")))
 
 
 @dataclass(frozen=True)

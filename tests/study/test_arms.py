@@ -72,7 +72,7 @@ def test_without_light_the_position_is_the_centre() -> None:
     np.testing.assert_allclose(table, 0.375, rtol=1e-6)
     specification = StudySpecification("s", [Sweep("a", pixels=10)], arms=["thresholded"])
     arms = CellArms(specification.cells()[0], specification)
-    slopes = arms.measure("thresholded", (("threshold_e", 5.0),), noise)
+    slopes = arms.measure("thresholded", (("threshold_e", 5.0),), flat)
     assert not slopes.valid.any()
     assert slopes.x[0] == slopes.y[0] == 0.0
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,11 @@ from faintspot.io.frames import read_array
 from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_map, read_tables, save_tables
 
 _MAPS = ("dark", "flat", "bad_pixels")
+
+
+@cache  # asked in every frame
+def _largest(dtype: np.dtype[Any]) -> float:
+    return float(np.iinfo(dtype).max)
 
 
 @dataclass(frozen=True)
@@ -170,7 +177,7 @@ class Calibration:
         if self.saturation_adu is not None:
             return self.saturation_adu
         # Not infinity: an infinite pixel would reach it.
-        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.nan
+        return _largest(dtype) if dtype.kind in "iu" else math.nan
 
     def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
         if self.bad_pixels.dtype == np.bool_:
