@@ -23,6 +23,7 @@ _ORDER = (
     "scale",
     "projection",
     "estimators",
+    "pictures",
     "roofline",
     "breakdown",
     "realtime",

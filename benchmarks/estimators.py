@@ -32,9 +32,8 @@ def _score(rng: np.random.Generator) -> fs.TrainedScore:
     return fs.TrainedScore(tables, np.array([FLUX_E]), np.full((1, 1, 2), 0.1))
 
 
-def _pipelines(layout: fs.Layout) -> dict[str, fs.SlopePipeline]:
+def pipelines(layout: fs.Layout, calibration: fs.Calibration) -> dict[str, fs.SlopePipeline]:
     """Return every estimator's pipeline."""
-    calibration = fs.Calibration(dark=0.0, read_noise_e=READ_NOISE_E)
     psf, score = fs.PSF.analytic(), _score(np.random.default_rng(1))
     rotated = fs.PSF.analytic(elongation=2.0, angle_deg=30.0)
 
@@ -111,12 +110,10 @@ def _table(shape: tuple[int, int]) -> Table:
         rng=np.random.default_rng(2),
     )
     frame, n = frames[0], len(layout)
-    pipelines = _pipelines(layout)
-    candidates: dict[str, Candidate] = {
-        name: partial(pipeline, frame) for name, pipeline in pipelines.items()
-    }
+    cases = pipelines(layout, fs.Calibration(read_noise_e=READ_NOISE_E))
+    candidates: dict[str, Candidate] = {name: partial(pipeline, frame) for name, pipeline in cases.items()}
     times = interleaved(candidates | {"gather": _gather(layout, frame)}, seconds=12.0)
-    rows = [_row(name, n, times) for name in pipelines]
+    rows = [_row(name, n, times) for name in cases]
     notes = [f"gathering and calibrating: {best(times, 'gather') / n * 1e6:.3f} us"]
     return Table(f"estimators_{n}", f"Estimators, {n} sub-apertures of 16 x 16 pixels", rows, notes)
 

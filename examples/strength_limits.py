@@ -1,9 +1,9 @@
 """What a strength that is too strong for the image costs: slope errors with TV denoising over those without.
 
-Spots of 20 to 200 e-, 1 and 3 e- read noise, windows of 8 and 16 px, the usual number of kept pixels. Strengths
-are the suggested one, the automatic one and twice the suggested one. R = mean of (|dx| + |dy|) / 2 over all
-sub-apertures, one without light counting as at the centre; differences are paired, so that their errors are
-smaller than those of R. docs/automatic.md has the table.
+Spots of 20 to 200 e-, 1 and 3 e- read noise, windows of 8 and 16 px, the usual number of kept pixels.
+Strengths are the suggested one, the automatic one and twice the suggested one. R = mean of (|dx| + |dy|) / 2
+over all sub-apertures, one without light counting as at the centre; differences are paired, so that their
+errors are smaller than those of R. docs/automatic.md has the table.
 """
 
 import numpy as np
@@ -49,9 +49,10 @@ def main() -> None:
             lowered = np.mean((slopes.flags & fs.SubapertureFlag.INFEASIBLE_STRENGTH) > 0)
             lost = np.count_nonzero(plain.valid & ~slopes.valid)
             change = found - without
+            case = f"| {side} px | {noise:g} e- | {flux:g} e- | {without.mean():.3f} | {name} "
             print(
-                f"| {side} px | {noise:g} e- | {flux:g} e- | {without.mean():.3f} | {name} | {100 * lowered:.1f} % "
-                f"| {lost} | {found.mean():.3f} | {change.mean():+.4f} ± {change.std() / SPOTS**0.5:.4f} |"
+                f"{case}| {100 * lowered:.1f} % | {lost} | {found.mean():.3f} "
+                f"| {change.mean():+.4f} ± {change.std() / SPOTS**0.5:.4f} |"
             )
 
 

@@ -19,7 +19,7 @@ class SubapertureFlag(IntFlag):
     SATURATED = 8
     """At least one pixel reached the saturation level."""
     INFEASIBLE_STRENGTH = 16
-    """The strength is above 0.9 of the image's own rms, too strong for it: it was lowered to 0.6 of the rms."""
+    """The strength is too strong for the image, above 0.9 of its own rms: lowered to 0.6 of that."""
     NOT_CONVERGED = 32
     """The iteration limit came before the tolerance was reached. Not where the tolerance is 0."""
     OUTLIER_LIKELY = 64

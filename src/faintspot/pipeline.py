@@ -32,6 +32,10 @@ from faintspot.slopes import RESULT_TYPES, Slopes, Stages
 if TYPE_CHECKING:
     from faintspot.cuda.measuring import DevicePipeline
 
+_KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
+_NO_STAGES = np.empty((0, 0, 0, 0), np.float32)
+_LIGHT_COST = 0.1  # of summing up a sub-aperture's pixels, as `Estimator.cost`
+
 
 class SlopePipeline:
     """Turns frames into slopes.
@@ -275,10 +279,12 @@ class SlopePipeline:
         """Compute the slopes, and the stages where asked for."""
         frames = kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
-        results = SlopeArrays(*(np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES))
+        results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
         prepared = self.preparation.prepared
-        rows = STAGE_ROWS if explain or isinstance(prepared, PythonPrepared) else 0
-        stages = np.empty((rows, n_frames, n, self.layout.pixels), np.float32)
+        in_python = isinstance(prepared, PythonPrepared)
+        stages = _NO_STAGES
+        if explain or in_python:
+            stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
         if self.on_device is not None and not explain:
@@ -293,14 +299,14 @@ class SlopePipeline:
 
         n_groups = n_frames * -(-n // self._lanes.width)
         own_scratch = self.preparation.own_scratch
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch)
-        if isinstance(prepared, PythonPrepared):
+        cost = self.preparation.estimator.cost
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
+        if in_python:
             images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
                 prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
-        shaped: Any = (result.reshape(*array.shape[:-2], n) for result in results)
-        return Slopes(*shaped), stages
+        return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
         """Return what kernels read of frames.
@@ -328,13 +334,15 @@ class SlopePipeline:
             light_kernel(source, start, stop, scratch, light)
 
         n_groups = n_frames * -(-n // self._lanes.width)
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads)
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_LIGHT_COST)
         return self.preparation.variants(light.mean(axis=1, dtype=np.float64))
 
 
 def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
     """Return frames as kernels read them: (n, h, w), contiguous, uint16 or float32."""
-    dtype = np.uint16 if array.dtype in (np.uint8, np.uint16) else np.float32
+    if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
+        return array if array.ndim == 3 else array[None]
+    dtype = np.uint16 if array.dtype == np.uint8 else np.float32
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
         frames = np.ascontiguousarray(array, dtype=dtype)
     return frames.reshape(-1, *array.shape[-2:])

@@ -121,7 +121,7 @@ class Preparation:
         return self._direct(self.prepared.light_kernel, frames)
 
     def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
-        key = kernel, frames.dtype.str
+        key = kernel, frames.dtype.char
         if key not in self._kernels:
             self._kernels[key] = Direct(kernel)
         return self._kernels[key]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from faintspot.sensor.layout import Layout
 
-RESULT_TYPES = (np.float32, np.float32, np.float32, np.uint8, np.int32, np.int32, np.float32, np.float32)
+RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4")))
 
 
 @dataclass(frozen=True)

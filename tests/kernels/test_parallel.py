@@ -20,7 +20,7 @@ def test_every_group_once(n_groups: int, threads: int | None) -> None:
             done[start:stop] += 1
             names.add(threading.current_thread().name)
 
-    run_groups(job, n_groups, lanes_for(np.float32, 4), (4, 5), threads)
+    run_groups(job, n_groups, lanes_for(np.float32, 4), (4, 5), threads, cost=100.0)
     assert np.all(done == 1)
     assert len(names) <= (threads or available_cpus())
 
@@ -31,7 +31,22 @@ def test_errors_come_out() -> None:
 
     for threads in (1, 2):
         with pytest.raises(RuntimeError, match="broken"):
-            run_groups(job, 100, lanes_for(np.float32, 4), (4, 4), threads)
+            run_groups(job, 100, lanes_for(np.float32, 4), (4, 4), threads, cost=100.0)
+
+
+@pytest.mark.parametrize(
+    ("n_groups", "side", "cost", "shares"),
+    [(76, 8, 0.2, 1), (290, 8, 0.2, 5), (76, 16, 0.7, 8), (3, 32, 100.0, 3), (1, 32, 100.0, 1)],
+)
+def test_threads_are_woken_for_enough_work_only(n_groups: int, side: int, cost: float, shares: int) -> None:
+    """Groups of 16 sub-apertures; at least 50 us for each of up to 8 threads."""
+    starts: list[int] = []
+
+    def job(start: int, stop: int, scratch: Any) -> None:
+        starts.append(start)
+
+    run_groups(job, n_groups, lanes_for(np.float32, 16), (side, side), 8, cost=cost)
+    assert len(starts) == shares
 
 
 def test_scratch_is_of_each_thread_and_fits_the_window() -> None:
@@ -42,7 +57,7 @@ def test_scratch_is_of_each_thread_and_fits_the_window() -> None:
         used[start] = scratch
         barrier.wait(timeout=30)  # both at once, hence on two threads
 
-    run_groups(job, 100, lanes_for(np.float32, 4), (6, 5), 2)
+    run_groups(job, 100, lanes_for(np.float32, 4), (6, 5), 2, cost=100.0)
     first, second = used.values()
     # One vector more than pixels: reading a pixel's right neighbour never leaves the memory.
     assert first.image.size == second.image.size == (6 * 5 + 1) * 4

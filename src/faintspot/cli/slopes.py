@@ -140,7 +140,7 @@ def describe(summary: Summary, output: str) -> list[str]:
         SubapertureFlag.TOO_MANY_BAD_PIXELS: "with too many bad pixels",
         SubapertureFlag.BAD_PIXELS: "with a few bad pixels, filled from their neighbours",
         SubapertureFlag.SATURATED: "with saturated pixels",
-        SubapertureFlag.INFEASIBLE_STRENGTH: "whose strength (noise_std) was too strong for the image and was lowered",
+        SubapertureFlag.INFEASIBLE_STRENGTH: "whose noise_std was too strong for the image and was lowered",
         SubapertureFlag.NOT_CONVERGED: "at the iteration limit (max_iterations)",
         SubapertureFlag.OUTLIER_LIKELY: "so faint that outliers are to be expected",
         SubapertureFlag.AT_SEARCH_LIMIT: "at the limit of the search range (search_range_px)",

@@ -32,7 +32,7 @@ class Denoised(NamedTuple):
     converged: NDArray[np.bool_]
     """Whether the tolerance was reached (true where no iteration was needed)."""
     infeasible: NDArray[np.bool_]
-    """Whether the strength is too strong for the image, which is then its mean; or the strength was lowered."""
+    """Whether the strength is too strong: the image is its mean then, or the strength was lowered."""
 
 
 @overload
@@ -102,8 +102,8 @@ def tv_denoise(
         "fast": begin at the dual field of a flat solution, which is what near the image's own rms takes so
         many iterations from zero; make 8 iterations and no test (other numbers may be given).
     lower_strength : bool
-        Lower a strength that is too strong for an image, above 0.9 of the image's own rms, to 0.6 of that rms,
-        as `SlopePipeline` does: next to rms, too little of a spot is left.
+        Lower a strength that is too strong for an image, above 0.9 of the image's own rms, to 0.6 of it, as
+        `SlopePipeline` does: nearer the rms, too little of a spot is left.
     full_output : bool
         Return a `Denoised`: the images and, for each, iterations, multiplier, converged and infeasible.
 
@@ -112,8 +112,8 @@ def tv_denoise(
     ndarray or Denoised
         u, of the shape of `images`. The constraint holds to rounding error after any number of iterations.
         A constant image and noise_std = 0 return the image itself; where ``rms(g - mean(g)) <= noise_std``
-        no u obeys the constraint with less variation than the constant mean(g), which is returned unless strengths are
-        lowered.
+        no u obeys the constraint with less variation than the constant mean(g), which is returned unless
+        strengths are lowered.
 
     Raises
     ------

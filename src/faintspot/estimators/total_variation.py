@@ -38,7 +38,7 @@ class TotalVariation(KeepingBrightest):
         None,
         'Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from '
         "read noise, light and spot, by `faintspot.estimate.automatic.automatic_strength`. 0: not denoised. "
-        "Lowered where it is too strong for an image: above 0.9 of the image's own rms it becomes 0.6 of that.",
+        "Lowered where it is too strong for an image: above 0.9 of the image's own rms it becomes 0.6 of it.",
         unit="e-",
         low=0.0,
         automatic=True,

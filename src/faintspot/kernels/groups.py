@@ -19,6 +19,7 @@ from faintspot.kernels.compiling import compiled, compiled_with
 from faintspot.kernels.gather import calibrate, fill_bad_pixels, gather_raw, scatter_image
 from faintspot.kernels.host import aligned_zeros
 from faintspot.kernels.simd import Lanes, load, maximum, select, splat, store, width_of
+from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
@@ -253,6 +254,7 @@ def measure_groups(
     width = width_of(lanes)
     n = source.corners.shape[0]
     n_groups = (n + width - 1) // width
+    control = flush_subnormals()
     for item in range(start, stop):
         f, first = item // n_groups, item % n_groups * width
         settings = task.settings[task.variants[f]]
@@ -263,6 +265,7 @@ def measure_groups(
         group = Group(lanes, source.ny, source.nx, f, first, settings, predicted)
         locate(group, task.tables, scratch, stages)
         _store_group(width, n, group, scratch, slopes)
+    restore_control(control)
 
 
 @cache

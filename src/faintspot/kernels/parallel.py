@@ -13,7 +13,8 @@ from faintspot.kernels.gravity import gravity_scratch
 from faintspot.kernels.groups import Scratch, new_scratch
 from faintspot.kernels.simd import Lanes
 
-_FEWEST_GROUPS = 16  # a thread with less to do costs more than it saves
+_FEWEST_US = 50.0  # of work for a thread: waking one takes about 30 us
+_US_OF_COST = 1.2  # that a sub-aperture of 16 x 16 px takes whose `cost` is 1
 _REMEMBERED = 2
 _local = threading.local()
 
@@ -54,10 +55,20 @@ def run_groups(
     window: tuple[int, int],
     threads: int | None = None,
     own_scratch: OwnScratch = gravity_scratch,
+    cost: float = 1.0,
 ) -> None:
-    """Call `job(start, stop, scratch)` so that every group is done once, on up to `threads` threads."""
+    """Call `job(start, stop, scratch)` so that every group is done once, on up to `threads` threads.
+
+    `cost`: of a sub-aperture, as `Estimator.cost`. Threads that would have too little to do are not woken.
+    """
+    ny, nx = window
+    work_us = n_groups * lanes.width * cost * _US_OF_COST * ny * nx / 256
+    most = min(int(work_us / _FEWEST_US), n_groups)
+    if most < 2 or threads == 1:
+        job(0, n_groups, _thread_scratch(lanes, window, own_scratch))
+        return
     wanted = available_cpus() if threads is None else threads
-    shares = max(1, min(wanted, n_groups // _FEWEST_GROUPS))
+    shares = min(wanted, most)
 
     def work(share: int) -> None:
         start, stop = n_groups * share // shares, n_groups * (share + 1) // shares

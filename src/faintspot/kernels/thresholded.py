@@ -28,6 +28,7 @@ from faintspot.kernels.simd import (
     widened,
     width_of,
 )
+from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 _WITHIN = 1.0 / 12.0  # of the light in a pixel, where in it is not known: px^2
 
@@ -53,6 +54,7 @@ def thresholded_in_rows(
     width = width_of(source.lanes)
     n = source.corners.shape[0]
     n_groups = (n + width - 1) // width
+    control = flush_subnormals()
     for item in range(start, stop):
         f, group = item // n_groups, item % n_groups
         first, last = group * width, min((group + 1) * width, n)
@@ -66,6 +68,7 @@ def thresholded_in_rows(
         gravity_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
         for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
             _measure(source, task.tables, f, s, settings, slopes)
+    restore_control(control)
 
 
 @compiled

@@ -14,7 +14,7 @@ FLAG_MEANINGS = {
     SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
     SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
-    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std was too strong for the image (above 0.9 of its rms) and was lowered.",
+    SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std was above 0.9 of the image's rms, and was lowered.",
     SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
     SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
     SubapertureFlag.AT_SEARCH_LIMIT: "The slope ends at search_range_px: the spot may be beyond.",
@@ -36,8 +36,8 @@ _ADVICE = {
     ),
     SubapertureFlag.INFEASIBLE_STRENGTH: (
         _OFTEN_INFEASIBLE,
-        "were hardly less noisy on paper (noise_std) than their whole images, so that noise_std was lowered there",
-        'lower noise_std, or set it to "auto"; where the star is that faint, compare with estimator "brightest"',
+        "had images hardly noisier than noise_std says the noise is, so that it was lowered there",
+        'lower noise_std or set it to "auto"; compare with estimator "brightest"',
     ),
     SubapertureFlag.NOT_CONVERGED: (
         0.10,
@@ -109,6 +109,6 @@ def _no_light(arm: MeasuredSlopes) -> list[str]:
     if fraction <= 0.01:
         return []
     return [
-        f"{percentage(fraction)} of the measurements had no light. Next: check that the windows lie on the spots "
-        "(faintspot layout draws them) and that the dark is right."
+        f"{percentage(fraction)} of the measurements had no light. Next: check that the windows lie on the "
+        "spots (faintspot layout draws them) and that the dark is right."
     ]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,11 @@ _MAPS = ("dark", "flat", "bad_pixels")
 # What the kernels square in float32, with a wide margin; no camera comes near.
 _GAINS = 1e-9, 1e9
 _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
+
+
+@cache  # asked in every frame
+def _largest(dtype: np.dtype[Any]) -> float:
+    return float(np.iinfo(dtype).max)
 
 
 @dataclass(frozen=True)
@@ -189,7 +196,7 @@ class Calibration:
         if self.saturation_adu is not None:
             return self.saturation_adu
         # Not infinity: an infinite pixel would reach it.
-        return float(np.iinfo(dtype).max) if dtype.kind in "iu" else np.nan
+        return _largest(dtype) if dtype.kind in "iu" else math.nan
 
     def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
         if self.bad_pixels.dtype == np.bool_:
