@@ -110,7 +110,7 @@ def _table(shape: tuple[int, int]) -> Table:
         rng=np.random.default_rng(2),
     )
     frame, n = frames[0], len(layout)
-    cases = pipelines(layout, fs.Calibration(read_noise_e=READ_NOISE_E))
+    cases = pipelines(layout, fs.Calibration(dark=0.0, read_noise_e=READ_NOISE_E))
     candidates: dict[str, Candidate] = {name: partial(pipeline, frame) for name, pipeline in cases.items()}
     times = interleaved(candidates | {"gather": _gather(layout, frame)}, seconds=12.0)
     rows = [_row(name, n, times) for name in cases]

@@ -83,3 +83,18 @@ def test_slopes_that_are_damaged(tmp_path: Path) -> None:
         read_reference(tmp_path / "a.zarr")
     with pytest.raises(InputError, match="no such file"):
         read_reference(tmp_path / "b.zarr")
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "a\0b:frames"])
+def test_names_that_no_file_can_have(name: str) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_reference(name)
+
+
+def test_a_damaged_archive(tmp_path: Path) -> None:
+    path = tmp_path / "flat.npz"
+    write(path, result())
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"PK\x01\x02", b"PK\x01\x03"))  # the list of what is in it
+    with pytest.raises(InputError, match=r"flat\.npz"):
+        read_reference(path)

@@ -156,6 +156,35 @@ def test_what_is_not_telemetry_is_refused(store: TelemetryStore, tmp_path: Path)
         read_telemetry(store.path)
 
 
+def test_damage_is_said_and_never_read_as_other_telemetry(store: TelemetryStore) -> None:
+    """One wrong bit in any chunk, or a chunk that is lost, also one that holds zeros only."""
+    chunks = sorted(file for file in store.path.rglob("*") if file.is_file() and file.suffix != ".json")
+    assert {file.relative_to(store.path).parts[0] for file in chunks} >= {"x", "flags", "iterations", "raw"}
+    for chunk in chunks:
+        content = chunk.read_bytes()
+        for place in (0, len(content) // 2, len(content) - 1):
+            chunk.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+            with pytest.raises(InputError, match="the store is damaged"):
+                read_telemetry(store.path)
+        chunk.unlink()
+        with pytest.raises(InputError, match="is lost"):
+            read_telemetry(store.path)
+        chunk.write_bytes(content)
+    assert len(read_telemetry(store.path).frame) == 15
+
+
+def test_telemetry_without_checksums_is_read(store: TelemetryStore) -> None:
+    """As version 0.1 wrote it: without codecs for that, and without chunks of zeros."""
+    import zarr
+
+    group: Any = zarr.open_group(str(store.path), mode="r+")
+    values = group["flags"][:]
+    del group["flags"]
+    group.create_array("flags", shape=values.shape, chunks=values.shape, dtype=values.dtype)[:] = 0 * values
+    assert not list((store.path / "flags").glob("c/*"))
+    assert not read_telemetry(store.path).flags.any()
+
+
 def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> None:
     aotpy = pytest.importorskip("aotpy")
     telemetry = read_telemetry(store.path)

@@ -45,12 +45,20 @@ def split_location(location: str | Path) -> tuple[Path, str | None]:
         When there is no such file or directory.
     """
     whole = Path(location)
-    if whole.exists():
+    if _exists(whole):
         return whole, None
     before, separator, key = str(location).rpartition(":")
-    if separator and key and before and Path(before).exists():
+    if separator and key and before and _exists(Path(before)):
         return Path(before), key
     raise InputError(f"{location}: no such file or directory")
+
+
+def _exists(path: Path) -> bool:
+    """Say whether there is such a file; there is none whose name no file can have."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # too long, or with a character that names do not have
+        return False
 
 
 def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> str:

@@ -79,10 +79,11 @@ class Npz(FileFormat):
 
     def has_slopes(self, path: Path) -> bool:
         """Tell by the names of the arrays."""
-        if not zipfile.is_zipfile(path):
-            return False
-        with zipfile.ZipFile(path) as archive:
-            return {f"{name}.npy" for name in (*REQUIRED, "attributes")} <= set(archive.namelist())
+        try:
+            with zipfile.ZipFile(path) as archive:
+                return {f"{name}.npy" for name in (*REQUIRED, "attributes")} <= set(archive.namelist())
+        except DAMAGE:
+            return False  # whoever reads it says what is wrong with it
 
 
 def _find_npy(path: Path, key: str | None) -> StoredArray:

@@ -24,7 +24,13 @@ from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, unit_of, with_absent
 from faintspot.io.slopes_writer import Begun
-from faintspot.io.zarr_store import is_store, replace_attributes
+from faintspot.io.zarr_store import (
+    checked_codecs,
+    chunk_files,
+    is_store,
+    read_items,
+    replace_attributes,
+)
 
 zarr = load_zarr()
 _MARK = "finished_frames"
@@ -118,7 +124,7 @@ class StoreStorage:
         for name, values in arrays.items():
             array = self._arrays[name]
             array[start : start + len(values)] = values
-            self._not_synchronised.update(_chunk_files(self.place, array, start, start + len(values)))
+            self._not_synchronised.update(chunk_files(self.place, array, start, start + len(values)))
 
     def finish(self) -> None:
         """The mark says it all."""
@@ -169,6 +175,12 @@ def read_store(path: Path) -> StoredSlopes:
     )
 
 
+def _read(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
+    """Return items of an array."""
+    # Versions without checksums wrote no chunk that is all fill value; NaN, that of floats, no slope ever is.
+    return read_items(path, array, start, stop, whole=array.dtype.kind == "f")
+
+
 def _create_arrays(path: Path, run: Run) -> None:
     attributes = {
         **run.attributes,
@@ -179,7 +191,6 @@ def _create_arrays(path: Path, run: Run) -> None:
         _COORDINATES: " ".join(run.coordinates),
     }
     group = zarr.create_group(str(path), zarr_format=3, attributes=attributes)
-    codecs = (zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec())
     chunk = min(run.n_frames, max(1, _CHUNK_NUMBERS // run.n_subapertures))
     for name, variable in VARIABLES.items():
         group.create_array(
@@ -187,7 +198,7 @@ def _create_arrays(path: Path, run: Run) -> None:
             shape=(run.n_frames, run.n_subapertures),
             chunks=(chunk, run.n_subapertures),
             dtype=variable.dtype,
-            compressors=codecs,
+            compressors=checked_codecs(),
             chunk_key_encoding=_CHUNK_NAMES,
             fill_value=np.nan if variable.dtype == "float32" else 0,
             dimension_names=("frame", "subaperture"),
@@ -198,7 +209,7 @@ def _create_arrays(path: Path, run: Run) -> None:
             name,
             shape=values.shape,
             dtype=values.dtype,
-            compressors=codecs,
+            compressors=checked_codecs(),
             chunk_key_encoding=_CHUNK_NAMES,
             dimension_names=("subaperture",),
             attributes={"units": COORDINATE_UNITS[name]} if name in COORDINATE_UNITS else {},
@@ -213,30 +224,3 @@ def _stored_attributes(path: Path) -> dict[str, Any]:
     for name in (_MARK, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
         attributes[name]
     return attributes
-
-
-def _read(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
-    """Return items of an array, or say that some are lost: to Zarr, a lost chunk is its fill value."""
-    # Versions without checksums wrote no chunk that is all fill value; NaN, that of floats, no slope ever is.
-    has_all_chunks = any(isinstance(codec, zarr.codecs.Crc32cCodec) for codec in array.compressors)
-    if has_all_chunks or array.dtype.kind == "f":
-        for number, file in enumerate(_chunk_files(path, array, start, stop), start // array.chunks[0]):
-            if not file.is_file():
-                raise InputError(
-                    f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
-                    "(counted from 0) and later is lost"
-                )
-    try:
-        return np.asarray(array[start:stop])
-    except Exception as error:  # a broken chunk makes each codec raise its own kind
-        raise InputError(
-            f"{path}: the store is damaged: {array.basename} cannot be read ({one_line(error)})"
-        ) from None
-
-
-def _chunk_files(path: Path, array: Any, start: int, stop: int) -> list[Path]:
-    """Return the files of the chunks that hold items `start` to `stop`; a chunk spans all later axes."""
-    length = array.chunks[0]
-    rest = (0,) * (array.ndim - 1)
-    numbers = range(start // length, -(-stop // length))
-    return [path / array.basename / array.metadata.encode_chunk_key((number, *rest)) for number in numbers]

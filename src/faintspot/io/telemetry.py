@@ -1,7 +1,8 @@
 """Telemetry in a Zarr store (format 3) that grows while the engine runs, and reading it back.
 
-Whatever is written goes to the end of the arrays; then the counters in the group's attributes are replaced.
-However the recording ends, the store is valid and the counters include only what is whole.
+Whatever is written goes to the end of the arrays, in chunks with checksums (crc32c); then the counters in the
+group's attributes are replaced. However the recording ends, the store is valid and the counters include only
+what is whole.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.io.zarr_store import TELEMETRY, is_store, replace_attributes
+from faintspot.io.zarr_store import TELEMETRY, checked_codecs, is_store, read_items, replace_attributes
 
 zarr = load_zarr()
 FORMAT = TELEMETRY
@@ -154,7 +155,9 @@ class TelemetryStore:
         with output_errors(self.path):
             _create(self.path, (record_type, image_type), {**attributes, **counters})
         group: Any = zarr.open_group(str(self.path), mode="r+")
-        self._arrays: dict[str, Any] = dict(group.arrays())
+        # A chunk of zeros is written like any other: one that is not there has been lost.
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            self._arrays: dict[str, Any] = dict(group.arrays())
 
     def append(self, records: NDArray[Any], images: NDArray[Any], attributes: Mapping[str, Any]) -> None:
         """Add records and images and replace attributes; when it returns, they are in the store.
@@ -217,8 +220,13 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
         arrays = {}
         for name in _ARRAYS:
             array = group[name]
-            arrays[name] = np.asarray(array[: finished[_dimensions(name, array.ndim)[0]]])
+            count = finished[_dimensions(name, array.ndim)[0]]
+            if count > array.shape[0]:
+                raise ValueError(f"{name}: expected {count}, found {array.shape[0]}")
+            arrays[name] = read_items(store, array, 0, count, whole=False)
         changes = attributes.pop("changes")
+    except InputError:
+        raise
     except Exception as error:  # a broken store makes zarr raise many things
         raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
     return Telemetry(**arrays, changes=changes, attributes=attributes)
@@ -242,6 +250,7 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
                 shape=(0, *row),
                 chunks=(max(1, length), *row),
                 dtype=values.dtype,
+                compressors=checked_codecs(),
                 dimension_names=_dimensions(name, values.ndim),
                 attributes={"units": _UNITS.get(name, "1")},
             )
