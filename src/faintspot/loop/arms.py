@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.checks import number_between
+from faintspot.checks import number_between, one_of
 from faintspot.compare.arms import score_for_scene
+from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, MODAL
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.registry import estimator_named, estimators
@@ -26,10 +27,13 @@ Choice = Mapping[str, Any]
 """Values of what is tuned, by name: `LOOP_GAIN` and options of the estimator."""
 
 LOOP_GAIN = "loop_gain"
+NOISE_SCALE = "noise_scale"
+_NOISE_SCALES = (0.35, 0.6, 1.0)
+_FIRST_NOISE_SCALES = (0.6,)
 _LOOP_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _FIRST_LOOP_GAINS = (0.2, 0.4, 0.7)
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
-_PRIOR = "prior_std_px"
+PRIOR = "prior_std_px"
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
 _STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
 _FEWEST_TO_WIDEN = 4
@@ -58,13 +62,18 @@ class LoopArm:
         Whether slopes are divided by the centroid gain measured at the run's flux.
     true_slopes : bool
         Whether slopes are the wavefront's true mean gradients instead of measured ones.
+    control : str
+        What makes commands of the slopes, see `faintspot.control.learning.CONTROLS`. All but the integrator
+        learn from telemetry of a loop with the integrator, on other air.
+    noise_scale : float
+        What control multiplies the variance of the slopes' noise by that telemetry shows.
     psf, score : PSF, Score, optional
         For the estimators that need them. Default PSF: that of a flat wavefront.
 
     Raises
     ------
     InputError
-        For an empty label, a gain or window out of range.
+        For an empty label, an unknown control, a gain, window or scale out of range.
     """
 
     label: str
@@ -75,6 +84,8 @@ class LoopArm:
     predict_prior: bool = False
     correct_gain: bool = True
     true_slopes: bool = False
+    control: str = INTEGRATOR
+    noise_scale: float = 1.0
     psf: PSF | None = None
     score: Score | None = None
 
@@ -87,6 +98,8 @@ class LoopArm:
             number_between("arm.gain", self.gain, 0, 2)
         if self.window_pixels is not None:
             number_between("arm.window_pixels", self.window_pixels, 2, 64, integer=True)
+        one_of("arm.control", self.control, list(CONTROLS))
+        number_between("arm.noise_scale", self.noise_scale, 0, 100, low_open=True)
 
 
 Arm = LoopArm
@@ -129,6 +142,8 @@ VARIANTS = {
 }
 """By what follows the estimator's name in that of an arm: "map_predicted_weighted"."""
 _PREDICTED = "_predicted"
+CONTROL_SIGN = "+"
+"""Between an arm's slopes and its control: "map+kalman"."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +153,15 @@ class ArmKind:
     estimator: type[Estimator]
     variants: tuple[str, ...] = ()
     """Of `VARIANTS`, in their order there."""
+    control: str = INTEGRATOR
 
     @property
     def name(self) -> str:
         """What command lines and results call it."""
-        return "".join([self.estimator.name, *self.variants])
+        # The Kalman filter always predicts.
+        variants = [each for each in self.variants if each != _PREDICTED or self.control != KALMAN]
+        slopes = "".join([self.estimator.name, *variants])
+        return slopes if self.control == INTEGRATOR else f"{slopes}{CONTROL_SIGN}{self.control}"
 
     @property
     def is_predicted(self) -> bool:
@@ -152,7 +171,8 @@ class ArmKind:
     @property
     def label(self) -> str:
         """What reports call it."""
-        return ", ".join([self.estimator.label, *(VARIANTS[name].label for name in self.variants)])
+        parts = [self.estimator.label, *(VARIANTS[name].label for name in self.variants)]
+        return ", ".join(parts if self.control == INTEGRATOR else [*parts, CONTROLS[self.control]])
 
     def tuned(self, configuration: LoopConfiguration) -> dict[str, Tunable]:
         """Return what is tuned for a configuration's light: the loop gain and options of the estimator."""
@@ -162,10 +182,14 @@ class ArmKind:
             name: _wider(values, declared[name])
             for name, values in estimator.tuned(configuration.scene).items()
         }
-        if _PRIOR in declared:
+        if PRIOR in declared:
             reach = configuration.position_range_px(predicted=_PREDICTED in self.variants)
-            options[_PRIOR] = [part * reach for part in _PRIORS]
+            options[PRIOR] = [part * reach for part in _PRIORS]
+        if self.control == KALMAN:
+            options.pop(PRIOR, None)  # the filter knows it
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
+        if self.control not in (INTEGRATOR, MODAL):
+            tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
         for number, (name, values) in enumerate(options.items()):
             tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
         return tuned
@@ -184,13 +208,16 @@ class ArmKind:
         for name in self.tuned(configuration):
             if name not in choice:
                 raise InputError(f"choice: expected a value for {name!r} of the arm {self.name!r}")
-        options = {name: value for name, value in choice.items() if name != LOOP_GAIN}
+        of_loop = (LOOP_GAIN, NOISE_SCALE)
+        options = {name: value for name, value in choice.items() if name not in of_loop}
         estimator = self._untuned(configuration).replaced(options)
         changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
         return LoopArm(
             self.label,
             Settings(estimator),
             float(choice[LOOP_GAIN]),
+            control=self.control,
+            noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
             psf=_flat_psf(configuration) if Need.PSF in estimator.required else None,
             score=_trained_score(configuration) if Need.SCORE in estimator.required else None,
             **changes,
@@ -202,14 +229,18 @@ class ArmKind:
 
 
 def arm_kind(name: str) -> ArmKind:
-    """Return an arm by its name: that of an estimator and of variants, as "ml_weighted".
+    """Return an arm by its name: that of an estimator, of variants and of control, as "ml_weighted+polc".
+
+    With the Kalman filter, estimators that take a prior are given its prediction.
 
     Raises
     ------
     InputError
-        For an unknown estimator, or a prediction for one that takes none.
+        For an unknown estimator or control, or a prediction for one that takes none.
     """
-    base, variants = name, set()
+    slopes, _, control = name.partition(CONTROL_SIGN)
+    control = one_of("control of the arm", control or INTEGRATOR, list(CONTROLS))
+    base, variants = slopes, set()
     while base not in estimators():
         ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
         if ending is None:
@@ -223,7 +254,9 @@ def arm_kind(name: str) -> ArmKind:
         raise InputError(f"arm{text}; after it may follow {', '.join(VARIANTS)}") from None
     if _PREDICTED in variants and not estimator.takes_prior:
         raise InputError(f"arm = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
-    return ArmKind(estimator, tuple(variant for variant in VARIANTS if variant in variants))
+    if control == KALMAN and estimator.takes_prior:
+        variants.add(_PREDICTED)
+    return ArmKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
 
 
 def default_arms(configuration: LoopConfiguration) -> list[str]:

@@ -125,6 +125,12 @@ class Control:
     """"closed", or "open": the sensor does not see the mirror."""
     largest_condition: float = number(30.0, 1.0, 1e6)
     """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
+    telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
+    """Closed loop with an integrator that other kinds of control learn from, on air that is not scored."""
+    told_wind_factor: float = number(1.0, 0.0, 100.0)
+    """Winds that control is told, as a multiple of the true ones."""
+    told_wind_turn_deg: float = number(0.0, -360.0, 360.0)
+    """Angle by which the winds that control is told are turned."""
 
 
 @dataclass(frozen=True)

@@ -1,130 +1,196 @@
-"""Control: from slopes to commands, and when they act."""
+"""The controller of an arm: the integrator, or one that has learnt from telemetry of the loop."""
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from faintspot.checks import finite_array, number_between
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
+from faintspot.control.integrator import Integrator
+from faintspot.control.learning import INTEGRATOR, Learnt, Plant, learn
+from faintspot.control.telemetry import Telemetry, make_telemetry
+from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
-from faintspot.loop.configuration import CLOSED, Control
+from faintspot.loop.arms import PRIOR, LoopArm
+from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
+from faintspot.loop.record import LoopRecord
+
+if TYPE_CHECKING:
+    from faintspot.loop.simulation import LoopOptics
 
 Floats = NDArray[np.float64]
 
-_RIDGE = 3e-2  # of the mean square of the driven combinations' slopes: weak ones move less, noise does too
+FIRST_TELEMETRY_REALISATION = 2000
+"""The realisation of the air that control learns from; never scored, nor tuned on."""
+
+_TELEMETRY_PRIOR_PX = 0.6  # while telemetry is taken, as nothing is known yet
+_SETTLE_FRAMES = 50
 
 
-@dataclass(frozen=True, eq=False)
-class Reconstructor:
-    """From slopes to the commands that cause them, on the combinations of actuators that slopes can see."""
-
-    matrix: Floats
-    """(commands, 2 n): regularised least squares, all slopes counting alike."""
-    modes: Floats
-    """(commands, modes): combinations that are driven, orthonormal."""
-    slopes_of_modes: Floats
-    """(2 n, modes)"""
-
-    def __call__(self, slopes: Floats) -> Floats:
-        """Return the commands, in the interaction matrix's unit."""
-        return self.matrix @ slopes
-
-    def weighted(self, slopes: Floats, standard_error: Floats) -> Floats:
-        """Return the commands from slopes that count by the inverse of their variance; infinite: not at all.
-
-        Regularised like `matrix`, which it is where all errors are the same.
-        """
-        variance = np.square(np.where(np.isfinite(standard_error), standard_error, np.inf))
-        usable = np.isfinite(variance) & (variance > 0)
-        if not usable.any():
-            return np.zeros(len(self.modes))
-        weight = np.where(usable, 1 / np.where(usable, variance, 1.0), 0.0)
-        weight /= weight.mean()  # as many slopes as without weights
-        return self.modes @ (_estimator(self.slopes_of_modes, weight) @ slopes)
+def make_controller(
+    configuration: LoopConfiguration,
+    optics: LoopOptics,
+    arm: LoopArm,
+    learnt: Learnt | None,
+    line: CommandLine,
+) -> Controller:
+    """Return the controller of an arm, which sends its commands along `line`."""
+    if learnt is not None:
+        return learnt.controller(line, prior_std_px(arm, len(optics.interaction)))
+    control = configuration.control
+    return Integrator(
+        line,
+        optics.interaction,
+        optics.reconstructor,
+        control.gain if arm.gain is None else arm.gain,
+        control.leak,
+        weighted=arm.weighted_reconstructor and not arm.true_slopes,
+        sees_mirror=control.mode == CLOSED,
+    )
 
 
-def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) -> Reconstructor:
-    """Return the reconstructor of an interaction matrix, by truncated and damped singular values.
+def learnt_control(
+    configuration: LoopConfiguration, arm: LoopArm, seed: int, learns_on: LoopConfiguration | None = None
+) -> tuple[LoopArm, Learnt | None]:
+    """Return what the control of an arm has learnt, None: it need not; and the arm with what follows.
+
+    The prior of an estimator that has one becomes as wide as the control is sure.
 
     Parameters
     ----------
-    interaction : (2 n, commands) array
-        Slopes for a unit of each command.
-    largest_condition : float
-        Combinations whose slopes are smaller than the largest's by more than this are not driven: piston,
-        what looks like waffle, and what tip-tilt mirror and actuators could do against each other.
+    configuration : LoopConfiguration
+    arm : LoopArm
+    seed : int
+    learns_on : LoopConfiguration, optional
+        Of the loop that telemetry is taken from. Default: the same.
 
     Raises
     ------
     InputError
-        When there are more commands than slopes, or no command moves a slope.
+        For control that learns, in open loop.
     """
-    matrix: Floats = finite_array("interaction", interaction).astype(np.float64)
-    if matrix.ndim != 2:
-        raise InputError(f"interaction: expected shape (2 n, commands), got {matrix.shape}")
-    slopes, commands = matrix.shape
-    check_controllable(commands, slopes)
-    limit = number_between("largest_condition", largest_condition, 1)
-    left, size, right = np.linalg.svd(matrix, full_matrices=False)
-    if size[0] == 0:
-        raise InputError("interaction: expected slopes that follow the commands, got zeros only")
-    driven = size * limit >= size[0]
-    modes, seen = right[driven].T, left[:, driven] * size[driven]
-    return Reconstructor(modes @ _estimator(seen, np.ones(slopes)), modes, seen)
+    if arm.control == INTEGRATOR:
+        return arm, None
+    if configuration.control.mode != CLOSED:
+        raise InputError(f"arm.control = {arm.control!r}: expected {INTEGRATOR!r} in open loop")
+    on = configuration if learns_on is None else learns_on
+    learnt = _learnt(replace(on, name="-", run=Run()), _Known.of(arm), arm.control, arm.noise_scale, seed)
+    if learnt.expected_std_px is not None and _has_prior(arm):
+        std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
+        arm = _with_prior(arm, std)
+    return arm, learnt
 
 
-def _estimator(slopes_of_modes: Floats, weight: Floats) -> Floats:
-    """Return (modes, 2 n): modes from slopes, by weighted least squares with a ridge."""
-    weighted = slopes_of_modes.T * weight
-    normal = weighted @ slopes_of_modes
-    normal[np.diag_indices_from(normal)] += _RIDGE * np.trace(normal) / len(normal)
-    return np.asarray(np.linalg.solve(normal, weighted))
+def prior_std_px(arm: LoopArm, slopes: int) -> Floats | None:
+    """Return the prior of the arm's estimator around what control predicts, (2 n,), or None."""
+    if not _has_prior(arm):
+        return None
+    each = np.broadcast_to(getattr(arm.settings, PRIOR), (slopes // 2,))
+    return np.tile(each, 2).astype(np.float64)
 
 
-def check_controllable(commands: int, slopes: int) -> None:
-    """Raise InputError when there are more commands than slopes."""
-    if commands > slopes:
-        raise InputError(
-            f"mirror.actuators: {commands} commands (actuators, tip and tilt) are more than {slopes} slopes "
-            "of the lit sub-apertures can control"
-        )
+def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
+    """Return what theory knows of the slopes of sub-apertures, with the winds that control is told."""
+    air, control = configuration.atmosphere, configuration.control
+    angle = np.deg2rad(air.wind_direction_deg)
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    return SlopeTurbulence(
+        cells[:, ::-1].astype(np.float64) * configuration.subaperture_m,
+        configuration.subaperture_m,
+        configuration.pixel_scale_rad,
+        float(np.mean(air.r0_m)),
+        air.outer_scale_m,
+        np.array(air.fraction),
+        np.array(air.wind_speed_m_per_s, np.float64)[:, None] * around,
+    ).turned(control.told_wind_factor, control.told_wind_turn_deg)
 
 
-class Integrator:
-    """An integrator with a delay; it holds what the mirror does now and what is on its way.
+@dataclass(frozen=True)
+class _Known:
+    """An arm, equal to others that would leave the same telemetry."""
 
-    Parameters
-    ----------
-    control : Control
-    commands : int
-    """
+    arm: LoopArm = field(compare=False)
+    same: tuple[Any, ...]
 
-    def __init__(self, control: Control, commands: int) -> None:
-        self._control = control
-        self._latest = np.zeros(commands)
-        self._underway = deque([np.zeros(commands)] * control.delay_frames)
+    @classmethod
+    def of(cls, arm: LoopArm) -> _Known:
+        from faintspot.configuration import to_text
 
-    @property
-    def acting(self) -> Floats:
-        """What the mirror holds during this frame."""
-        return self._underway[0]
+        plain = replace(arm, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
+        if _has_prior(arm):
+            plain = _with_prior(plain, _TELEMETRY_PRIOR_PX)
+        values = {
+            **vars(plain),
+            "settings": to_text(plain.settings),
+            "psf": id(arm.psf),
+            "score": id(arm.score),
+        }
+        return cls(plain, tuple(values.items()))
 
-    @property
-    def latest(self) -> Floats:
-        """The last command computed, which still may be on its way."""
-        return self._latest
 
-    def expected(self) -> Floats:
-        """Return commands whose slopes this frame should have, if the latest command is right for it."""
-        return self.acting - self._latest if self._control.mode == CLOSED else -self._latest
+@lru_cache(maxsize=8)
+def _learnt(
+    configuration: LoopConfiguration, known: _Known, kind: str, noise_scale: float, seed: int
+) -> Learnt:
+    from faintspot.loop.simulation import prepare
 
-    def update(self, measured: Floats, gain: float) -> None:
-        """Take this frame's wavefront, as commands that cause it, and go on to the next frame."""
-        control = self._control
-        forgotten = control.leak if control.mode == CLOSED else gain
-        self._latest = (1 - forgotten) * self._latest - gain * measured
-        self._underway.append(self._latest)
-        self._underway.popleft()
+    optics, control = prepare(configuration), configuration.control
+    telemetry = _telemetry(_without_told(configuration), known, seed)
+    told = slope_turbulence(configuration, optics.sensor.layout.cells)
+    frame_s = 1 / control.frame_rate_hz
+    theories = {
+        "winds as told": told.lagged_px2(frame_s),
+        "winds from anywhere": told.from_anywhere().lagged_px2(frame_s),
+    }
+    plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+    return learn(kind, plant, telemetry, theories, noise_scale)
+
+
+@lru_cache(maxsize=8)
+def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int) -> Telemetry:
+    """Run the loop with an integrator on air that is never scored."""
+    from faintspot.loop.simulation import simulate_loop
+
+    frames = configuration.control.telemetry_frames
+    run = configuration.replace("run", frames=frames, settle_frames=0)
+    record = simulate_loop(run, [known.arm], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    return telemetry_of(record, known.arm)
+
+
+def telemetry_of(record: LoopRecord, arm: LoopArm) -> Telemetry:
+    """Return what control learns from a run of one arm with the integrator."""
+    divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
+    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
+    expected = np.zeros_like(held)
+    if arm.predict_prior:  # what acts less the latest command, which acts so many frames later
+        later = record.delay_frames - 1
+        expected[: len(held) - later] = held[: len(held) - later] - held[later:]
+    telemetry = make_telemetry(
+        record.slopes_px.astype(np.float64) / divisor,
+        record.standard_error_px.astype(np.float64) / divisor,
+        held,
+        expected,
+        prior_std_px(arm, held.shape[1]),
+    )
+    return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
+
+
+def _has_prior(arm: LoopArm) -> bool:
+    """Whether the slopes are drawn towards what the control predicts."""
+    has = arm.predict_prior and PRIOR in arm.settings.declared() and not arm.true_slopes
+    return has and getattr(arm.settings, PRIOR) is not None
+
+
+def _with_prior(arm: LoopArm, std_px: float | Floats) -> LoopArm:
+    changes: dict[str, Any] = {PRIOR: std_px}
+    return replace(arm, settings=arm.settings.replace(**changes))
+
+
+def _without_told(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration as far as its telemetry depends on it."""
+    return configuration.replace("control", told_wind_factor=1.0, told_wind_turn_deg=0.0)

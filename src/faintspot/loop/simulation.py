@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot import configuration as configuration_file
 from faintspot.checks import number_between, numbers_between
+from faintspot.control.commands import CommandLine
+from faintspot.control.learning import INTEGRATOR, Learnt
+from faintspot.control.reconstructor import Reconstructor, check_controllable, make_reconstructor
 from faintspot.errors import InputError
 from faintspot.light import MeanLight
 from faintspot.loop.arms import LoopArm
@@ -25,7 +28,7 @@ from faintspot.loop.calibration import (
 )
 from faintspot.loop.camera import Exposing, NoiselessDetector, make_detector
 from faintspot.loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
-from faintspot.loop.control import Integrator, Reconstructor, check_controllable, make_reconstructor
+from faintspot.loop.control import learnt_control, make_controller
 from faintspot.loop.mirror import BestFit, DeformableMirror, make_mirror
 from faintspot.loop.record import LoopRecord
 from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pupil
@@ -34,6 +37,12 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.slopes import Slopes
 
 _MOST_ARMS = 127
+_OF_AIR = (
+    "frame_rate_hz",
+    "delay_frames",
+    "mode",
+    "largest_condition",
+)  # of the control: of typical spots, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +85,10 @@ class Idealised:
         camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
         return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
 
+    def arm(self, arm: LoopArm) -> LoopArm:
+        """Return an arm as it is in such a run."""
+        return replace(arm, true_slopes=arm.true_slopes or self.true_slopes)
+
     def time_s(self, frame: int, frame_rate_hz: float) -> float:
         """Return the middle of a frame."""
         first = 0 if self.faster == 1.0 else frame - frame % self.stretch_frames
@@ -96,6 +109,7 @@ def simulate_loop(
     realisation: int = 0,
     progress: Callable[[int, int], None] | None = None,
     idealised: Idealised | None = None,
+    learns_on: LoopConfiguration | None = None,
 ) -> LoopRecord:
     """Run the loop once.
 
@@ -117,6 +131,8 @@ def simulate_loop(
         Called with the number of frames done and that of all, after every frame.
     idealised : Idealised, optional
         What is left out of what spoils the Strehl ratio.
+    learns_on : LoopConfiguration, optional
+        Of the loop that control learns from where it does. Default: the same, with other air.
 
     Returns
     -------
@@ -133,10 +149,15 @@ def simulate_loop(
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
     number = int(number_between("realisation", realisation, 0, integer=True))
     switches = Idealised() if idealised is None else idealised
+    ready = [
+        learnt_control(switches.configuration(configuration), arm, start, learns_on)
+        for arm in map(switches.arm, arms)
+    ]
+    what = configuration, ready, which, start, number, switches
     gains = None
     if switches.exact_gain:
-        gains = _Loop(configuration, arms, which, start, number, switches).run(None).gains_in_run()
-    return _Loop(configuration, arms, which, start, number, switches, gains).run(progress).record()
+        gains = _Loop(*what).run(None).gains_in_run()
+    return _Loop(*what, gains).run(progress).record()
 
 
 def prepare(configuration: LoopConfiguration) -> LoopOptics:
@@ -181,7 +202,7 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        arms: Sequence[LoopArm],
+        ready: Sequence[tuple[LoopArm, Learnt | None]],
         which: NDArray[np.int64],
         seed: int,
         realisation: int,
@@ -189,7 +210,8 @@ class _Loop:
         gains: NDArray[np.float64] | None = None,
     ) -> None:
         self.configuration = configuration = idealised.configuration(configuration)
-        self.arms, self.which, self.idealised = tuple(arms), which, idealised
+        self.arms = arms = tuple(arm for arm, _ in ready)
+        self.which, self.idealised = which, idealised
         self.seed, self.realisation = seed, realisation
         self.optics = optics = prepare(configuration)
         self.air = _air(_without_light(configuration), seed, realisation)
@@ -202,9 +224,9 @@ class _Loop:
         self.lights = [self._first_light(pipeline) for pipeline in self.pipelines]
         for number in range(len(arms)):
             self._follow_light(number)
-        self.true_slopes = [arm.true_slopes or idealised.true_slopes for arm in arms]
         self.gains, self.divisors = self._gains_and_divisors(gains)
-        self.controller = Integrator(configuration.control, optics.mirror.commands)
+        self.line = CommandLine(optics.mirror.commands, configuration.control.delay_frames)
+        self.controllers = [make_controller(configuration, optics, *each, self.line) for each in ready]
         frames, n = len(which), len(optics.sensor.layout)
         self.slopes = np.zeros((frames, 2 * n), np.float32)
         self.valid = np.zeros((frames, n), np.bool_)
@@ -242,7 +264,7 @@ class _Loop:
             realisation=self.realisation,
             detector=self.detector,
         )
-        gains = np.where(self.true_slopes, 1.0, gains)
+        gains = np.where([arm.true_slopes for arm in self.arms], 1.0, gains)
         return gains, np.where([arm.correct_gain for arm in self.arms], gains, 1.0)
 
     def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
@@ -257,7 +279,7 @@ class _Loop:
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         control, number = self.configuration.control, int(self.which[frame])
-        arm, commands = self.arms[number], self.controller.acting
+        commands = self.line.acting
         time = self.idealised.time_s(frame, control.frame_rate_hz)
         air = self.air.wavefront_nm(time)
         if self.best_fit is not None:
@@ -265,13 +287,9 @@ class _Loop:
         after = air + self.optics.mirror.wavefront_nm(commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, after if control.mode == CLOSED else air)
-        measured = slopes.vector.astype(np.float64) / self.divisors[number]
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
-        if arm.weighted_reconstructor and not self.true_slopes[number]:
-            wavefront = self.optics.reconstructor.weighted(measured, error.astype(np.float64))
-        else:
-            wavefront = self.optics.reconstructor(measured)
-        self.controller.update(wavefront, control.gain if arm.gain is None else arm.gain)
+        vector = slopes.vector.astype(np.float64) / self.divisors[number]
+        self.controllers[number].update(vector, error.astype(np.float64) / self.divisors[number])
         self.slopes[frame], self.errors[frame] = slopes.vector, error
         self.valid[frame], self.commands[frame] = slopes.valid, commands
 
@@ -286,13 +304,13 @@ class _Loop:
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the frame that the sensor's camera takes."""
         number, sensor = int(self.which[frame]), self.optics.sensor
-        if self.true_slopes[number]:
+        if self.arms[number].true_slopes:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
         light = sensor.frame(sensor.spots(wavefront)) * self.configuration.photons
         rng = np.random.default_rng([self.seed, self.realisation, frame, 2])
         prior = None
         if self.arms[number].predict_prior:
-            prior = self.optics.interaction @ self.controller.expected()
+            prior = self.controllers[number].expected().mean_px
         slopes = self.pipelines[number](self.detector.expose(light, rng), prior)
         known = self.lights[number]
         if known is not None:
@@ -357,6 +375,8 @@ def _checked_schedule(
 ) -> NDArray[np.int64]:
     if not 1 <= len(arms) <= _MOST_ARMS:
         raise InputError(f"arms: expected 1 to {_MOST_ARMS}, got {len(arms)}")
+    if len(arms) > 1 and any(arm.control != INTEGRATOR for arm in arms):
+        raise InputError("arms: expected one, or several with the integrator alone")
     if schedule is None:
         return np.zeros(configuration.run.frames, np.int64)
     which = numbers_between("schedule", schedule, 0, len(arms) - 1, integer=True)
@@ -367,7 +387,7 @@ def _checked_schedule(
 
 def _without_light(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
-    control = replace(configuration.control, gain=0.0, leak=0.0)
+    control = Control(**{name: getattr(configuration.control, name) for name in _OF_AIR})
     camera = Camera(photons_per_subaperture=1.0)
     return replace(configuration, name="-", camera=camera, control=control, run=Run())
 

@@ -1,0 +1,1 @@
+"""Control: from slopes to commands. Plain objects that know nothing of a simulation."""

@@ -1,0 +1,100 @@
+"""Two controllers on the same slopes: the mirror gets the commands of the one that leaves less."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.base import Controller, Expected
+from faintspot.control.commands import CommandLine
+from faintspot.control.telemetry import as_estimated, without_prior
+
+Floats = NDArray[np.float64]
+
+_MEMORY_FRAMES = 400
+_CORRELATED_FRAMES = 5  # over which residuals are alike
+_STANDARD_ERRORS = 2.0  # by which one must leave less than the other
+
+
+class Guarded:
+    """A controller that has learnt, and the plain one that takes its place while it does worse.
+
+    Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
+    that each would have had follow from the open-loop slopes. So what they leave can be compared in the same
+    frames, and either can take over without a jump in its own state. As long as the difference is within its
+    error, nothing changes.
+
+    Parameters
+    ----------
+    line : CommandLine
+        To the true mirror.
+    interaction : (m, commands) array
+    reconstruct : (commands, m) array
+        From slopes to what is compared.
+    learnt, plain : callable
+        Return a controller, given where its commands go.
+    prior_std_px : (m,) array, optional
+        Prior of the estimator, whose mean is `expected`. Default: it has none.
+    noise_factor : float
+        What to multiply the variances of standard errors by.
+    prefers_plain : bool
+        Whether the plain one begins.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self,
+        line: CommandLine,
+        interaction: Floats,
+        reconstruct: Floats,
+        learnt: Callable[[CommandLine], Controller],
+        plain: Callable[[CommandLine], Controller],
+        *,
+        prior_std_px: Floats | None = None,
+        noise_factor: float = 1.0,
+        prefers_plain: bool = False,
+    ) -> None:
+        self._line, self._interaction, self._reconstruct = line, interaction, reconstruct
+        self._lines = [CommandLine(interaction.shape[1], line.delay_frames) for _ in range(2)]
+        makers = (learnt, plain)
+        self.controllers = [make(own) for make, own in zip(makers, self._lines, strict=True)]
+        self._prior_std_px, self._noise_factor = prior_std_px, noise_factor
+        self.chosen = int(prefers_plain)
+        """0: the one that has learnt; 1: the plain one."""
+        self._difference = np.zeros(2)
+        self._frames = 0
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        mean, std = self.controllers[self.chosen].expected()
+        other = self._line.acting - self._lines[self.chosen].acting
+        return Expected(mean + self._interaction @ other, std)
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`."""
+        expected = self.expected().mean_px
+        alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self._prior_std_px)
+        open_loop = alone - self._interaction @ self._line.acting
+        error = np.sqrt(self._noise_factor * variance)
+        left = []
+        for controller, line in zip(self.controllers, self._lines, strict=True):
+            residual = open_loop + self._interaction @ line.acting
+            left.append(float(np.square(self._reconstruct @ (trust * residual)).sum()))
+            controller.update(as_estimated(residual, trust, controller), error)
+        self._choose(left[0] - left[1])
+        self._line.put(self._lines[self.chosen].latest)
+
+    def _choose(self, difference: float) -> None:
+        """Change places where the mean difference of late is beyond its error."""
+        self._frames += 1
+        share = 1 / min(self._frames, _MEMORY_FRAMES)
+        self._difference += share * (np.array([difference, difference**2]) - self._difference)
+        if self._frames < _MEMORY_FRAMES // 2:
+            return
+        mean, square = self._difference
+        values = min(self._frames, 2 * _MEMORY_FRAMES) / _CORRELATED_FRAMES
+        if abs(mean) > _STANDARD_ERRORS * np.sqrt(max(0.0, square - mean**2) / values):
+            self.chosen = int(mean > 0)

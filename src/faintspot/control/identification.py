@@ -1,0 +1,140 @@
+"""Learning a model of open-loop slopes from short, noisy telemetry, with the help of theory.
+
+What telemetry says of the slopes behind its noise depends on the model that they are smoothed with: theory's
+at first (expectation maximisation). A ridge regression of z[k + 1] on z[k], z[k - 1] draws the model back to
+theory, in the metric of theory's own covariances: its normal equations are those of a weighted mean of
+measured and theoretical moments. Which theory, and how much weight the measured moments get, is decided by
+what the control would have left of the turbulence in frames that it has not learnt from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.models import SlopeModel, joint_moments
+from faintspot.control.smoothing import smoothed_moments
+from faintspot.control.telemetry import Telemetry, lagged_covariance
+
+Floats = NDArray[np.float64]
+Score = Callable[[SlopeModel, Telemetry], float]
+
+MEASURED_SHARES = (0.1, 0.25, 0.5, 0.75)
+_NOISE_FACTORS = (0.1, 30.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Strengths:
+    """How strong turbulence and noise are in telemetry."""
+
+    later_px2: Floats
+    """(2, m, m): covariances of slopes one and two frames apart, which have no noise."""
+    noise_factor: float
+    """Actual variance of the noise as a multiple of what the standard errors say."""
+
+    @classmethod
+    def of(cls, telemetry: Telemetry) -> Self:
+        """Measure them: noise is what the variance has beyond its extrapolation from later lags."""
+        later = np.array([lagged_covariance(telemetry, lag) for lag in (1, 2)])
+        finite = np.where(np.isfinite(telemetry.variance_px2), telemetry.variance_px2, 0.0)
+        squares = np.square(telemetry.trust)
+        noise = (squares * finite).sum(axis=0) / np.maximum(squares.sum(axis=0), 1e-12)
+        beyond = np.trace(lagged_covariance(telemetry, 0)) - np.trace(_extrapolated(later))
+        factor = float(np.clip(beyond / max(noise.sum(), 1e-12), *_NOISE_FACTORS))
+        return cls(later, factor)
+
+    def relative_to(self, theory_px2: Floats) -> float:
+        """Return by what to multiply theoretical covariances (3, m, m): by slopes without tip and tilt."""
+        theory = _without_tilt(_extrapolated(theory_px2[1:]))
+        return max(_without_tilt(_extrapolated(self.later_px2)), 0.01 * theory) / theory
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What was learnt."""
+
+    model: SlopeModel
+    noise_factor: float
+    """What to multiply the variances of standard errors by."""
+    theory: str
+    """Which theory it is drawn to."""
+    covariances_px2: Floats
+    """(3, m, m): of that theory, with the strength of the telemetry."""
+    measured_share: float
+    """Weight of measured moments, 0 to 1."""
+    score: float
+    """Mean square of what control by it leaves, in frames that were not learnt from."""
+
+
+def identify(
+    telemetry: Telemetry,
+    theories_px2: Mapping[str, Floats],
+    score: Score,
+    shares: Sequence[float] = MEASURED_SHARES,
+) -> Identified:
+    """Choose a model: of each half of the frames, the other half is scored.
+
+    Parameters
+    ----------
+    telemetry : Telemetry
+    theories_px2 : mapping of (3, m, m) arrays
+        Theoretical covariances for lags of 0, 1 and 2 frames, by name; their strength is not used.
+    score : callable
+        Mean square of what control by a model leaves in some frames.
+    shares : sequence of float
+        Weights of measured moments that are tried beside none.
+    """
+    middle = len(telemetry) // 2
+    halves = telemetry.part(0, middle), telemetry.part(middle, len(telemetry))
+    strengths = [Strengths.of(half) for half in halves]
+
+    def left(models: Sequence[SlopeModel]) -> float:
+        of_each = zip(models, strengths, halves[::-1], strict=True)
+        return float(np.mean([score(model, other.scaled(by.noise_factor)) for model, by, other in of_each]))
+
+    tried = {
+        (name, 0.0): left([SlopeModel.of_covariances(by.relative_to(theory) * theory) for by in strengths])
+        for name, theory in theories_px2.items()
+    }
+    name, _ = min(tried, key=tried.__getitem__)
+    pairs = [_moments(half, by, theories_px2[name]) for half, by in zip(halves, strengths, strict=True)]
+    for share in shares:
+        tried[name, share] = left([SlopeModel.of_moments(mixed(*pair, share)) for pair in pairs])
+    name, share = best = min(tried, key=tried.__getitem__)
+    whole = Strengths.of(telemetry)
+    theory = whole.relative_to(theories_px2[name]) * theories_px2[name]
+    model = SlopeModel.of_covariances(theory)
+    if share:
+        model = SlopeModel.of_moments(mixed(*_moments(telemetry, whole, theories_px2[name]), share))
+    return Identified(model, whole.noise_factor, name, theory, share, tried[best])
+
+
+def mixed(measured_px2: Floats, theory_px2: Floats, share: float) -> Floats:
+    """Return a weighted mean of moments."""
+    return share * measured_px2 + (1 - share) * theory_px2
+
+
+def _moments(telemetry: Telemetry, strengths: Strengths, theory_px2: Floats) -> tuple[Floats, Floats]:
+    """Return the moments (3 m, 3 m) of telemetry, smoothed with a theory, and of the theory."""
+    theory = strengths.relative_to(theory_px2) * theory_px2
+    model = SlopeModel.of_covariances(theory)
+    return smoothed_moments(model, telemetry.scaled(strengths.noise_factor)), joint_moments(theory)
+
+
+def _extrapolated(later: Floats) -> Floats:
+    """Return the covariance of no lag, without noise, from those of one and two frames."""
+    mean = (4 * later[0] - later[1]) / 3
+    return np.asarray(0.5 * (mean + mean.T))
+
+
+def _without_tilt(covariance: Floats) -> float:
+    """Return the sum of variances about each axis's mean over the sub-apertures."""
+    n = len(covariance) // 2
+    total = np.trace(covariance)
+    for axis in (slice(0, n), slice(n, 2 * n)):
+        total -= covariance[axis, axis].mean() * n
+    return float(total)

@@ -1,0 +1,74 @@
+"""The integrator: one gain for all, or one for each mode."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.base import Expected
+from faintspot.control.commands import CommandLine
+from faintspot.control.reconstructor import Reconstructor
+
+Floats = NDArray[np.float64]
+
+
+class Integrator:
+    """Adds a part of each frame's wavefront to the command, and forgets a little of it.
+
+    Parameters
+    ----------
+    line : CommandLine
+    interaction : (2 n, commands) array
+        Slopes in px that a unit of each command adds.
+    reconstructor : Reconstructor
+    gain : float or (modes,) array
+        Loop gain, of everything or of each of the reconstructor's modes.
+    leak : float
+        Part of the command that is forgotten in every frame, so that a loop that has lost the star returns.
+    weighted : bool
+        Whether slopes count by their standard errors.
+    sees_mirror : bool
+        Whether the sensor is behind the mirror. If not (open loop), the command follows the running mean of
+        the wavefront.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self,
+        line: CommandLine,
+        interaction: Floats,
+        reconstructor: Reconstructor,
+        gain: float | Floats,
+        leak: float,
+        *,
+        weighted: bool = False,
+        sees_mirror: bool = True,
+    ) -> None:
+        self._line, self._interaction, self._reconstructor = line, interaction, reconstructor
+        self._gain, self._leak = gain, leak
+        self._weighted, self._sees_mirror = weighted, sees_mirror
+
+    def expected(self) -> Expected:
+        """See `Controller`: what is not yet taken off, if the latest command is right for this frame."""
+        line = self._line
+        commands = line.acting - line.latest if self._sees_mirror else -line.latest
+        return Expected(self._interaction @ commands, None)
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`."""
+        if self._weighted:
+            wavefront = self._reconstructor.weighted(slopes_px, standard_error_px)
+        else:
+            wavefront = self._reconstructor(slopes_px)
+        self.follow(wavefront)
+
+    def follow(self, wavefront: Floats) -> None:
+        """Take this frame's wavefront, as commands that cause it."""
+        if np.ndim(self._gain):
+            modes = self._reconstructor.modes
+            step = modes @ (self._gain * (modes.T @ wavefront))
+        else:
+            step = self._gain * wavefront
+        forgotten = self._leak if self._sees_mirror else self._gain
+        self._line.put((1 - forgotten) * self._line.latest - step)

@@ -1,0 +1,93 @@
+"""Control from the open-loop slopes: pseudo-open-loop control, and predictive control."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.base import Expected
+from faintspot.control.commands import CommandLine
+from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor
+
+Floats = NDArray[np.float64]
+
+
+class PseudoOpenLoop:
+    """Pseudo-open-loop control: the most probable wavefront from slopes without the mirror's part.
+
+    Gilles 2005, Appl. Opt. 44, 993. Slopes count by their variance in each frame. As a gain g averages over
+    frames, the reconstructor is that for their noise in the mean, g / (2 - g) of a frame's.
+
+    Parameters
+    ----------
+    line : CommandLine
+    interaction : (m, commands) array
+    now_px2 : (m, m) array
+        Covariance of open-loop slopes.
+    ahead_px2 : (m, m) array
+        E[later slopes, slopes now]: those of the frame in which the command acts; or `now_px2`.
+    reconstruct : (commands, m) array
+        The wavefront, as commands that cause it, from open-loop slopes without noise.
+    gain : float
+        How much of the way to the new wavefront a command goes, 0 to 1.
+    """
+
+    undoes_prior = True
+
+    def __init__(
+        self,
+        line: CommandLine,
+        interaction: Floats,
+        now_px2: Floats,
+        ahead_px2: Floats,
+        reconstruct: Floats,
+        gain: float,
+    ) -> None:
+        self._line, self._interaction, self._gain = line, interaction, gain
+        self._now, self._ahead = now_px2, reconstruct @ ahead_px2
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`."""
+        line, gain = self._line, self._gain
+        variance = np.minimum(np.square(standard_error_px), LARGEST_VARIANCE_PX2)
+        noisy = self._now.copy()
+        noisy[np.diag_indices(len(noisy))] += variance * gain / (2 - gain)
+        wavefront = self._ahead @ np.linalg.solve(noisy, slopes_px - self._interaction @ line.acting)
+        line.put((1 - gain) * line.latest - gain * wavefront)
+
+
+class Predictive:
+    """Commands from the open-loop slopes that a Kalman filter predicts for the frame in which they act.
+
+    Parameters
+    ----------
+    line : CommandLine
+    interaction : (m, commands) array
+    predictor : SlopePredictor
+    reconstruct : (commands, m) array
+        The wavefront, as commands that cause it, from open-loop slopes without noise.
+    """
+
+    undoes_prior = True
+
+    def __init__(
+        self, line: CommandLine, interaction: Floats, predictor: SlopePredictor, reconstruct: Floats
+    ) -> None:
+        self._line, self._interaction, self.predictor = line, interaction, predictor
+        self._command = -reconstruct @ predictor.model.ahead(line.delay_frames)
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        mean = self.predictor.mean_px + self._interaction @ self._line.acting
+        return Expected(mean, self.predictor.std_px)
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`."""
+        open_loop = slopes_px - self._interaction @ self._line.acting
+        self.predictor.correct(open_loop, np.square(standard_error_px))
+        self._line.put(self._command @ self.predictor.state)
+        self.predictor.advance()

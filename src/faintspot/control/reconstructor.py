@@ -1,0 +1,96 @@
+"""From slopes to the commands that cause them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import finite_array, number_between
+from faintspot.errors import InputError
+
+Floats = NDArray[np.float64]
+
+_RIDGE_CLEAN = 3e-3  # of slopes that a filter has freed of most of their noise
+_RIDGE = 3e-2  # of the mean square of the driven combinations' slopes: weak ones move less, noise does too
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructor:
+    """From slopes to the commands that cause them, on the combinations of actuators that slopes can see."""
+
+    matrix: Floats
+    """(commands, 2 n): regularised least squares, all slopes counting alike."""
+    modes: Floats
+    """(commands, modes): combinations that are driven, orthonormal."""
+    slopes_of_modes: Floats
+    """(2 n, modes)"""
+    clean: Floats
+    """(commands, 2 n): as `matrix`, for slopes with little noise, hardly regularised."""
+
+    def __call__(self, slopes: Floats) -> Floats:
+        """Return the commands, in the interaction matrix's unit."""
+        return self.matrix @ slopes
+
+    def weighted(self, slopes: Floats, standard_error: Floats) -> Floats:
+        """Return the commands from slopes that count by the inverse of their variance; infinite: not at all.
+
+        Regularised like `matrix`, which it is where all errors are the same.
+        """
+        variance = np.square(np.where(np.isfinite(standard_error), standard_error, np.inf))
+        usable = np.isfinite(variance) & (variance > 0)
+        if not usable.any():
+            return np.zeros(len(self.modes))
+        weight = np.where(usable, 1 / np.where(usable, variance, 1.0), 0.0)
+        weight /= weight.mean()  # as many slopes as without weights
+        return self.modes @ (_estimator(self.slopes_of_modes, weight) @ slopes)
+
+
+def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) -> Reconstructor:
+    """Return the reconstructor of an interaction matrix, by truncated and damped singular values.
+
+    Parameters
+    ----------
+    interaction : (2 n, commands) array
+        Slopes for a unit of each command.
+    largest_condition : float
+        Combinations whose slopes are smaller than the largest's by more than this are not driven: piston,
+        what looks like waffle, and what tip-tilt mirror and actuators could do against each other.
+
+    Raises
+    ------
+    InputError
+        When there are more commands than slopes, or no command moves a slope.
+    """
+    matrix: Floats = finite_array("interaction", interaction).astype(np.float64)
+    if matrix.ndim != 2:
+        raise InputError(f"interaction: expected shape (2 n, commands), got {matrix.shape}")
+    slopes, commands = matrix.shape
+    check_controllable(commands, slopes)
+    limit = number_between("largest_condition", largest_condition, 1)
+    left, size, right = np.linalg.svd(matrix, full_matrices=False)
+    if size[0] == 0:
+        raise InputError("interaction: expected slopes that follow the commands, got zeros only")
+    driven = size * limit >= size[0]
+    modes, seen = right[driven].T, left[:, driven] * size[driven]
+    equal = np.ones(slopes)
+    plain, clean = (modes @ _estimator(seen, equal, ridge) for ridge in (_RIDGE, _RIDGE_CLEAN))
+    return Reconstructor(plain, modes, seen, clean)
+
+
+def _estimator(slopes_of_modes: Floats, weight: Floats, ridge: float = _RIDGE) -> Floats:
+    """Return (modes, 2 n): modes from slopes, by weighted least squares with a ridge."""
+    weighted = slopes_of_modes.T * weight
+    normal = weighted @ slopes_of_modes
+    normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
+    return np.asarray(np.linalg.solve(normal, weighted))
+
+
+def check_controllable(commands: int, slopes: int) -> None:
+    """Raise InputError when there are more commands than slopes."""
+    if commands > slopes:
+        raise InputError(
+            f"mirror.actuators: {commands} commands (actuators, tip and tilt) are more than {slopes} slopes "
+            "of the lit sub-apertures can control"
+        )

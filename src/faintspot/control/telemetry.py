@@ -1,0 +1,147 @@
+"""What a loop has recorded for its control to learn from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
+
+Floats = NDArray[np.float64]
+
+_LEAST_SHARE = 0.02  # of the prior's information, that a slope is taken to add at least
+
+_LEAST_VARIANCE = 1e-8  # px^2: of slopes that are known without an error
+
+
+@dataclass(frozen=True, eq=False)
+class Telemetry:
+    """Open-loop slopes of consecutive frames, with their noise, and how the loop saw them."""
+
+    open_loop_px: Floats
+    """(frames, m): measured slopes without what the mirror added; anything finite where not measured."""
+    variance_px2: Floats
+    """(frames, m): of their noise; infinite: not measured."""
+    trust: Floats
+    """(frames, m): part of a deviation from what was expected that the estimator gives: 1, of estimators with
+    a prior less, where not measured 0."""
+
+    def __len__(self) -> int:
+        return len(self.open_loop_px)
+
+    def part(self, start: int, stop: int) -> Telemetry:
+        """Return some of the frames."""
+        return Telemetry(*(each[start:stop] for each in vars(self).values()))
+
+    def scaled(self, noise_factor: float) -> Telemetry:
+        """Return the same with another size of the noise."""
+        return Telemetry(self.open_loop_px, self.variance_px2 * noise_factor, self.trust)
+
+
+def make_telemetry(
+    slopes_px: Floats,
+    standard_error_px: Floats,
+    held_px: Floats,
+    expected_px: Floats,
+    prior_std_px: Floats | None,
+) -> Telemetry:
+    """Return telemetry of residual slopes, (frames, m).
+
+    Parameters
+    ----------
+    slopes_px, standard_error_px : (frames, m) array
+        In true pixels; infinite error: not measured.
+    held_px : (frames, m) array
+        What the mirror added to the slopes.
+    expected_px, prior_std_px : (frames, m) array
+        Prior of an estimator whose slopes and errors are those of the posterior; None: it has none.
+    """
+    slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected_px, prior_std_px)
+    return Telemetry(slopes - held_px, variance, trust)
+
+
+def without_prior(
+    slopes_px: Floats, standard_error_px: Floats, expected_px: Floats, prior_std_px: Floats | None
+) -> tuple[Floats, Floats, Floats]:
+    """Return what a frame alone says: slopes, variances and `Telemetry.trust`.
+
+    A posterior's mean and variance s hold the prior of variance v, too; fed back to the filter that the
+    prior came from, it would count twice. The frame alone has the variance 1 / (1 / s - 1 / v), at most
+    v / 0.02 so that a posterior as wide as the prior stays harmless, and its slope is as much farther from
+    the prior's mean as the prior has drawn it there (all Gaussian).
+    """
+    variance = np.maximum(np.square(standard_error_px), _LEAST_VARIANCE)
+    measured = np.isfinite(variance)
+    if prior_std_px is None:
+        return slopes_px, variance, measured.astype(np.float64)
+    prior = np.square(prior_std_px)
+    # Information of the frame in units of the prior's.
+    share = np.maximum(prior / variance - 1, _LEAST_SHARE)
+    trust = np.where(measured, share / (1 + share), 0.0)
+    alone = expected_px + (slopes_px - expected_px) * (1 + share) / share
+    return alone, np.where(measured, prior / share, np.inf), trust
+
+
+def usual_variance(telemetry: Telemetry) -> Floats:
+    """Return (m,): the variance of noise that gives as much information as the frames do on average."""
+    information = np.where(np.isfinite(telemetry.variance_px2), 1 / telemetry.variance_px2, 0.0)
+    return np.asarray(1 / np.maximum(information.mean(axis=0), 1e-6))
+
+
+def lagged_covariance(telemetry: Telemetry, lag: int) -> Floats:
+    """Return E[slopes `lag` frames later, slopes], (m, m) px^2; slopes count as far as they are trusted."""
+    weighted, stop = telemetry.trust * telemetry.open_loop_px, len(telemetry) - lag
+    together = telemetry.trust[lag:].T @ telemetry.trust[:stop]
+    return np.asarray(weighted[lag:].T @ weighted[:stop] / np.maximum(together, 1e-12))
+
+
+def replayed(
+    make: Callable[[CommandLine], Controller],
+    telemetry: Telemetry,
+    interaction: Floats,
+    reconstruct: Floats,
+    delay_frames: int,
+    settle_frames: int = 0,
+) -> float:
+    """Return how well a controller would have done on recorded frames: mean square of what is left.
+
+    The commands that it would have sent are added to the recorded open-loop slopes. As these commands do not
+    know the noise of the frame that they act in, that noise adds the same to every controller's result.
+
+    Parameters
+    ----------
+    make : callable
+        Returns the controller, given where its commands go.
+    telemetry : Telemetry
+    interaction : (m, commands) array
+    reconstruct : (commands, m) array
+        From slopes to what is scored.
+    delay_frames, settle_frames : int
+        Frames at the start that are not scored.
+    """
+    line = CommandLine(interaction.shape[1], delay_frames)
+    controller = make(line)
+    error = np.sqrt(telemetry.variance_px2)
+    left = np.zeros_like(telemetry.open_loop_px)
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop leaves more than can be told
+        for frame, slopes in enumerate(telemetry.open_loop_px):
+            residual = slopes + interaction @ line.acting
+            trust = telemetry.trust[frame]
+            left[frame] = trust * residual
+            controller.update(as_estimated(residual, trust, controller), error[frame])
+        seen = np.square(left[settle_frames:] @ reconstruct.T).mean()
+    share = np.square(telemetry.trust[settle_frames:]).mean()
+    return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
+
+
+def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:
+    """Return the slopes that an estimator would have given a controller: drawn towards what it expects."""
+    if controller.undoes_prior:
+        return slopes_px
+    expected = controller.expected().mean_px
+    return np.asarray(expected + trust * (slopes_px - expected))

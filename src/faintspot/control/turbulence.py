@@ -1,0 +1,159 @@
+"""Covariances of slopes in von Karman turbulence that the wind carries over the telescope.
+
+The mean gradient over a square is a difference of the phase along two of its edges, so that all covariances
+are sums of the phase's structure function D over pairs of edges: cov = 1/2 sum of signs times D. No spectrum
+is sampled and nothing repeats itself. Layers are frozen and independent: after a time t a layer is as it was,
+shifted by the wind.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.special import gamma, kv
+
+Floats = NDArray[np.float64]
+
+_R0_WAVELENGTH_M = 500e-9  # at which r0 is given
+_KOLMOGOROV = 6.88
+_SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations in outer scales of the table
+_DIRECTIONS = 8
+_POINTS = 6  # of the quadrature along half an edge
+
+
+@dataclass(frozen=True, eq=False)
+class SlopeTurbulence:
+    """The slopes of turbulence that a Shack-Hartmann sensor sees, as far as theory knows them.
+
+    Parameters
+    ----------
+    positions_m : (n, 2) array
+        x (along columns) and y (along rows) of the sub-apertures' centres.
+    subaperture_m : float
+        Side of a sub-aperture.
+    pixel_scale_rad : float
+        Angle on the sky that a pixel sees.
+    r0_m : float
+        Fried parameter at 500 nm.
+    outer_scale_m : float
+        L0; infinite: Kolmogorov's spectrum.
+    fraction : (layers,) array
+        Strength of each layer; their ratios matter.
+    wind_m_per_s : (layers, 2) array
+        Velocity of each layer along x and y.
+    """
+
+    positions_m: Floats
+    subaperture_m: float
+    pixel_scale_rad: float
+    r0_m: float
+    outer_scale_m: float
+    fraction: Floats
+    wind_m_per_s: Floats
+
+    def covariance_px2(self, later_s: float = 0.0) -> Floats:
+        """Return E[slopes at t + later_s, slopes at t], (2 n, 2 n) px^2: all x, then all y."""
+        x, y = (line[:, None] - line for line in self.positions_m.T)
+        part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
+        total = 0.0
+        for strength, (wind_x, wind_y) in zip(part, self.wind_m_per_s, strict=True):
+            total = total + strength * self._of_layer(x - wind_x * later_s, y - wind_y * later_s)
+        scale = self.r0_m ** (-5 / 3) * (_R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
+        return np.asarray(scale * total)
+
+    def turned(self, factor: float, degrees: float) -> Self:
+        """Return the same with all winds as many times as fast and turned by an angle."""
+        angle = math.radians(degrees)
+        turn = factor * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return replace(self, wind_m_per_s=np.asarray(self.wind_m_per_s) @ turn.T)
+
+    def lagged_px2(self, frame_s: float) -> Floats:
+        """Return (3, 2 n, 2 n): `covariance_px2` for 0, 1 and 2 frames."""
+        return np.array([self.covariance_px2(lag * frame_s) for lag in range(3)])
+
+    def from_anywhere(self) -> Self:
+        """Return the same with winds of these speeds from all directions alike."""
+        angles = 2 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        around = np.column_stack([np.cos(angles), np.sin(angles)])
+        speeds = np.hypot(*np.asarray(self.wind_m_per_s).T)
+        winds = (speeds[:, None, None] * around).reshape(-1, 2)
+        return replace(self, fraction=np.repeat(self.fraction, _DIRECTIONS), wind_m_per_s=winds)
+
+    def _of_layer(self, x: Floats, y: Floats) -> Floats:
+        """Return the covariance of gradients with such separations, rad^2 m^-2 for r0 = 1 m."""
+        structure = _structure(self.outer_scale_m)
+        offsets, which = np.unique(
+            np.round(np.column_stack([x.ravel(), y.ravel()]), 9), axis=0, return_inverse=True
+        )
+        along, across = offsets.T
+        side = self.subaperture_m
+        values = (
+            _same_axis(along, across, side, structure),
+            _both_axes(along, across, side, structure),
+            _same_axis(across, along, side, structure),
+        )
+        xx, xy, yy = (each[which.reshape(-1)].reshape(x.shape) for each in values)
+        return np.block([[xx, xy], [xy, yy]])
+
+
+class _Structure:
+    """The structure function of the phase, rad^2, at the square of a separation, for r0 = 1 m."""
+
+    def __init__(self, outer_scale_m: float) -> None:
+        self._scale = outer_scale_m
+        if math.isfinite(outer_scale_m):
+            line = np.geomspace(_SMALLEST, _LARGEST, _NODES)
+            self._table = CubicSpline(np.log(line), np.log(_von_karman(line)))
+
+    def __call__(self, square_m2: Floats) -> Floats:
+        square = np.maximum(square_m2, 1e-20)
+        if not math.isfinite(self._scale):
+            return np.asarray(_KOLMOGOROV * square ** (5 / 6))
+        separation = np.clip(0.5 * np.log(square / self._scale**2), math.log(_SMALLEST), math.log(_LARGEST))
+        return np.asarray(np.exp(self._table(separation)) * self._scale ** (5 / 3))
+
+
+def _von_karman(separation: Floats) -> Floats:
+    """Return the structure function for r0 = 1, outer scale 1 (Conan 2008, JOSA A 25, 526)."""
+    x = 2 * math.pi * separation
+    factor = 2 ** (1 / 6) * gamma(11 / 6) / math.pi ** (8 / 3) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
+    return np.asarray(factor * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x)))
+
+
+@lru_cache(maxsize=4)
+def _structure(outer_scale_m: float) -> _Structure:
+    return _Structure(float(outer_scale_m))
+
+
+def _same_axis(along: Floats, across: Floats, side: float, structure: _Structure) -> Floats:
+    """Return the covariance of gradients along the same axis: of parallel edges."""
+    nodes, weights = np.polynomial.legendre.leggauss(2 * _POINTS)
+    total = np.zeros(along.shape)
+    for half in (-0.5, 0.5):  # the density of differences between two edges' points is a triangle
+        place = half * side * (1 + nodes * np.sign(half))
+        weight = 0.5 * weights * (1 - np.abs(place) / side)
+        for node, part in zip(place, weight, strict=True):
+            square = (across + node) ** 2
+            apart = structure((along + side) ** 2 + square) + structure((along - side) ** 2 + square)
+            total += part * (0.5 * apart - structure(along**2 + square))
+    return total / side**2
+
+
+def _both_axes(along: Floats, across: Floats, side: float, structure: _Structure) -> Floats:
+    """Return the covariance of a gradient along x with one along y, `along`, `across` apart."""
+    nodes, weights = np.polynomial.legendre.leggauss(_POINTS)
+    total = np.zeros(along.shape)
+    for on_x, weight_x in zip(0.5 * side * nodes, 0.5 * weights, strict=True):
+        for on_y, weight_y in zip(0.5 * side * nodes, 0.5 * weights, strict=True):
+            for edge_x in (-1, 1):
+                for edge_y in (-1, 1):
+                    square = (along + on_x - edge_x * side / 2) ** 2
+                    square = square + (across + edge_y * side / 2 - on_y) ** 2
+                    total -= 0.5 * edge_x * edge_y * weight_x * weight_y * structure(square)
+    return total / side**2
