@@ -93,6 +93,34 @@ def test_spots_without_light_are_flagged() -> None:
     assert found.valid.tolist() == [True, False]
 
 
+@pytest.mark.parametrize("fwhm_px", [1.5, 30.0])
+def test_dark_flat_gain_and_bad_pixels(fwhm_px: float) -> None:
+    """Calibration is part of the weights; a bad pixel that counts is filled as for all others."""
+    rng = np.random.default_rng(8)
+    layout = fs.Layout.grid((4, 5), pixels=16)
+    adu = rng.poisson(40.0, layout.frame_shape) + 1000.0
+    dark, flat = rng.normal(1000.0, 3.0, adu.shape), rng.uniform(0.8, 1.2, adu.shape)
+    bad = np.zeros(adu.shape, bool)
+    bad[7, 8] = bad[16 + 1, 16 + 1] = True  # at a spot, and where a narrow window does not look
+    calibration = fs.Calibration(dark, flat, 1.7, bad_pixels=bad, read_noise_e=2.0)
+    found = fs.SlopePipeline(layout, window(fwhm_px), calibration)(adu)
+    filled = layout.images(np.where(bad, np.nan, (adu - dark) * 1.7 / flat))
+    clean = fs.SlopePipeline(
+        fs.Layout.grid((20, 1), pixels=16), window(fwhm_px), fs.Calibration(read_noise_e=2.0)
+    )(filled.reshape(-1, 16))
+    np.testing.assert_allclose(found.vector, clean.vector, atol=2e-4)  # float32 sums of 1000 ADU
+    flagged = (found.flags & fs.SubapertureFlag.BAD_PIXELS) != 0
+    assert np.flatnonzero(flagged).tolist() == ([0] if fwhm_px < 2 else [0, 6])
+
+
+def test_saturated_pixels_that_count() -> None:
+    layout = fs.Layout.grid((1, 2), pixels=16)
+    frame = np.full(layout.frame_shape, 10, np.uint16)
+    frame[8, 8] = frame[0, 16] = 65535
+    flags = fs.SlopePipeline(layout, window(2.0), fs.Calibration(read_noise_e=2.0))(frame).flags
+    assert ((flags & fs.SubapertureFlag.SATURATED) != 0).tolist() == [True, False]
+
+
 def test_quad_cells() -> None:
     """Sums of four pixels, with the gain of the spot."""
     cell = np.array([[-1.0, 1.0], [-1.0, 1.0]])

@@ -1,14 +1,44 @@
-"""Slopes that are linear in the pixels: the own kernel of fixed windows and other fixed weights."""
+"""Slopes that are linear in the pixels: fixed windows and other fixed weights.
+
+Where the pixels that count are rows of whole vectors, they are taken straight from the frame, and the
+calibration is part of the weights: to gather whole windows would take several times longer than the sums.
+What has bad pixels is left to `locate_window`.
+"""
 
 from __future__ import annotations
 
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from faintspot.checks import LARGEST_FLOAT32
 from faintspot.kernels import groups
 from faintspot.kernels.compiling import compiled
-from faintspot.kernels.groups import COMMON_ROWS, NO_LIGHT, TOO_MANY_BAD_PIXELS, driver_of
-from faintspot.kernels.simd import Lanes, load, multiply_add, splat, store, width_of
+from faintspot.kernels.groups import (
+    COMMON_ROWS,
+    NO_LIGHT,
+    SATURATED,
+    TOO_MANY_BAD_PIXELS,
+    Task,
+    driver_of,
+    store_slope,
+)
+from faintspot.kernels.simd import (
+    Lanes,
+    absolute,
+    any_lane,
+    load,
+    maximum,
+    multiply_add,
+    select,
+    splat,
+    store,
+    sum_of,
+    widened,
+    width_of,
+)
+from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 # Rows of the settings' table that follow the common ones: what the sums are divided by (0: the frame's own
 # light; negative: not measurable); position of a sum of 0; what a light of 1 e- at the reference adds to the
@@ -33,6 +63,25 @@ class WindowTables(NamedTuple):
     left: Any
     rows: Any
     columns: Any
+
+
+class RowTables(NamedTuple):
+    """The same, of pixels that lie side by side in the frame."""
+
+    pixels: Any
+    """Lanes: of pixels in a row."""
+    weights: Any
+    """(n_subapertures, rows, vectors, 3, W) float32: for pixels in ADU; 0 in those that do not count."""
+    level: Any
+    """(n_subapertures,) float32: taken off every pixel first, so that nothing is lost in large sums."""
+    dark: Any
+    """(n_subapertures, 3) float32: sums that the dark gives above the level."""
+    bad: Any
+    """(n_subapertures,) bool: whether a pixel that counts is masked."""
+    top: Any
+    left: Any
+    whole: Any
+    """WindowTables, for groups with bad pixels."""
 
 
 def no_scratch(lanes: Lanes, ny: int, nx: int) -> tuple[Any, ...]:
@@ -61,36 +110,107 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     store(found, groups.Y * width, sum_y)
     store(found, groups.FLUX * width, light)
     for lane in range(width):
-        _finish(width, lane, group, scratch)
+        s = min(group.first + lane, group.settings.shape[1] - 1)
+        x, y, seen, error_x, error_y, usable = _solved(
+            group.settings,
+            s,
+            found[groups.X * width + lane],
+            found[groups.Y * width + lane],
+            found[groups.FLUX * width + lane],
+        )
+        found[groups.X * width + lane], found[groups.Y * width + lane] = x, y
+        found[groups.FLUX * width + lane] = seen
+        found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
+        if not usable and not scratch.flags[lane] & TOO_MANY_BAD_PIXELS:
+            scratch.flags[lane] |= NO_LIGHT
+        scratch.iterations[lane] = 0
 
 
 @compiled
-def _finish(width: Any, lane: Any, group: Any, scratch: Any) -> None:
-    """Turn one lane's sums into a position, its standard errors and flags."""
-    settings, found = group.settings, scratch.results
-    s = min(group.first + lane, settings.shape[1] - 1)
-    seen = found[groups.FLUX * width + lane]
+def _solved(settings: Any, s: Any, sum_x: Any, sum_y: Any, seen: Any) -> Any:
+    """Turn sums into position, light, standard errors, and whether they are good for anything."""
     divisor = settings[DIVISOR, s]
+    light = divisor
     usable = divisor > 0.0
     if divisor == 0.0:
-        variance = settings[DARK_LIGHT, s] + settings[PHOTON_LIGHT, s] * max(seen, 0.0)
+        light = max(seen, np.float32(0.0))
+        variance = settings[DARK_LIGHT, s] + settings[PHOTON_LIGHT, s] * light
         usable = seen > LEAST_SIGNIFICANCE * math.sqrt(variance)
         divisor = seen
-    total = abs(found[groups.X * width + lane]) + abs(found[groups.Y * width + lane]) + abs(seen)
-    usable = usable and total < math.inf  # False for NaN, too
-    inverse = 1.0 / divisor if usable else 0.0
-    light = max(seen, 0.0) if settings[DIVISOR, s] == 0.0 else divisor
-    for axis in range(2):
-        moved = found[(groups.X + axis) * width + lane] * inverse - settings[OFFSET_X + axis, s]
-        variance = settings[DARK_X + axis, s] + settings[PHOTON_X + axis, s] * light
-        error = math.sqrt(variance) * inverse
-        usable = usable and abs(moved) + error < math.inf
-        found[(groups.X + axis) * width + lane] = settings[HOME_X + axis, s] + moved
-        found[(groups.ERROR_X + axis) * width + lane] = error
-    found[groups.FLUX * width + lane] = seen if abs(seen) < math.inf else 0.0
-    if not usable and not scratch.flags[lane] & TOO_MANY_BAD_PIXELS:
-        scratch.flags[lane] |= NO_LIGHT
-    scratch.iterations[lane] = 0
+    usable = usable and abs(sum_x) + abs(sum_y) + abs(seen) < math.inf  # False for NaN, too
+    inverse = np.float32(1.0) / divisor if usable else np.float32(0.0)
+    x = settings[HOME_X, s] + (sum_x * inverse - settings[OFFSET_X, s])
+    y = settings[HOME_Y, s] + (sum_y * inverse - settings[OFFSET_Y, s])
+    error_x = math.sqrt(settings[DARK_X, s] + settings[PHOTON_X, s] * light) * inverse
+    error_y = math.sqrt(settings[DARK_Y, s] + settings[PHOTON_Y, s] * light) * inverse
+    usable = usable and abs(x) + abs(y) + error_x + error_y < math.inf
+    return x, y, seen if abs(seen) < math.inf else np.float32(0.0), error_x, error_y, usable
 
 
 window_of_groups = driver_of(locate_window)
+
+
+@compiled
+def window_in_rows(
+    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
+) -> None:
+    """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
+    width = width_of(source.lanes)
+    n = source.corners.shape[0]
+    n_groups = (n + width - 1) // width
+    control = flush_subnormals()
+    for item in range(start, stop):
+        f, group = item // n_groups, item % n_groups
+        first, last = group * width, min((group + 1) * width, n)
+        settings = task.settings[task.variants[f]]
+        whole = stages.shape[0] == 0
+        for s in range(first, last):
+            whole = _measure(source, task.tables, f, s, settings, slopes) and whole
+        if whole:
+            continue
+        filled = Task(task.settings, task.variants, task.prior, task.tables.whole)
+        window_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
+        for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
+            _measure(source, task.tables, f, s, settings, slopes)
+    restore_control(control)
+
+
+@compiled
+def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: Any) -> Any:
+    """Measure one sub-aperture; False, and nothing written, where a pixel that counts is bad."""
+    if tables.bad[s]:
+        return False
+    frames, corners, pixels = source.frames, source.corners, tables.pixels
+    width = width_of(pixels)
+    height, line = frames.shape[1], frames.shape[2]
+    rows, vectors = tables.weights.shape[1], tables.weights.shape[2]
+    corner = (corners[s, 0] + tables.top) * line + corners[s, 1] + tables.left
+    zero = splat(pixels, 0.0)
+    sum_x, sum_y, light, spoilt, largest, brightest = zero, zero, zero, zero, zero, splat(pixels, -math.inf)
+    level = splat(pixels, tables.level[s])
+    place = s * rows * vectors * 3 * width
+    for y in range(rows):
+        for vector in range(vectors):
+            raw = widened(pixels, frames, f * height * line + corner + y * line + vector * width)
+            brightest = maximum(raw, brightest)
+            g = raw - level
+            largest = maximum(absolute(g), largest)
+            spoilt = multiply_add(g, zero, spoilt)  # 0, or NaN where a value is not finite
+            sum_x = multiply_add(g, load(pixels, tables.weights, place + X * width), sum_x)
+            sum_y = multiply_add(g, load(pixels, tables.weights, place + Y * width), sum_y)
+            light = multiply_add(g, load(pixels, tables.weights, place + LIGHT * width), light)
+            place += 3 * width
+    one = splat(pixels, 1.0)
+    bad = select(spoilt >= zero, select(largest <= splat(pixels, LARGEST_FLOAT32), zero, one), one)
+    if any_lane(bad > zero):
+        return False
+    dark = tables.dark[s]
+    x, y, seen, error_x, error_y, usable = _solved(
+        settings, s, sum_of(sum_x) - dark[X], sum_of(sum_y) - dark[Y], sum_of(light) - dark[LIGHT]
+    )
+    bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
+    bits |= 0 if usable else NO_LIGHT
+    slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
+    slopes.flux[f, s] = seen
+    store_slope(f, s, settings, x, y, error_x, error_y, bits, slopes)
+    return True
