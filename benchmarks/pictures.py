@@ -2,7 +2,7 @@
 
 Frame to slopes, 16 x 16 pixels, 1024 sub-apertures, one thread, all frames in turns. Real time has to keep up
 with the slowest frame, so what counts is the ratio of the slowest to the fastest. Estimators of fixed work
-must stay within 1.3. Denoising has nothing to do on constant images (dark, saturated): they do not count for it;
+must stay within 1.3. Denoising has nothing to do on constant images (dark, saturated): they are left out;
 "tv, accurate" iterates until its images have converged, and takes what it takes.
 """
 

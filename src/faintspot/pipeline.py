@@ -281,9 +281,8 @@ class SlopePipeline:
         n_frames, n = len(frames), len(self.layout)
         results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
         prepared = self.preparation.prepared
-        in_python = isinstance(prepared, PythonPrepared)
         stages = _NO_STAGES
-        if explain or in_python:
+        if explain or isinstance(prepared, PythonPrepared):
             stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
@@ -301,7 +300,7 @@ class SlopePipeline:
         own_scratch = self.preparation.own_scratch
         cost = self.preparation.estimator.cost
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
-        if in_python:
+        if isinstance(prepared, PythonPrepared):
             images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]

@@ -119,7 +119,7 @@ def hostile_images() -> np.ndarray[Any, Any]:
             1e30 * single / 7,
             1e31 * single,  # too large to be a pixel
             1e-30 * noise,
-            1e-38 * noise,
+            1e-35 * noise,  # below 1e-38 the CPU takes numbers as 0
             3.0 + 1e-6 * noise,
             0.1 * noise,  # infeasible
         ]
