@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,3 +83,25 @@ def test_damaged_page(tmp_path: Path) -> None:
         with pytest.raises(InputError) as error:
             source.block(0, 11)
     assert_message(error, "deflated.tif: frame 4 (counted from 0) cannot be read")
+
+
+@pytest.mark.parametrize("bigtiff", [False, True])
+@pytest.mark.parametrize("byteorder", ["<", ">"])
+def test_pages_in_a_circle_are_refused(tmp_path: Path, bigtiff: bool, byteorder: Any) -> None:
+    """The last page says that the first is next."""
+    path = tmp_path / "a.tif"
+    with tifffile.TiffWriter(path, bigtiff=bigtiff, byteorder=byteorder) as writer:
+        for page in cube(3, dtype="uint16"):
+            writer.write(page, contiguous=False, metadata=None)
+    with open_frames([path]) as source:
+        assert source.n_frames == 3
+    with tifffile.TiffFile(path) as file:
+        first, last = file.pages[0].offset, file.pages[2].offset
+        tags = len(file.pages[2].tags)
+    count_bytes, tag_bytes, size = (8, 20, 8) if bigtiff else (2, 12, 4)
+    place = last + count_bytes + tags * tag_bytes
+    content = bytearray(path.read_bytes())
+    content[place : place + size] = first.to_bytes(size, "little" if byteorder == "<" else "big")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="in a circle"):
+        open_frames([path])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ class Tiff(FileFormat):
 
         tifffile calls a series what was written together. Raises InputError when pages are not alike.
         """
+        _check_chain(path)
         complaints = _Complaints()
         try:
             with complaints, _load_tifffile().TiffFile(path) as file:
@@ -39,6 +40,28 @@ class Tiff(FileFormat):
         if complaints.first:
             raise InputError(f"{path}: expected a whole TIFF file ({complaints.first})")
         return array
+
+
+def _check_chain(path: Path) -> None:
+    """Refuse pages that follow each other in a circle, which tifffile would read for ever."""
+    with path.open("rb") as stream:
+        start = stream.read(8)
+        order: Literal["little", "big"] = "little" if start[:2] == b"II" else "big"
+        big = int.from_bytes(start[2:4], order) == 43
+        count_bytes, tag_bytes, offset_bytes = (8, 20, 8) if big else (2, 12, 4)
+        offset = int.from_bytes(stream.read(8) if big else start[4:8], order)
+        seen: set[int] = set()
+        end = path.stat().st_size
+        while 0 < offset < end:
+            if offset in seen:
+                raise InputError(
+                    f"{path}: expected a whole TIFF file (its pages follow each other in a circle)"
+                )
+            seen.add(offset)
+            stream.seek(offset)
+            after = offset + count_bytes + tag_bytes * int.from_bytes(stream.read(count_bytes), order)
+            stream.seek(min(after, end))
+            offset = int.from_bytes(stream.read(offset_bytes), order)
 
 
 class _Complaints(logging.Handler):
