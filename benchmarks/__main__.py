@@ -30,6 +30,7 @@ _ORDER = (
     "realtime_sustained",
     "pyrtc",
     "loop",
+    "control",
     "study",
     "startup",
     "gpu",
