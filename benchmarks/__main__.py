@@ -31,6 +31,7 @@ _ORDER = (
     "realtime_sustained",
     "pyrtc",
     "loop",
+    "control",
     "study",
     "startup",
     "gpu",

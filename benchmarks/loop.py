@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
+from faintspot.control.commands import CommandLine
+from faintspot.control.integrator import Integrator
 from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.calibration import make_pipeline
 from faintspot.loop.camera import make_detector
-from faintspot.loop.control import Integrator
 from faintspot.loop.simulation import LoopOptics, prepare
 from faintspot.loop.telescope import pupil_grid, require_hcipy
 
@@ -76,14 +77,17 @@ def hcipy_layers(configuration: LoopConfiguration, kind: str) -> Any:
 
 def strehl_with_true_slopes(optics: LoopOptics, air: MovingLayers, configuration: LoopConfiguration) -> float:
     """Return the mean Strehl ratio of a loop without noise, whose slopes are the mean gradients."""
-    integrator = Integrator(configuration.control, optics.mirror.commands)
+    control = configuration.control
+    line = CommandLine(optics.mirror.commands, control.delay_frames)
+    integrator = Integrator(line, optics.interaction, optics.reconstructor, 0.5, control.leak)
+    errors = np.ones(len(optics.interaction))
     strehl = np.zeros(FRAMES)
     for frame in range(FRAMES):
         wavefront = air.wavefront_nm((frame + 0.5) / configuration.control.frame_rate_hz)
-        wavefront = wavefront + optics.mirror.wavefront_nm(integrator.acting)
+        wavefront = wavefront + optics.mirror.wavefront_nm(line.acting)
         field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
         strehl[frame] = optics.pupil.strehl(field)
-        integrator.update(optics.reconstructor(optics.sensor.mean_slopes_px(wavefront)), 0.5)
+        integrator.update(optics.sensor.mean_slopes_px(wavefront), errors)
     return float(strehl[50:].mean())
 
 

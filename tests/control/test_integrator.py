@@ -4,116 +4,79 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.control.control_cases import ERRORS, INTERACTION
 
-from faintspot.errors import InputError
-from faintspot.loop.configuration import Control
-from faintspot.loop.control import Integrator, check_controllable, make_reconstructor
+from faintspot.control.commands import CommandLine
+from faintspot.control.integrator import Integrator
+from faintspot.control.reconstructor import make_reconstructor
+
+ONE = np.ones((2, 1))
 
 
-def _matrix(slopes: int = 40, commands: int = 12) -> np.ndarray:
-    return np.random.default_rng(1).standard_normal((slopes, commands))
+def _integrator(
+    delay: int = 2, gain: float = 0.5, leak: float = 0.0, *, sees_mirror: bool = True
+) -> tuple[Integrator, CommandLine]:
+    line = CommandLine(1, delay)
+    return Integrator(line, ONE, make_reconstructor(ONE), gain, leak, sees_mirror=sees_mirror), line
 
 
 @given(delay=st.integers(1, 5), gain=st.floats(0.1, 1.0))
 def test_a_command_acts_delay_frames_after_its_frame(delay: int, gain: float) -> None:
-    integrator = Integrator(Control(delay_frames=delay, leak=0.0), 1)
+    integrator, line = _integrator(delay, gain)
     held = []
     for frame in range(10):
-        held.append(float(integrator.acting[0]))
-        integrator.update(np.array([1.0 if frame == 3 else 0.0]), gain)
+        held.append(float(line.acting[0]))
+        integrator.follow(np.array([1.0 if frame == 3 else 0.0]))
     np.testing.assert_allclose(held, [-gain if frame >= 3 + delay else 0.0 for frame in range(10)])
 
 
 def test_closed_loop_recursion() -> None:
-    integrator = Integrator(Control(delay_frames=2, leak=0.1), 1)
+    integrator, line = _integrator(2, 0.3, 0.1)
     commands = [0.0, 0.0]
     for frame in range(8):
-        assert integrator.acting[0] == pytest.approx(commands[frame])
-        integrator.update(np.array([1.0 + commands[frame]]), 0.3)
+        assert line.acting[0] == pytest.approx(commands[frame])
+        integrator.follow(np.array([1.0 + commands[frame]]))
         commands.append(0.9 * commands[-1] - 0.3 * (1.0 + commands[frame]))
 
 
 def test_open_loop_is_a_running_mean() -> None:
-    integrator = Integrator(Control(mode="open", leak=0.5), 1)
+    integrator, line = _integrator(2, 0.4, 0.5, sees_mirror=False)
     for _ in range(40):
-        integrator.update(np.array([7.0]), 0.4)
-    assert integrator.acting[0] == pytest.approx(-7)
+        integrator.follow(np.array([7.0]))
+    assert line.acting[0] == pytest.approx(-7)
+    np.testing.assert_allclose(integrator.expected().mean_px, 7.0)
 
 
-def test_the_expected_wavefront_is_what_is_not_yet_taken_off() -> None:
-    integrator = Integrator(Control(leak=0.0), 1)
-    integrator.update(np.array([10.0]), 0.5)
-    assert integrator.expected()[0] == pytest.approx(5.0)  # a wavefront of 5 is still to be taken off
-    integrator.update(np.array([0.0]), 0.5)
-    assert integrator.expected()[0] == pytest.approx(0.0)
+def test_the_expected_slopes_are_what_is_not_yet_taken_off() -> None:
+    integrator, _ = _integrator()
+    integrator.follow(np.array([10.0]))
+    np.testing.assert_allclose(integrator.expected().mean_px, 5.0)  # 5 are still to be taken off
+    integrator.follow(np.array([0.0]))
+    np.testing.assert_allclose(integrator.expected().mean_px, 0.0)
 
 
 @pytest.mark.parametrize(("gain", "stable"), [(0.9, True), (1.1, False)])
 def test_stability_with_two_frames_of_delay(gain: float, stable: bool) -> None:
     """z^2 - z + g = 0 has roots of modulus sqrt(g): stable below 1."""
-    integrator = Integrator(Control(leak=0.0), 1)
+    integrator, line = _integrator(2, gain)
     residual = np.array([1.0])
     for _ in range(400):
-        residual = 1.0 + integrator.acting
-        integrator.update(residual, gain)
+        residual = 1.0 + line.acting
+        integrator.follow(residual)
     assert (abs(residual[0]) < 1e-3) == stable
 
 
-def test_the_reconstructor_gives_back_commands_but_for_its_ridge() -> None:
-    matrix = _matrix()
-    command = np.random.default_rng(2).standard_normal(12)
-    estimate = make_reconstructor(matrix, 1e6)(matrix @ command)
-    assert np.corrcoef(estimate, command)[0, 1] > 0.99
-    assert 0.85 < estimate @ command / (command @ command) < 1  # damped, never amplified
-
-
-def test_combinations_without_slopes_are_not_driven() -> None:
-    matrix = _matrix()
-    matrix[:, 1] = matrix[:, 0]  # two actuators that do the same
-    reconstructor = make_reconstructor(matrix, 30.0)
-    assert reconstructor.modes.shape == (12, 11)
-    command = reconstructor(np.random.default_rng(3).standard_normal(40))
-    assert command[0] == pytest.approx(command[1])
-
-
-def test_equal_errors_weigh_as_none() -> None:
-    reconstructor, slopes = make_reconstructor(_matrix()), np.random.default_rng(4).standard_normal(40)
-    np.testing.assert_allclose(reconstructor.weighted(slopes, np.full(40, 0.3)), reconstructor(slopes))
-
-
-def test_slopes_without_a_standard_error_do_not_count() -> None:
-    reconstructor, slopes = make_reconstructor(_matrix()), np.random.default_rng(5).standard_normal(40)
-    errors = np.where(np.arange(40) % 4 == 0, np.inf, 0.2)
-    wrong = np.where(np.isinf(errors), 1e6, slopes)
-    np.testing.assert_allclose(
-        reconstructor.weighted(wrong, errors), reconstructor.weighted(slopes, errors), atol=1e-9
+def test_equal_gains_of_all_modes_are_one_gain_on_what_is_driven() -> None:
+    reconstructor = make_reconstructor(INTERACTION)
+    lines = [CommandLine(INTERACTION.shape[1], 2) for _ in range(2)]
+    equal = np.full(reconstructor.modes.shape[1], 0.4)
+    one, several = (
+        Integrator(line, INTERACTION, reconstructor, gain, 0.01)
+        for line, gain in zip(lines, (0.4, equal), strict=True)
     )
-    np.testing.assert_array_equal(reconstructor.weighted(slopes, np.full(40, np.inf)), np.zeros(12))
-    np.testing.assert_array_equal(reconstructor.weighted(slopes, np.full(40, np.nan)), np.zeros(12))
-
-
-def test_weights_lower_the_error() -> None:
-    rng = np.random.default_rng(6)
-    matrix = _matrix()
-    reconstructor = make_reconstructor(matrix, 1e6)
-    errors = np.where(np.arange(40) % 2, 2.0, 0.1)
-    plain, weighted = [], []
-    for _ in range(50):
-        command = rng.standard_normal(12)
-        slopes = matrix @ command + errors * rng.standard_normal(40)
-        plain.append(np.sum((reconstructor(slopes) - command) ** 2))
-        weighted.append(np.sum((reconstructor.weighted(slopes, errors) - command) ** 2))
-    assert np.mean(weighted) < 0.5 * np.mean(plain)
-
-
-def test_more_commands_than_slopes_are_refused() -> None:
-    with pytest.raises(InputError, match=r"41 commands .* more than 40 slopes"):
-        check_controllable(41, 40)
-    with pytest.raises(InputError, match="12 commands"):
-        make_reconstructor(_matrix(10))
-
-
-@pytest.mark.parametrize("matrix", [np.zeros((4, 2)), np.ones(4), np.full((4, 2), np.nan)])
-def test_bad_matrices_are_refused(matrix: np.ndarray) -> None:
-    with pytest.raises(InputError, match="interaction"):
-        make_reconstructor(matrix)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        slopes = rng.standard_normal(len(INTERACTION))
+        one.update(slopes, ERRORS)
+        several.update(slopes, ERRORS)
+    np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-12)

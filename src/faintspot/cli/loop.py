@@ -130,11 +130,13 @@ def magnitude(
     Each method is tuned at each flux, its settings and the loop gain together, on air that is not scored.
     Methods: every estimator by its name (`faintspot estimators` lists them); after the name may follow
     _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors) and
-    _uncorrected (slopes are not divided by the centroid gain).
+    _uncorrected (slopes are not divided by the centroid gain), and then the control: +modal, +polc or +kalman
+    in place of the integrator.
 
     \b
     Examples:
       faintspot loop magnitude --quick
+      faintspot loop magnitude diffraction_limit --arms map_predicted,map+kalman --photons 20
       faintspot loop magnitude camera_3e --arms brightest,smoothed,tv,ml --photons 60,200,640
     """
     from faintspot.loop.configuration import load_loop

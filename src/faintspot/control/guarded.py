@@ -15,7 +15,8 @@ Floats = NDArray[np.float64]
 
 _MEMORY_FRAMES = 400
 _CORRELATED_FRAMES = 5  # over which residuals are alike
-_STANDARD_ERRORS = 2.0  # by which one must leave less than the other
+_FEWEST_FRAMES = 50  # before the first change
+_STANDARD_ERRORS = 2.5  # by which one must leave less than the other
 
 
 class Guarded:
@@ -84,15 +85,15 @@ class Guarded:
             residual = open_loop + self._interaction @ line.acting
             left.append(float(np.square(self._reconstruct @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error)
-        self._choose(left[0] - left[1])
+        self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
         self._line.put(self._lines[self.chosen].latest)
 
     def _choose(self, difference: float) -> None:
-        """Change places where the mean difference of late is beyond its error."""
+        """Change places where the mean difference of late, -1 to 1, is beyond its error."""
         self._frames += 1
         share = 1 / min(self._frames, _MEMORY_FRAMES)
         self._difference += share * (np.array([difference, difference**2]) - self._difference)
-        if self._frames < _MEMORY_FRAMES // 2:
+        if self._frames < _FEWEST_FRAMES:
             return
         mean, square = self._difference
         values = min(self._frames, 2 * _MEMORY_FRAMES) / _CORRELATED_FRAMES

@@ -1,0 +1,101 @@
+"""Control: microseconds a frame, from slopes to commands.
+
+Of the 4.2 m telescope, 72 slopes, every controller as it is. Of an extremely large telescope, 9,232 slopes
+and 4,600 commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and
+sparse ones of which each slope knows its neighbours within four sub-apertures (filled with random numbers:
+what they hold does not change the time).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from benchmarks.measuring import Row, Table, best, interleaved, pinned
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
+from faintspot.control.kalman import SlopePredictor
+from faintspot.control.learning import Plant
+from faintspot.control.models import SlopeModel
+from faintspot.control.predictive import Predictive, PseudoOpenLoop
+from faintspot.loop import load_loop
+from faintspot.loop.control import slope_turbulence
+from faintspot.loop.simulation import prepare
+
+_NOISE_PX = 0.5
+_LARGE, _LARGE_COMMANDS, _ACROSS, _REACH = 9232, 4600, 68, 4
+
+
+def small_table() -> Table:
+    """Time the controllers of the 4.2 m telescope."""
+    configuration = load_loop("diffraction_limit")
+    optics, control = prepare(configuration), configuration.control
+    covariances = slope_turbulence(configuration, optics.sensor.layout.cells).lagged_px2(
+        1 / control.frame_rate_hz
+    )
+    plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+    slopes = np.random.default_rng(1).standard_normal(len(optics.interaction))
+    errors = np.full(len(slopes), _NOISE_PX)
+    model, clean = SlopeModel.of_covariances(covariances), optics.reconstructor.clean
+
+    def line() -> CommandLine:
+        return CommandLine(optics.mirror.commands, control.delay_frames)
+
+    def predictive(line: CommandLine, *, steady: bool) -> Controller:
+        predictor = SlopePredictor(model, errors**2, steady=steady)
+        return Predictive(line, plant.interaction, predictor, clean)
+
+    controllers: dict[str, Controller] = {
+        "integrator": plant.integrator(0.4, line()),
+        "integrator, a gain for each mode": plant.integrator(
+            np.full(optics.reconstructor.modes.shape[1], 0.4), line()
+        ),
+        "pseudo-open-loop control": PseudoOpenLoop(
+            line(), plant.interaction, covariances[0], covariances[2], clean, 0.3
+        ),
+        "Kalman filter, gain of each frame": predictive(line(), steady=False),
+        "Kalman filter, constant gain": predictive(line(), steady=True),
+    }
+    with pinned():
+        times = interleaved(
+            {name: partial(each.update, slopes, errors) for name, each in controllers.items()}
+        )
+    rows = [Row(name, {"us a frame": best(times, name) * 1e6}) for name in controllers]
+    return Table("control", f"Control with {len(slopes)} slopes, one core", rows)
+
+
+def large_table() -> Table:
+    """Time the products of a predictive filter of an extremely large telescope."""
+    rng = np.random.default_rng(1)
+    whole = rng.standard_normal((_LARGE, _LARGE), np.float32)
+    near = sparse.kron(np.ones((2, 2)), _neighbours(), format="csr").astype(np.float32)
+    commands = near[rng.integers(0, near.shape[0], _LARGE_COMMANDS)]
+    vector, local = (rng.standard_normal(size).astype(np.float32) for size in (_LARGE, near.shape[1]))
+
+    def of(matrix: Any, slopes: np.ndarray[Any, Any], times: int) -> None:
+        for _ in range(times):
+            matrix @ slopes
+
+    # Correction 2, onward 2, and what the mirror added and its command 3 halves of a square matrix.
+    candidates = {
+        "whole matrices, float32": partial(of, whole, vector, 6),
+        "neighbours within 4": lambda: (of(near, local, 4), of(commands, local, 3)),
+    }
+    with pinned():
+        times = interleaved(candidates, fewest=3)
+    rows = [Row(name, {"ms a frame": best(times, name) * 1e3}) for name in candidates]
+    return Table("control-elt", f"Constant-gain Kalman filter, {_LARGE} slopes, one core", rows)
+
+
+def _neighbours() -> Any:
+    """Return a sparse matrix (n, n) with ones for neighbours of each sub-aperture in a square array."""
+    band = sparse.diags([1.0] * (2 * _REACH + 1), range(-_REACH, _REACH + 1), shape=(_ACROSS, _ACROSS))
+    return sparse.kron(band, band)
+
+
+def run() -> list[Table]:
+    """Time control."""
+    return [small_table(), large_table()]

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from tests.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, MODEL, PLANT, TURBULENCE, telemetry
+
+from faintspot.control.identification import Strengths, identify
+from faintspot.control.kalman import SlopePredictor
+from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
+from faintspot.control.modal_gains import GAINS, largest_stable_gain, modal_gains
+from faintspot.control.models import SlopeModel, joint_moments
+from faintspot.control.predictive import Predictive
+from faintspot.control.smoothing import smoothed_moments
+from faintspot.control.telemetry import Telemetry, usual_variance, without_prior
+
+AGAINST = TURBULENCE.turned(3.0, 180.0).lagged_px2(FRAME_S)
+
+
+def test_a_prior_is_taken_out_again() -> None:
+    """A Gaussian posterior gives back the frame's own slope and variance."""
+    rng = np.random.default_rng(1)
+    mean, slope = rng.standard_normal((2, 50))
+    prior, noise = rng.uniform(0.2, 1.0, (2, 50))
+    variance = 1 / (1 / prior**2 + 1 / noise**2)
+    posterior = variance * (mean / prior**2 + slope / noise**2)
+    alone, found, trust = without_prior(posterior, np.sqrt(variance), mean, prior)
+    informed = noise**2 < 50 * prior**2  # less is taken for that
+    np.testing.assert_allclose(alone[informed], slope[informed], rtol=1e-6)
+    np.testing.assert_allclose(found[informed], noise[informed] ** 2, rtol=1e-6)
+    np.testing.assert_allclose((mean + trust * (alone - mean))[informed], posterior[informed], rtol=1e-6)
+
+
+def test_posteriors_wider_than_the_prior_stay_harmless() -> None:
+    _, variance, trust = without_prior(np.ones(3), np.array([2.0, 1.0, np.inf]), np.zeros(3), np.ones(3))
+    np.testing.assert_allclose(variance, [50.0, 50.0, np.inf])
+    np.testing.assert_allclose(trust, [1 / 51, 1 / 51, 0.0])
+
+
+def test_strengths_of_noise_and_turbulence_are_measured() -> None:
+    """Errors that are told twice too large; turbulence four times weaker than theory."""
+    found = Strengths.of(telemetry(4000, 0.5, said=2.0))
+    assert found.noise_factor == pytest.approx(0.25, rel=0.05)
+    assert found.relative_to(4 * COVARIANCES) == pytest.approx(0.25, rel=0.2)
+
+
+def test_moments_behind_noise_are_found() -> None:
+    """Smoothed with the true model they are those of slopes without noise, but for statistics."""
+    noisy, clear = telemetry(6000, 0.5), telemetry(6000, 1e-4)
+    found, expected = smoothed_moments(MODEL, noisy), smoothed_moments(MODEL, clear)
+    assert np.linalg.eigvalsh(found)[0] > 0
+    assert np.linalg.norm(found - expected) < 0.15 * np.linalg.norm(expected)
+
+
+def _score(model: SlopeModel, frames: Telemetry) -> float:
+    def made(line):  # type: ignore[no-untyped-def]
+        predictor = SlopePredictor(model, usual_variance(frames))
+        return Predictive(line, INTERACTION, predictor, PLANT.reconstructor.clean)
+
+    return PLANT.left(made, frames)
+
+
+def test_the_right_theory_is_chosen_and_a_wrong_one_is_mended() -> None:
+    frames = telemetry(1500, 0.5)
+    both = identify(frames, {"against": AGAINST, "right": COVARIANCES}, _score)
+    assert both.theory == "right"
+    wrong_only = identify(frames, {"against": AGAINST}, _score)
+    assert wrong_only.measured_share > 0
+    unmended = identify(frames, {"against": AGAINST}, _score, shares=())
+    assert both.score < wrong_only.score < unmended.score
+
+
+def test_shares_go_from_theory_to_measured() -> None:
+    model = SlopeModel.of_moments(joint_moments(COVARIANCES))
+    np.testing.assert_array_equal(model.first, MODEL.first)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])
+def test_what_has_learnt_leaves_less(kind: str) -> None:
+    """On other frames of the same air, than the integrator with the gain that is best there."""
+    theories = {"told": COVARIANCES}
+    learnt = learn(kind, PLANT, telemetry(1200, 0.5), theories)
+    other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
+    plain = min(PLANT.left(partial(PLANT.integrator, gain), other) for gain in (0.1, 0.2, 0.3, 0.4, 0.5))
+    # Of a gain for each mode, in a mirror without any order, no more can be asked than to be no worse.
+    assert PLANT.left(learnt.controller, other) < plain * (1.01 if kind == "modal" else 0.99)
+
+
+def test_the_best_gain_is_that_of_a_loop_run_through() -> None:
+    rng = np.random.default_rng(4)
+    walk = np.cumsum(rng.standard_normal((20_000, 2)), axis=0)
+    modes = walk - walk.mean(axis=0) + np.array([0.5, 6.0]) * rng.standard_normal(walk.shape)
+
+    def left(gain: float) -> np.ndarray:
+        command, underway = np.zeros(2), [np.zeros(2)] * 2
+        squares = np.zeros(2)
+        for mode in modes:
+            residual = mode + underway.pop(0)
+            squares += residual**2
+            command = 0.99 * command - gain * residual
+            underway.append(command)
+        return squares
+
+    stable = GAINS[largest_stable_gain(2) > GAINS]
+    run_through = stable[np.argmin([left(gain) for gain in stable], axis=0)]
+    found = modal_gains(modes, 2, 0.01)
+    assert np.all(np.abs(np.searchsorted(stable, found) - np.searchsorted(stable, run_through)) <= 1)
+    assert found[0] > 1.5 * found[1]
