@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintspot import InputError, Layout, Slopes, SubapertureFlag, fit_wavefront
-from faintspot.sensor.pupil import lenslet_outlines, pupil_of
+from faintspot import InputError, Layout, Settings, SlopePipeline, Slopes, SubapertureFlag, fit_wavefront
+from faintspot.sensor.pupil import inside_pupil, lenslet_outlines, pupil_of
 from faintspot.wavefront.zernike import mean_gradients, zernike
 
 LAYOUT = Layout.grid((7, 7), pixels=8, outer_radius=3.5, inner_radius=0.5)
@@ -163,3 +163,16 @@ def test_bad_input() -> None:
         fit_wavefront(slopes, LAYOUT[1:])
     with pytest.raises(InputError, match=r"3 sub-apertures across, but lit ones lie 6\.32 apart"):
         fit_wavefront(slopes, replace(SCALED, diameter_m=1.5, subaperture_m=0.5))
+
+
+def test_corners_of_a_square_array_are_outside_of_the_disk() -> None:
+    layout = Layout.grid((7, 7), pixels=8)
+    assert pupil_of(layout).radius_subapertures == pytest.approx(3.5)
+    inside = inside_pupil(layout, pupil_of(layout))
+    assert np.count_nonzero(~inside) == 12  # those at (3, 3) and (3, 2) from the middle
+    frames = np.zeros((1, 56, 56))
+    slopes = SlopePipeline(layout, Settings("centroid"))(frames + 1.0)
+    wild = replace(slopes, x=np.where(inside, slopes.x, 3.0).astype(np.float32))
+    np.testing.assert_array_equal(
+        fit_wavefront(wild, layout).coefficients, fit_wavefront(slopes, layout).coefficients
+    )

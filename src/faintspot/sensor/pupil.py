@@ -31,8 +31,8 @@ def pupil_of(layout: Layout) -> Pupil:
     """Return the disk of the pupil.
 
     Its middle is that of the rectangle along the lattice's rows that holds all lit sub-apertures, and its
-    diameter the longer side, or as much as the centres of all need, where corners are lit; with both
-    `subaperture_m` and `diameter_m`, their ratio.
+    diameter the longer side, so that corners of a square array are outside; with both `subaperture_m` and
+    `diameter_m`, their ratio.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def pupil_of(layout: Layout) -> Pupil:
     low, high = rotated.min(axis=0), rotated.max(axis=0)
     x, y = along @ ((low + high) / 2)
     farthest = float(np.hypot(*(layout.centres - (x, y)).T).max())
-    radius = max(0.5 * (float((high - low).max()) + pitch), farthest)
+    radius = 0.5 * (float((high - low).max()) + pitch)
     side, diameter = layout.subaperture_m, layout.diameter_m
     if side is not None and diameter is not None:
         radius = 0.5 * pitch * diameter / side
@@ -60,6 +60,12 @@ def pupil_of(layout: Layout) -> Pupil:
         diameter = 2 * radius / pitch * side
     metres = None if diameter is None else diameter / 2
     return Pupil((float(x), float(y)), radius, radius / pitch, metres)
+
+
+def inside_pupil(layout: Layout, pupil: Pupil) -> NDArray[np.bool_]:
+    """Return which sub-apertures have their centre within the disk, (n,)."""
+    away = np.hypot(*(layout.centres - pupil.centre_px).T)
+    return np.asarray(away <= pupil.radius_px * (1 + 1e-9))
 
 
 def lenslet_pitch(layout: Layout) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.pupil import Pupil, lenslet_outlines, pupil_of
+from faintspot.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, pupil_of
 from faintspot.slopes import Slopes
 from faintspot.wavefront.zernike import mean_gradients, zernike
 
@@ -115,7 +115,8 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     """Fit Zernike modes to slopes, each frame by least squares over its valid sub-apertures.
 
     What is compared with a slope is the mean gradient of a mode over the lenslet's square or hexagon, exactly
-    integrated; a sub-aperture that the pupil's edge cuts counts as whole.
+    integrated; a sub-aperture that the pupil's edge cuts counts as whole, one with its centre beyond not at
+    all: a mode outside its disk is no wavefront's.
 
     Parameters
     ----------
@@ -137,10 +138,11 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     x, y, valid = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "valid"))
     if x.ndim != 2 or x.shape[1] != len(layout):
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
+    pupil = pupil_of(layout)
+    valid = valid & inside_pupil(layout, pupil)
     lit = np.asarray(valid.any(axis=0))
     if not lit.any():
         raise InputError("slopes: expected some to fit a wavefront to, found none that is valid")
-    pupil = pupil_of(layout)
     gradients, condition = _chosen_gradients(modes, layout, pupil, lit)
     unit, scale = _unit(layout, pupil)
     errors = np.concatenate(
