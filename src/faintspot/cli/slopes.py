@@ -53,6 +53,12 @@ from faintspot.written_changes import parse_changes
     help="Of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
 )
 @click.option(
+    "--mean-light",
+    is_flag=True,
+    help="Take the light of spots as their mean over the recording, not that of each frame: for steady, "
+    "faint stars.",
+)
+@click.option(
     "--reference",
     metavar="FILE",
     help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE or FILE:ARRAY.",
@@ -73,6 +79,7 @@ def command(
     preset: str | None,
     device: str,
     unit: str,
+    mean_light: bool,
     reference: str | None,
     key: str | None,
     threads: int | None,
@@ -95,6 +102,7 @@ def command(
       faintspot slopes night1.fits -o plain.zarr --no-denoise
       faintspot slopes night1.fits -o slopes.zarr --preset fast
       faintspot slopes night1.fits -o ml.zarr --estimator ml --set model_error=0.1
+      faintspot slopes night1.fits -o window.zarr --estimator window --mean-light
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
     with progress_bar("slopes") as advance:
@@ -110,6 +118,7 @@ def command(
             preset=preset,
             device=device,
             unit=unit,
+            mean_light=mean_light,
             reference=reference,
             key=key,
             threads=threads,

@@ -23,11 +23,14 @@ from faintspot.io.locations import split_location
 from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import UNITS, VARIABLES, pixels_in, scaled_positions
+from faintspot.light import MeanLight
 from faintspot.pipeline import SlopePipeline
 from faintspot.settings import with_preset, without_denoising
 from faintspot.slopes import Slopes
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
+
+_LOOKS_FOR_LIGHT, _FRAMES_FOR_LIGHT = 20, 50  # stretches of frames over the whole recording
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished frames and of all frames."""
@@ -66,6 +69,7 @@ def measure_recorded(
     changes: Mapping[str, Any] | None = None,
     device: str = "cpu",
     unit: str = "px",
+    mean_light: bool = False,
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
@@ -95,6 +99,9 @@ def measure_recorded(
         "cpu" or "cuda", see `SlopePipeline`.
     unit : {"px", "arcsec"}
         Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
+    mean_light : bool
+        Tell the estimator the mean light of every sub-aperture over the recording, instead of letting it take
+        that of each frame: better where the star is faint and steady; see `faintspot.MeanLight`.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
         slopes of which they are the mean; see `faintspot.io.references.read_reference`.
@@ -139,6 +146,8 @@ def measure_recorded(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
+        if mean_light:
+            pipeline = _told_mean_light(pipeline, source)
         attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
@@ -161,6 +170,24 @@ def measure_recorded(
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
     return summary
+
+
+def _told_mean_light(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
+    """Return the pipeline for the mean light of frames from all over the recording."""
+    estimator = pipeline.settings.estimator
+    if not estimator.uses_light:
+        raise InputError(f"mean light: the estimator {estimator.name!r} does not use the light of spots")
+    starts = np.unique(
+        np.linspace(0, max(source.n_frames - _FRAMES_FOR_LIGHT, 0), _LOOKS_FOR_LIGHT, dtype=int)
+    )
+    light = [
+        pipeline(block).flux
+        for start in starts.tolist()
+        for _, block in source.blocks(
+            start, min(start + _FRAMES_FOR_LIGHT, source.n_frames), _FRAMES_FOR_LIGHT
+        )
+    ]
+    return pipeline.with_light(MeanLight(np.concatenate(light)))
 
 
 def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
