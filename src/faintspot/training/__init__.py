@@ -1,15 +1,18 @@
-"""Learning from spots: the trained linear score, and the point-spread function."""
+"""Learning from spots: the trained linear score, the point-spread function, the centroid gain."""
 
+from faintspot.training.centroid_gain import CentroidGain, measure_centroid_gain
 from faintspot.training.psf_learning import LearntPSF, learn_psf, learn_psf_from_images
 from faintspot.training.recorded import train_from_frames
 from faintspot.training.running_psf import RunningPSF
 from faintspot.training.simulation import train_estimator
 
 __all__ = [
+    "CentroidGain",
     "LearntPSF",
     "RunningPSF",
     "learn_psf",
     "learn_psf_from_images",
+    "measure_centroid_gain",
     "train_estimator",
     "train_from_frames",
 ]

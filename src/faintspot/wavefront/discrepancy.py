@@ -1,0 +1,104 @@
+"""Slope discrepancy: the part of slopes that no wavefront can cause, a check of noise and calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.sensor.layout import Layout
+from faintspot.slopes import Slopes
+
+Floats = NDArray[np.float64]
+
+_NEGLIGIBLE = 1e-9  # of the largest singular value
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """What of the slopes is not the gradient of any wavefront."""
+
+    rms_px: Floats
+    """(n_frames,): per slope that could be compared, so that noise alone gives its own rms."""
+    expected_px: Floats
+    """(n_frames,): from the slopes' standard errors; NaN where they are not known."""
+    degrees_of_freedom: int
+    """Combinations of slopes that no wavefront causes."""
+
+    @property
+    def ratio(self) -> float:
+        """Measured over expected, as mean squares over all frames; 1 where noise alone is there."""
+        return float(np.sqrt(np.mean(self.rms_px**2) / np.mean(self.expected_px**2)))
+
+
+def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
+    """Return the part of the slopes that is not a gradient, frame by frame.
+
+    Wavefronts are those of a phase at the corners of the sub-apertures (Fried 1977, JOSA 67, 370): with them,
+    the sum of slopes around a closed path is 0. What is left is noise, and what spoils slopes: centroid gains
+    that differ between x and y or from place to place (quad cells above all), wrong references, a rotation of
+    the lenslets against the detector, scintillation.
+
+    Parameters
+    ----------
+    slopes : Slopes
+        Of one frame or several, relative to their reference.
+    layout : Layout
+        Square.
+
+    Raises
+    ------
+    InputError
+        When slopes and layout do not fit together, or every combination of slopes is that of a wavefront.
+    """
+    if layout.geometry != "square":
+        raise InputError(f"layout.geometry: expected 'square' for a discrepancy, got {layout.geometry!r}")
+    vector, valid = np.atleast_2d(slopes.vector).astype(np.float64), np.atleast_2d(slopes.valid)
+    if vector.shape[1] != 2 * len(layout):
+        n = vector.shape[1] // 2
+        raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {n}")
+    used = np.tile(valid.all(axis=0), 2)
+    others = _not_gradients(_corner_gradients(layout)[used])
+    if not others.shape[1]:
+        raise InputError("slopes: expected more valid sub-apertures: any slopes of these are a wavefront's")
+    errors = np.concatenate(
+        [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
+    )[:, used].astype(np.float64)
+    degrees = others.shape[1]
+    with np.errstate(invalid="ignore"):
+        expected = np.sqrt((errors**2) @ (others**2).sum(axis=1) / degrees)
+    found = vector[:, used] @ others
+    rms = np.sqrt((found**2).sum(axis=1) / degrees)
+    return Discrepancy(rms, np.where(np.isfinite(expected), expected, np.nan), degrees)
+
+
+def _corner_gradients(layout: Layout) -> Floats:
+    """Return the slopes (2 n, corners) of a phase of 1 at each corner of the lit sub-apertures."""
+    rows, columns = layout.cells.T
+    places = np.stack([[rows + down, columns + right] for down in (0, 1) for right in (0, 1)])
+    corners, index = np.unique(places.transpose(0, 2, 1).reshape(-1, 2), axis=0, return_inverse=True)
+    top_left, top_right, bottom_left, bottom_right = index.reshape(4, -1)
+    n = len(layout)
+    gradients = np.zeros((2 * n, len(corners)))
+    which = np.arange(n)
+    for corner, x, y in (
+        (top_left, -0.5, -0.5),
+        (top_right, 0.5, -0.5),
+        (bottom_left, -0.5, 0.5),
+        (bottom_right, 0.5, 0.5),
+    ):
+        gradients[which, corner] += x
+        gradients[n + which, corner] += y
+    return gradients
+
+
+def _not_gradients(gradients: Floats) -> Floats:
+    """Return an orthonormal basis (slopes, k) of what is not a combination of gradients (slopes, corners)."""
+    if not len(gradients):
+        return np.zeros((0, 0))
+    left, size, _ = np.linalg.svd(gradients, full_matrices=True)
+    rank = int(np.count_nonzero(size > _NEGLIGIBLE * size[0]))
+    basis: Floats = left[:, rank:]
+    return basis
