@@ -32,6 +32,9 @@ _NOISE_SCALES = (0.35, 0.6, 1.0)
 _FIRST_NOISE_SCALES = (0.6,)
 _LOOP_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _FIRST_LOOP_GAINS = (0.2, 0.4, 0.7)
+# Of control that learns it is only the gain at which telemetry is taken, which takes long.
+_TELEMETRY_GAINS = (0.1, 0.2, 0.3, 0.4)
+_FIRST_TELEMETRY_GAINS = (0.2,)
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
 PRIOR = "prior_std_px"
 _PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
@@ -188,6 +191,8 @@ class ArmKind:
         if self.control == KALMAN:
             options.pop(PRIOR, None)  # the filter knows it
         tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
+        if self.control != INTEGRATOR:
+            tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
         if self.control not in (INTEGRATOR, MODAL):
             tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
         for number, (name, values) in enumerate(options.items()):

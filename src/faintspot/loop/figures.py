@@ -14,7 +14,7 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.loop.analysis import differences_by_flux
-from faintspot.loop.arms import VARIANTS
+from faintspot.loop.arms import CONTROL_SIGN, VARIANTS
 from faintspot.loop.results import BudgetResult, MagnitudeResult
 from faintspot.loop.telescope import PSF_SAMPLING
 from faintspot.report.drawing import GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
@@ -187,7 +187,7 @@ def _arm_style(name: str) -> dict[str, Any]:
     known = estimators()
     base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in known), "")
     style = known[base].style if base else Style("#666666")
-    variants = [ending for ending in VARIANTS if ending in name[len(base) :]]
+    variants = [ending for ending in (*VARIANTS, CONTROL_SIGN) if ending in name[len(base) :]]
     return {
         "color": style.colour,
         "marker": style.marker,
