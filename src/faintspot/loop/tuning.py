@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between
 from faintspot.compare.running import Advance
+from faintspot.control.learning import INTEGRATOR
 from faintspot.loop.arms import ArmKind, Choice, Tunable
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.simulation import simulate_loop
@@ -83,8 +84,10 @@ def tune(
     """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
 
     All combinations of a few values of each option first, then steps from the best of them to
-    neighbouring values of one option at a time, as long as that helps. All see the same air and noise;
-    realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
+    neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
+    which takes much longer than a run, the estimator's options are those that are best with the integrator,
+    and only what is the control's own is sought with it. All see the same air and noise; realisations are
+    those from `FIRST_TUNING_REALISATION` on, which are not scored.
 
     Parameters
     ----------
@@ -96,6 +99,24 @@ def tune(
     """
     search = Search() if search is None else search
     tuned = kind.tuned(configuration)
+    if kind.control == INTEGRATOR:
+        return _sought(kind, configuration, search, tuned, advance)
+    slopes = tune(replace(kind, control=INTEGRATOR), configuration, search, advance)
+    for name, each in tuned.items():
+        if name in slopes.choice:
+            tuned[name] = each.nearest(slopes.choice[name])
+    found = _sought(kind, configuration, search, tuned, advance)
+    return replace(found, tried=found.tried + slopes.tried)
+
+
+def _sought(
+    kind: ArmKind,
+    configuration: LoopConfiguration,
+    search: Search,
+    tuned: Mapping[str, Tunable],
+    advance: Advance | None,
+) -> Tuned:
+    """Return the best of the values that are tuned."""
     trials = _Trials(kind, configuration, search, advance)
     coarse = [
         dict(zip(tuned, values, strict=True))
@@ -134,9 +155,14 @@ def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 def tuning_frames(kind: ArmKind, configuration: LoopConfiguration, search: Search) -> int:
     """Return about how many frames tuning an arm simulates."""
     tuned = kind.tuned(configuration)
+    frames = 0
+    if kind.control != INTEGRATOR:
+        slopes = replace(kind, control=INTEGRATOR)
+        frames = tuning_frames(slopes, configuration, search)
+        tuned = {name: each for name, each in tuned.items() if name not in slopes.tuned(configuration)}
     combinations = math.prod(len(each.first) for each in tuned.values())
     looks = search.finalists + 2 * len(tuned) * min(2, search.rounds) if search.rounds else 0
-    return combinations * search.coarse_frames + looks * search.frames * search.realisations
+    return frames + combinations * search.coarse_frames + looks * search.frames * search.realisations
 
 
 class _Trials:
