@@ -14,7 +14,7 @@ from faintspot.loop.verdict import (
     better_and_worse,
     loop_verdict,
     options_that_may_pay,
-    reference_arm,
+    reference_arms,
     tv_arm,
 )
 
@@ -40,7 +40,7 @@ def test_one_realisation_says_nothing() -> None:
 
 def test_arms_are_found_by_their_names() -> None:
     result = dataclasses.replace(made_up_magnitude(), labels=tuple("abcd"))
-    assert LABELS[reference_arm(result)] == "brightest pixels"
+    assert LABELS[reference_arms(result)[0]] == "brightest pixels"
     arm = tv_arm(result)
     assert arm is not None
     assert LABELS[arm] == "TV denoising"
@@ -60,3 +60,12 @@ def test_results_are_read_from_a_folder(tmp_path: Path) -> None:
     assert found.interleaved is None
     assert found.magnitude is not None
     assert found.budget is not None
+
+
+def test_gains_are_said_against_the_strongest_baseline_first() -> None:
+    result = dataclasses.replace(made_up_magnitude(), names=("brightest", "tv", "window", "ml"))
+    assert reference_arms(result) == [2, 0]
+    lines = [line for line in loop_verdict(LoopResults(magnitude=result)) if line.startswith("Magnitudes")]
+    against = [line.split(" against ")[1].split(":")[0] for line in lines]
+    window, brightest = result.labels[2], result.labels[0]
+    assert against == [window, window, window, brightest, brightest]

@@ -15,7 +15,9 @@ from faintspot.compare.arms import score_for_scene
 from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, MODAL
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator, Need
+from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.registry import estimator_named, estimators
+from faintspot.estimators.window import Window
 from faintspot.loop.camera import make_detector
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.options import AUTO, Option
@@ -276,8 +278,9 @@ def default_arms(configuration: LoopConfiguration) -> list[str]:
 
     Every estimator, as far as it suits; those that take a prior also with the loop's prediction, and those
     that weigh pixels by their noise also with a weighted reconstructor. A score is trained for spots that
-    turbulence speckles: not where the source is elongated. In open loop, where an error of the centroid gain
-    is not fed back, those that know nothing of the spot also without its correction.
+    turbulence speckles: not where the source is elongated. In closed loop, the strongest usual estimator and
+    the one that gains most from a prior also with the Kalman filter. In open loop, where an error of the
+    centroid gain is not fed back, those that know nothing of the spot also without its correction.
     """
     names = []
     for name, kind in estimators().items():
@@ -289,7 +292,8 @@ def default_arms(configuration: LoopConfiguration) -> list[str]:
         names += [f"{predicted}_weighted"] if Need.READ_NOISE in kind.needs else []
         if configuration.control.mode != CLOSED and not kind.needs:
             names.append(f"{name}_uncorrected")
-    return names
+    kalman = [Window.name, MaximumAPosteriori.name] if configuration.control.mode == CLOSED else []
+    return names + [f"{name}{CONTROL_SIGN}{KALMAN}" for name in kalman]
 
 
 def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:

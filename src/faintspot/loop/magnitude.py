@@ -18,6 +18,7 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.trained import Trained
+from faintspot.estimators.window import Window
 from faintspot.loop.arms import LOOP_GAIN, ArmKind, Choice, arm_kind, default_arms
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.files import make_folder
@@ -32,7 +33,7 @@ from faintspot.loop.tuning import (
 )
 
 KIND = "magnitude"
-QUICK_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Trained))
+QUICK_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
 _QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
 _QUICK_FLUXES = 3
 
@@ -59,7 +60,7 @@ def run_magnitude(
     folder : path
         Where finished units are remembered; made where it is not there.
     arms : sequence of str, optional
-        See `faintspot.loop.arms.arm_kind`. Default: `default_arms`; with `quick`, four.
+        See `faintspot.loop.arms.arm_kind`. Default: `default_arms`; with `quick`, five.
     photons : sequence of float, optional
         Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
     quick : bool

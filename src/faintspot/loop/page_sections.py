@@ -36,7 +36,7 @@ from faintspot.loop.verdict import (
     LoopResults,
     loop_verdict,
     options_that_may_pay,
-    reference_arm,
+    reference_arms,
     tv_arm,
 )
 from faintspot.report.figure_data import FigureWithData
@@ -167,14 +167,16 @@ def _seeing_line(table: Measurements) -> list[str]:
 
 
 def _magnitude(result: MagnitudeResult) -> list[Section]:
-    reference = reference_arm(result)
-    base = result.labels[reference]
+    references = reference_arms(result)
+    base = " and then with ".join(result.labels[arm] for arm in references)
     wavelength = LoopConfiguration.from_text(result.configuration).science.wavelength_m
-    others = [arm for arm in range(len(result.labels)) if arm != reference]
-    tables = [
-        gain_table(result, others, reference),
-        difference_table(result, [(a, reference) for a in others]),
-    ]
+    tables = []
+    for place, reference in enumerate(references):
+        others = [arm for arm in range(len(result.labels)) if arm not in references[: place + 1]]
+        tables += [
+            gain_table(result, others, reference),
+            difference_table(result, [(arm, reference) for arm in others]),
+        ]
     pairs = [(arm, without) for _, arm, without in options_that_may_pay(result)]
     if pairs:
         tables.append(
@@ -194,7 +196,7 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
             "Strehl against magnitude",
             text,
             tables,
-            [magnitude_figure(result, reference, strehl_axis(wavelength))],
+            [magnitude_figure(result, references[0], strehl_axis(wavelength))],
         ),
         Section("gain", "Centroid gain", tables=[centroid_gain_table(result)], figures=[gain_figure(result)]),
         Section("settings", "Tuned settings", tables=[settings_table(result)]),
@@ -214,7 +216,7 @@ def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | 
 
 
 def _images_of_arms(result: MagnitudeResult) -> FigureWithData | None:
-    tv, reference = tv_arm(result), reference_arm(result)
+    tv, reference = tv_arm(result), reference_arms(result)[-1]
     if tv is None or tv == reference:
         return None
     curve = np.array([paired_mean(values).value for values in result.strehl[reference]])

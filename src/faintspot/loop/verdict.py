@@ -11,6 +11,7 @@ from faintspot.compare.statistics import Estimate
 from faintspot.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
+from faintspot.estimators.window import Window
 from faintspot.loop.analysis import (
     NO_TV,
     TV,
@@ -34,8 +35,8 @@ from faintspot.loop.results import (
 from faintspot.loop.values_with_errors import gain_in_words, in_words
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
-REFERENCE = BrightestPixels.name
-"""Name of the arm that others are compared with."""
+REFERENCES = (Window.name, BrightestPixels.name)
+"""Names of the arms that others are compared with: the strongest that systems run, then the usual one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +81,16 @@ def loop_verdict(results: LoopResults) -> list[str]:
         comparisons += [row.difference for row in differences_by_strength(table)]
     if results.magnitude is not None:
         lines += _magnitude_lines(results.magnitude)
-        tv, reference = tv_arm(results.magnitude), reference_arm(results.magnitude)
+        # What the denoising itself does: against the same without it.
+        tv, reference = tv_arm(results.magnitude), reference_arms(results.magnitude)[-1]
         if tv is not None and tv != reference:
             comparisons += differences_by_flux(results.magnitude, tv, reference)
     return _headline(comparisons) + lines
 
 
-def reference_arm(result: MagnitudeResult) -> int:
-    """Return the arm that others are compared with: brightest pixels, else the first."""
-    return result.names.index(REFERENCE) if REFERENCE in result.names else 0
+def reference_arms(result: MagnitudeResult) -> list[int]:
+    """Return the arms that others are compared with: those of `REFERENCES` that are there, else the first."""
+    return [result.names.index(name) for name in REFERENCES if name in result.names] or [0]
 
 
 def tv_arm(result: MagnitudeResult) -> int | None:
@@ -158,21 +160,10 @@ def _interleaved_lines(table: Measurements) -> list[str]:
 
 
 def _magnitude_lines(result: MagnitudeResult) -> list[str]:
-    reference = reference_arm(result)
-    base = result.labels[reference]
-    tv = tv_arm(result)
-    order = [arm for arm in range(len(result.labels)) if arm != reference]
-    if tv in order:
-        order = [tv, *(arm for arm in order if arm != tv)]
-    lines = []
-    for arm in order:
-        above, below = better_and_worse(result, arm, reference)
-        parts = [f"more Strehl beyond its error at {above}"] if above else []
-        parts += [f"less Strehl beyond its error at {below}"] if below else []
-        found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
-        lines.append(
-            f"Magnitudes, {result.labels[arm]} against {base}: {found}{_gain_in_magnitude(result, arm)}."
-        )
+    references, lines = reference_arms(result), []
+    for place, reference in enumerate(references):
+        others = [arm for arm in range(len(result.labels)) if arm not in references[: place + 1]]
+        lines += [_comparison(result, arm, reference) for arm in others]
     for option, arm, without in options_that_may_pay(result):
         above, below = better_and_worse(result, arm, without)
         found = f"pays at {above}" if above else "pays nowhere beyond its error"
@@ -181,13 +172,19 @@ def _magnitude_lines(result: MagnitudeResult) -> list[str]:
     return lines
 
 
-def _gain_in_magnitude(result: MagnitudeResult, arm: int) -> str:
+def _comparison(result: MagnitudeResult, arm: int, reference: int) -> str:
+    above, below = better_and_worse(result, arm, reference)
+    parts = [f"more Strehl beyond its error at {above}"] if above else []
+    parts += [f"less Strehl beyond its error at {below}"] if below else []
+    found = "; ".join(parts) if parts else "no difference beyond its error at any flux"
+    gain = _gain_in_magnitude(result, arm, reference)
+    return f"Magnitudes, {result.labels[arm]} against {result.labels[reference]}: {found}{gain}."
+
+
+def _gain_in_magnitude(result: MagnitudeResult, arm: int, reference: int) -> str:
     """Return the gain at the middle one of the Strehl ratios at which there is one."""
-    gains = [
-        each
-        for each in gains_in_magnitude(result, arm, reference_arm(result))
-        if np.isfinite(each.gain.value)
-    ]
+    every = gains_in_magnitude(result, arm, reference)
+    gains = [each for each in every if np.isfinite(each.gain.value)]
     if not gains:
         return ""
     middle = gains[len(gains) // 2]
