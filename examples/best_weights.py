@@ -2,8 +2,8 @@
 
 Sub-apertures of 1.14 r0 (near the diffraction limit) and 2.92 r0 (speckled), lambda / d = 2 px, 16 x 16 px,
 3 e- of read noise, the mean light known; positions are normal with the given rms. Widths of the window, and
-gains, are chosen on other spots than the scored ones, and the weights are made from still others. Rms error per
-axis after the gain is taken off; standard errors by blocks of spots, paired for the ratio.
+gains, are chosen on other spots than the scored ones, and the weights are made from still others. Rms error
+per axis after the gain is taken off; standard errors by blocks of spots, paired for the ratio.
 
     python examples/best_weights.py [--motion 0.5] [--spots 20000]
 """

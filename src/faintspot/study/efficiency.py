@@ -30,8 +30,8 @@ NEAR_BEST = 1.04
 """Gain-corrected rms over the smallest of all arms up to which an arm counts as near the best."""
 _OF_WINDOWS = (
     "True positions are uniform within plus and minus the range that stands behind each cell (±1 px in "
-    "most) on each axis; how near to the limit an arm comes depends on it, that of a fixed window (`window`, told "
-    "the mean light as `trained` is) above all: it lives from a narrow one, as in a closed loop."
+    "most) on each axis; how near to the limit an arm comes depends on it, that of a fixed window (`window`, "
+    "told the mean light as `trained` is) above all: it lives from a narrow one, as in a closed loop."
 )
 _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dominate its error
 
