@@ -15,11 +15,8 @@ from benchmarks.measuring import Table
 from faintspot.report.drawing import ARM_COLOURS, GREY, new_figure, png, styled
 
 Curves = Mapping[str, list[tuple[float, float]]]
-_TICKS = (3, 4, 6, 8, 10, 15, 20, 30, 40, 60)
-_STARTS: dict[str, dict[str, Any]] = {
-    "from zero": {"color": ARM_COLOURS[0], "marker": "s", "ls": "--"},
-    "flat start": {"color": ARM_COLOURS[1], "marker": "o", "ls": "-"},
-}
+_TICKS = (3, 4, 6, 8, 10, 15, 20, 30, 40, 60, 100)
+_STYLE: dict[str, Any] = {"color": ARM_COLOURS[1], "marker": "o", "ls": "-"}
 _FAST = 8
 
 
@@ -40,8 +37,7 @@ def excess(curves: Curves) -> Figure:
     figure = new_figure(14.0, 4.8)
     panels: tuple[Axes, Axes, Axes] = figure.subplots(1, 3)
     for axes, which in zip(panels, ("worst", "median", "cells"), strict=True):
-        for start in _STARTS:
-            _draw(axes, curves[f"{start}: {which}"], start)
+        _draw(axes, curves[which])
         _iterations(axes)
     panels[0].set_title("worst cell")
     panels[1].set_title("median of all cells")
@@ -66,8 +62,7 @@ def nearly_infeasible(curves: Curves) -> Figure:
     figure = new_figure(14.0, 4.8)
     panels = figure.subplots(1, len(labels), sharey=True)
     for axes, label in zip(panels, labels, strict=True):
-        for start in _STARTS:
-            _draw(axes, curves[f"{start}: R, px, {label}"], start)
+        _draw(axes, curves[f"R, px, {label}"])
         converged = curves[f"converged: R, px, {label}"][0][1]
         axes.axhline(converged, color="black", lw=1.5, label="converged")
         axes.set_title(label)
@@ -77,20 +72,11 @@ def nearly_infeasible(curves: Curves) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, points: list[tuple[float, float]], start: str) -> None:
+def _draw(axes: Axes, points: list[tuple[float, float]]) -> None:
     n, value = np.array(points).T
-    axes.plot(n, value, lw=2.2, ms=6, label=start, **_STARTS[start])
-    if start == "flat start":
-        fast = n == _FAST
-        ring: dict[str, Any] = {
-            "ls": "",
-            "marker": "o",
-            "ms": 15,
-            "mfc": "none",
-            "mec": ARM_COLOURS[1],
-            "mew": 2,
-        }
-        axes.plot(n[fast], value[fast], label='preset "fast"', **ring)
+    axes.plot(n, value, lw=2.2, ms=6, label="so many iterations", **_STYLE)
+    ring: dict[str, Any] = {"ls": "", "marker": "o", "ms": 15, "mfc": "none", "mec": ARM_COLOURS[1], "mew": 2}
+    axes.plot(n[n == _FAST], value[n == _FAST], label='preset "fast"', **ring)
 
 
 def _legend(figure: Figure, axes: Axes) -> None:

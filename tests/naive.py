@@ -64,7 +64,6 @@ def tv_denoise(
     algorithm: str = "fgp",
     tolerance: float = 1e-2,
     max_iterations: int = 200,
-    flat_start: bool = False,
     lower: bool = False,
 ) -> Denoised:
     """Constrained TV of one image: minimise TV(u) subject to ||u - g||^2 = N noise_std^2.
@@ -88,14 +87,9 @@ def tv_denoise(
     elif rms <= strength:
         return Denoised(np.full_like(g, mean), multiplier=np.inf, infeasible=True, margin=margin)
     radius = np.sqrt(g.size) * strength
-    multiplier = 0.4 * strength
-    zero = np.zeros_like(g)
-    p: tuple[Floats, Floats] = (zero, zero)
-    age, momentum, converged = 1.0, 0.0, False
-    if flat_start:
-        p, multiplier = flat_field(gc, strength)
-        age = 4.0
+    p, multiplier = flat_field(gc, strength)
     previous = p
+    age, momentum, converged = 4.0, 0.0, False
     for iteration in range(1, max_iterations + 1):
         if algorithm == "fgp":
             q = (p[0] + momentum * (p[0] - previous[0]), p[1] + momentum * (p[1] - previous[1]))
@@ -116,7 +110,7 @@ def tv_denoise(
         momentum, age = (age - 1.0) / next_age, next_age
         if np.linalg.norm(d) > 0:
             multiplier = radius / np.linalg.norm(d)
-        if iteration % 5 == 0:
+        if iteration % 24 == 0 or iteration == max_iterations:
             d = divergence(*p)
             change = np.linalg.norm(d - divergence(*previous))
             bound = tolerance * np.linalg.norm(d - gc / multiplier)
@@ -274,7 +268,7 @@ def slopes(
 def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:
     """The image of sub-aperture `s` of `n` as the estimator denoises it, if it does."""
     if settings.estimator.name == "brightest":
-        return tv_denoise(image, 0.0, "fgp", 0.0, 1, False)
+        return tv_denoise(image, 0.0, "fgp", 0.0, 1)
     strength, tolerance, limit = (
         settings.values(name, n, image.size)[s] for name in ("noise_std", "tolerance", "max_iterations")
     )
@@ -284,7 +278,6 @@ def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:
         settings.algorithm,
         float(tolerance),
         int(limit),
-        settings.preset == "fast",
         lower=True,
     )
     return replace(denoised, converged=denoised.converged or tolerance == 0)

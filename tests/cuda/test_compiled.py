@@ -73,20 +73,19 @@ def linked(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("window", "before", "algorithm", "flat"),
+    ("window", "before", "algorithm"),
     [
-        ((16, 16), DENOISE, FGP, True),
-        ((16, 16), DENOISE, FGP, False),
-        ((10, 10), SMOOTH, CHAMBOLLE, False),
+        ((16, 16), DENOISE, FGP),
+        ((10, 10), SMOOTH, CHAMBOLLE),
     ],
 )
 def test_nothing_spills(
-    window: tuple[int, int], before: int, algorithm: int, flat: bool, monkeypatch: pytest.MonkeyPatch
+    window: tuple[int, int], before: int, algorithm: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("numba_cuda", reason="needs the extra gpu")
     from faintspot.cuda.fused import slopes_kernel
 
-    text = assembly(lambda: slopes_kernel(window, before, algorithm, flat), SLOPES, monkeypatch)
+    text = assembly(lambda: slopes_kernel(window, before, algorithm), SLOPES, monkeypatch)
     assert "__local_depot" not in text
     assert ".f64 \t" not in text  # no double precision, which small GPUs do 64 times slower
     assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in linked(text)
@@ -98,7 +97,8 @@ def test_studies_spill_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     from faintspot.cuda import drawing, every_k
 
     tables = [("float32", 3), ("uint8", 2)]
-    positions = [("float32", 3), "float32", "float32", "int32", ("float32", 2), "float64", "float64", *tables]
+    options = ["float32", "float32", "int32", ("float32", 1), ("float32", 2)]
+    positions = [("float32", 3), *options, "float64", "float64", *tables]
     text = assembly(lambda: every_k.positions_kernel(16, every_k.DENOISE, 0), positions, monkeypatch)
     assert "__local_depot" not in text
     assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in linked(text)

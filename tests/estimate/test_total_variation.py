@@ -29,6 +29,11 @@ def tolerance_of(dtype: Any) -> float:
     return ROUNDINGS * float(np.finfo(dtype).eps)
 
 
+def rounding_of(g: Any, dtype: Any) -> float:
+    """What rounding may leave of a denoised image, in units of its largest pixel."""
+    return 50 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype)
+
+
 def strengths_of(stack: Any, fraction: float) -> Any:
     """Strengths relative to the images' own rms; of constant images, relative to one of them."""
     rms = spread(stack)
@@ -42,6 +47,9 @@ class TestAgainstOracle:
     def test_same_image_after_any_number_of_iterations(
         self, algorithm: str, dtype: Any, stack: Any, fraction: float, iterations: int
     ) -> None:
+        """The potential that the start is the gradient of grows as the square of the image's side; so does
+        what rounding leaves of its differences.
+        """
         stack = stack.astype(dtype)
         strength = strengths_of(stack, fraction)
         result = fs.tv_denoise(
@@ -51,35 +59,13 @@ class TestAgainstOracle:
         for i, g in enumerate(stack):
             expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, iterations)
             # Ranges whose inverse overflows float32 count as constant: nothing changes by more than 1e-30.
-            bound = tolerance_of(dtype) * largest(g) + 1e-29
+            bound = rounding_of(g, dtype) * largest(g) + 1e-29
             assert np.max(np.abs(result.images[i] - expected.image)) <= bound
             if largest(g) > 1e-20:
                 assert result.iterations[i] == expected.iterations
                 assert result.infeasible[i] == expected.infeasible
                 assert result.converged[i] == expected.converged
                 assert np.isclose(result.multiplier[i], expected.multiplier, rtol=100 * tolerance_of(dtype))
-
-    @every_dtype
-    @every_algorithm
-    @given(images(), fractions, st.sampled_from([1, 2, 8, 40]))
-    def test_fast_preset(
-        self, algorithm: str, dtype: Any, stack: Any, fraction: float, iterations: int
-    ) -> None:
-        """The potential that the start is the gradient of grows as the square of the image's side; so does
-        what rounding leaves of its differences.
-        """
-        stack = stack.astype(dtype)
-        strength = strengths_of(stack, fraction)
-        result = fs.tv_denoise(
-            stack, strength, algorithm=algorithm, preset="fast", max_iterations=iterations, full_output=True
-        )
-        for i, g in enumerate(stack):
-            expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, iterations, flat_start=True)
-            bound = 50 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype) * largest(g) + 1e-29
-            assert np.max(np.abs(result.images[i] - expected.image)) <= bound
-            if largest(g) > 1e-20:
-                assert result.iterations[i] == expected.iterations
-                assert result.infeasible[i] == expected.infeasible
 
     @every_dtype
     @every_algorithm
@@ -133,8 +119,7 @@ class TestSolution:
         assert np.all(error[feasible] <= tolerance_of(dtype))
 
     @every_algorithm
-    @pytest.mark.parametrize("preset", ["accurate", "fast"])
-    def test_is_the_minimum_of_the_penalised_problem(self, preset: str, algorithm: str) -> None:
+    def test_is_the_minimum_of_the_penalised_problem(self, algorithm: str) -> None:
         """u minimises ||u - g||^2 / 2 + lambda TV(u) exactly when v = (g - u) / lambda has <v, u> = TV(u)
         and <v, w> <= TV(w) for every w; the duality gap is lambda (TV(u) - <v, u>).
         """
@@ -145,7 +130,6 @@ class TestSolution:
                 g,
                 0.7 * g.std(),
                 algorithm=algorithm,
-                preset=preset,
                 tolerance=0,
                 max_iterations=20_000,
                 full_output=True,
@@ -288,18 +272,17 @@ class TestTooStrong:
 
     @every_dtype
     @every_algorithm
-    @pytest.mark.parametrize("preset", ["accurate", "fast"])
     @given(images(), st.sampled_from([0.5, 0.899, 0.901, 1.0, 3.0, 1e30]))
     def test_is_what_the_lowered_strength_gives(
-        self, algorithm: str, dtype: Any, preset: str, stack: Any, fraction: float
+        self, algorithm: str, dtype: Any, stack: Any, fraction: float
     ) -> None:
         stack = stack.astype(dtype)
         strength = spread(stack) * fraction
-        how: Any = {"algorithm": algorithm, "preset": preset, "tolerance": 0, "max_iterations": 8}
+        how: Any = {"algorithm": algorithm, "tolerance": 0, "max_iterations": 8}
         result = fs.tv_denoise(stack, strength, lower_strength=True, full_output=True, **how)
         for i, g in enumerate(stack):
-            expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, 8, preset == "fast", lower=True)
-            bound = 50 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype) * largest(g) + 1e-29
+            expected = naive.tv_denoise(g, strength[i], algorithm, 0.0, 8, lower=True)
+            bound = rounding_of(g, dtype) * largest(g) + 1e-29
             assert np.max(np.abs(result.images[i] - expected.image)) <= bound
             if largest(g) > 1e-20:
                 assert result.iterations[i] == expected.iterations
@@ -377,7 +360,7 @@ class TestArguments:
         g = np.random.default_rng(14).normal(size=(40, 8, 8))
         result = fs.tv_denoise(g, np.linspace(0, 1.2, 40), algorithm=algorithm, full_output=True)
         assert result.converged[result.iterations < 200].all()
-        assert np.all(result.iterations[result.iterations < 200] % 5 == 0)
+        assert np.all(result.iterations[result.iterations < 200] % 24 == 0)
         assert len(np.unique(result.iterations)) > 3
         assert np.all(result.iterations[result.infeasible] == 0)
 

@@ -10,6 +10,7 @@ from faintspot.loop import LoopConfiguration, load_loop, shipped_loops
 
 REGIMES = {
     "canary",
+    "canary_faint",
     "emccd",
     "camera_3e",
     "laboratory_16e",

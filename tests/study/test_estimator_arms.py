@@ -16,7 +16,7 @@ from faintspot.study import arms as study_arms
 from faintspot.study.arms import CellArms
 from faintspot.study.cell import realisations
 
-ESTIMATOR_ARMS = ("weighted", "matched", "ml", "map", "trained")
+ESTIMATOR_ARMS = ("window", "weighted", "matched", "ml", "map", "trained")
 ARMS = ("brightest", *ESTIMATOR_ARMS)
 COUNT = 2000
 
@@ -30,8 +30,8 @@ def specification_of(**cell: Any) -> StudySpecification:
 def quick_training() -> Iterator[None]:
     """Train on fewer spots: worse by 2 % (30 e-)."""
     with pytest.MonkeyPatch.context() as patch:
-        quick = functools.partial(fs.train_estimator, realisations=3000)
-        patch.setattr(study_arms, "train_estimator", quick)
+        quick = functools.partial(study_arms.score_for_scene, realisations=3000)
+        patch.setattr(study_arms, "score_for_scene", quick)
         yield
 
 

@@ -34,11 +34,11 @@ def test_cost_is_bounded() -> None:
 
 
 @pytest.mark.parametrize("quick", [False, True])
-def test_figure_five_needs_no_cells_of_its_own(quick: bool) -> None:
+def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(quick: bool) -> None:
     others = [name for name in paper.FIGURES if name != "fig5"]
     with_it, without = paper.specification(quick), paper.specification(quick, others)
     extra = set(with_it.cells()) - set(without.cells())
-    assert not extra
+    assert {(cell.flux_e, cell.read_noise_e) for cell in extra} == (set() if quick else {(50, 16)})
 
 
 @pytest.mark.parametrize("name", paper.FIGURES)

@@ -13,6 +13,7 @@ from numba import cuda, float32, float64, int32
 
 from faintspot.cuda.brightest import make_extremes
 from faintspot.cuda.compiling import device, kernel
+from faintspot.cuda.flat_start import pitch_of
 from faintspot.cuda.gather import make_recall, make_share, make_smooth
 from faintspot.cuda.median import make_median
 from faintspot.cuda.strips import WARP, Strips, strips_of
@@ -144,8 +145,9 @@ def positions_kernel(side: int, before: int, rule: int) -> Any:
     """
     strips = strips_of((side, side))
     rows, threads, last, pixels = strips.rows, strips.threads, strips.strips - 1, side * side
+    pitch, flat_rows = pitch_of(side), side if before == DENOISE else 1
     share, recall, smooth = make_share(strips), make_recall(strips), make_smooth(strips)
-    median, denoise = make_median(strips), make_denoise(strips, FGP, flat=False)
+    median, denoise = make_median(strips), make_denoise(strips, FGP)
     sort, locate_every_k = make_sort(strips), make_locate_every_k(strips, rule)
 
     @kernel
@@ -154,13 +156,14 @@ def positions_kernel(side: int, before: int, rule: int) -> Any:
         strength: Any,
         tolerance: Any,
         limit: Any,
+        pivots: Any,
         taps: Any,
         floor: Any,
         reach: Any,
         positions: Any,
         valid: Any,
     ) -> None:
-        """`images` (n, side, side); `taps` (2, 1 + reach)."""
+        """`images` (n, side, side); inverse `pivots` (side^2,) of the denoising; `taps` (2, 1 + reach)."""
         at, lane = cuda.blockIdx.x, cuda.threadIdx.x
         if at >= images.shape[0]:
             return
@@ -169,12 +172,13 @@ def positions_kernel(side: int, before: int, rule: int) -> Any:
         present = min(rows, side - top) if lane < threads else 0
         planes = cuda.shared.array((2, side, side), float32)
         tile, scratch = planes[0], planes[1]
+        plane = cuda.shared.array((flat_rows, pitch), float32)
         image = cuda.local.array(rows, float32)
         recall(images[at], top, column, present, image)
         if before == DENOISE:
             in_row = float32(1.0) if lane < threads and column < side - 1 else float32(0.0)
             in_last = float32(1.0) if strip < last else float32(0.0)
-            denoise(image, lane, present, in_row, in_last, strength, tolerance, limit, tile, taps[0])
+            denoise(image, lane, present, in_row, in_last, strength, tolerance, limit, plane, pivots)
         elif before == SMOOTH:
             smooth(images[at], taps, lane, scratch, tile)
             recall(tile, top, column, present, image)

@@ -164,15 +164,13 @@ def make_locate(strips: Strips) -> Any:
 
 
 @cache
-def slopes_kernel(
-    window: tuple[int, int], before: int, algorithm: int, flat: bool = False, warps: int = WARPS
-) -> Any:
+def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: int = WARPS) -> Any:
     """Return the kernel for a window (ny, nx).
 
     Launch it with `warps` * 32 threads a block; blocks along x are a frame's, along y the frames. It takes
     frames (n_frames, h * w) uint16 or float32; w and places (n,), each window's first pixel, both int32;
     maps of dark and electrons per ADU (2, h * w), saturation, tables (n_variants, rows, n) and taps
-    (n, 2, 1 + reach), inverse pivots (h * w,), of which `flat` asks (`faintspot.kernels.flat_start`), all
+    (n, 2, 1 + reach), inverse pivots (h * w,) for the denoising (`faintspot.kernels.flat_start`), all
     float32; variants (n_frames,) int32; and writes numbers (5, n_frames, n) float32,
     counts (2, n_frames, n) int32 and flags (n_frames, n) uint8.
 
@@ -185,10 +183,10 @@ def slopes_kernel(
     ny, nx, rows, threads, last = strips.ny, strips.nx, strips.rows, strips.threads, strips.strips - 1
     centre_x, centre_y = 0.5 * (nx - 1), 0.5 * (ny - 1)
     full = strips.full
-    pitch, flat_rows = pitch_of(nx), ny if flat else 1
+    pitch, flat_rows = pitch_of(nx), ny if before == DENOISE else 1
     planes = 3 if before == SMOOTH else 2
     gather, share, fill = make_gather(strips), make_share(strips), make_fill(strips)
-    recall, smooth, denoise = make_recall(strips), make_smooth(strips), make_denoise(strips, algorithm, flat)
+    recall, smooth, denoise = make_recall(strips), make_smooth(strips), make_denoise(strips, algorithm)
     locate, store = make_locate(strips), make_store(strips)
 
     @kernel

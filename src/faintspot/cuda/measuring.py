@@ -123,8 +123,7 @@ class DevicePipeline:
         self.layout = layout
         self.calibration = calibration
         self._preparation = preparation
-        flat = prepared.flat_start.size > 0
-        self._kernel = slopes_kernel(layout.window, prepared.before, prepared.algorithm, flat)
+        self._kernel = slopes_kernel(layout.window, prepared.before, prepared.algorithm)
         height, line = layout.frame_shape
         if height * line > MOST_FRAME_PIXELS:
             raise InputError(
@@ -136,7 +135,7 @@ class DevicePipeline:
         maps = np.asarray(calibration.maps(layout.frame_shape), np.float32)
         self._maps = cuda.to_device(np.ascontiguousarray(maps.reshape(2, -1)))
         self._taps = cuda.to_device(np.ascontiguousarray(prepared.taps, np.float32))
-        self._pivots = cuda.to_device(inverse_pivots(layout.window) if flat else np.zeros(1, np.float32))
+        self._pivots = cuda.to_device(inverse_pivots(layout.window))
         self._tables: tuple[NDArray[np.float32], Any] | None = None
         self._first_variants = cuda.to_device(np.zeros(1, np.int32))
 

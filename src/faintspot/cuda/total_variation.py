@@ -30,7 +30,6 @@ from faintspot.kernels.total_variation import (
     CHAMBOLLE,
     CHECK_INTERVAL,
     FGP,
-    FIRST_MULTIPLIER,
     HIGHEST_STRENGTH,
     LOWERED_STRENGTH,
 )
@@ -40,12 +39,6 @@ largest, smallest = warp.largest, warp.smallest
 
 SMALLEST_STRENGTH = 1e-8  # relative to the image's range: below its rounding error
 SMALLEST_RANGE = 1e-30  # of an image: smaller ones count as constant
-
-
-@device
-def first_inverse_multiplier(pixels: Any, radius: Any) -> Any:
-    """1 / lambda of the first iterations, in units of the normalised image."""
-    return math.sqrt(float32(pixels)) / (float32(FIRST_MULTIPLIER) * radius)
 
 
 @device
@@ -189,7 +182,7 @@ def make_iterations(strips: Strips, algorithm: int) -> Any:
             norm = warp_total(norm)
             if norm > float32(0.0):
                 inverse = norm * inverse_root(norm) * inverse_radius
-            if until_check == float32(0.0):
+            if until_check == float32(0.0) or iteration >= last:
                 until_check = check_after
                 if tolerance > float32(0.0):
                     converged = has_converged(q, p, g, lane, inverse, momentum, tolerance)
@@ -223,43 +216,12 @@ def make_normalise(strips: Strips) -> Any:
     return normalise
 
 
-def make_start(strips: Strips, flat: bool) -> Any:
-    """Return the function that writes the first p and q and returns the first 1 / lambda."""
-    if flat:
-        return make_start_flat(strips)
-    rows, pixels = strips.rows, strips.ny * strips.nx
-
-    @device
-    def start_at_zero(
-        g: Any,
-        plane: Any,
-        pivots: Any,
-        lane: Any,
-        present: Any,
-        in_row: Any,
-        in_last: Any,
-        radius: Any,
-        p: Any,
-        q: Any,
-    ) -> Any:
-        for r in range(rows):
-            for axis in range(2):
-                p[axis, r] = q[axis, r] = float32(0.0)
-        return first_inverse_multiplier(pixels, radius)
-
-    return start_at_zero
-
-
-def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
-    """Return the function that denoises an image, (rows,) per thread, in place.
-
-    `flat`: whether it begins at the flat solution's dual field, else at zero.
-    """
+def make_denoise(strips: Strips, algorithm: int) -> Any:
+    """Return the function that denoises an image, (rows,) per thread, in place."""
     rows, pixels = strips.rows, strips.ny * strips.nx
     normalise, divergence = make_normalise(strips), make_divergence(strips)
-    start, iterate = make_start(strips, flat), make_iterations(strips, algorithm)
+    start, iterate = make_start_flat(strips), make_iterations(strips, algorithm)
     chambolle = algorithm == CHAMBOLLE
-    first_age = MOMENTUM_AGE if flat else 1.0
 
     @device
     def denoise(
@@ -274,7 +236,7 @@ def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
         plane: Any,
         pivots: Any,
     ) -> Any:
-        """`plane` and `pivots`: see `make_laplace`; used where the start is flat.
+        """`plane` and `pivots`: see `make_laplace`.
 
         Return the number of iterations, and whether they converged and the strength was too strong.
         """
@@ -295,7 +257,7 @@ def make_denoise(strips: Strips, algorithm: int, flat: bool) -> Any:
         p, q = cuda.local.array((2, rows), float32), cuda.local.array((2, rows), float32)
         inverse = start(g, plane, pivots, lane, present, in_row, in_last, radius, p, q)
         iterations, converged = iterate(
-            q, p, g, lane, in_row, in_last, inverse, float32(first_age), radius, tolerance, limit
+            q, p, g, lane, in_row, in_last, inverse, float32(MOMENTUM_AGE), radius, tolerance, limit
         )
         d = cuda.local.array(rows, float32)
         if chambolle:

@@ -146,7 +146,7 @@ class GravityPrepared(Prepared):
 
     @property
     def flat_start(self) -> NDArray[np.float32]:
-        """What the denoising's start is computed from; no elements where it begins at zero."""
+        """What the denoising's start is computed from; no elements where there is none."""
         return NO_TABLE
 
     @cached_property

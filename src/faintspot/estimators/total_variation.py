@@ -21,9 +21,9 @@ from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
-from faintspot.kernels.flat_start import NO_TABLE, flat_start_table
+from faintspot.kernels.flat_start import flat_start_table
 from faintspot.options import PerSubaperture, is_auto, option
-from faintspot.presets import PRESETS, of_denoising, starts_flat
+from faintspot.presets import PRESETS, of_denoising
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # times the automatic strength
 _LEAST_STRENGTH_E = 1e-3
@@ -46,7 +46,7 @@ class TotalVariation(KeepingBrightest):
     tolerance: Any = option(
         None,
         "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. "
-        'Default: that of the preset, 0.01 or, with "fast", 0: only the limit stops it.',
+        'Default: that of the preset, 0.02 or, with "fast", 0: only the limit stops it.',
         low=0.0,
         high=1.0,
     )
@@ -58,8 +58,8 @@ class TotalVariation(KeepingBrightest):
     )
     preset: str = option(
         "accurate",
-        '"fast" does little work, and the same for every image: the denoising begins at the dual field of a '
-        "flat solution and makes 8 iterations. docs/fast.md says what it costs.",
+        '"fast" does little work, and the same for every image: 8 iterations of the denoising. docs/fast.md '
+        "says what it costs.",
         choices=PRESETS,
         per_subaperture=False,
     )
@@ -170,7 +170,7 @@ class _Prepared(GravityPrepared):
     @cached_property
     def flat_start(self) -> NDArray[np.float32]:
         """See `GravityPrepared`."""
-        return flat_start_table(*self.sensor.window) if starts_flat(self.estimator.preset) else NO_TABLE
+        return flat_start_table(*self.sensor.window)
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `Prepared`."""

@@ -63,7 +63,7 @@ def flat_start_table(ny: int, nx: int, dtype: DTypeLike = np.float32) -> NDArray
 
 
 NO_TABLE = np.zeros(0, np.float32)
-"""What stands for a start from p = 0."""
+"""What stands for it where nothing is denoised."""
 
 
 @inlined

@@ -56,7 +56,7 @@ class GravityTables(NamedTuple):
     algorithm: Any
     """Of the denoising, see `denoise_group`."""
     flat_start: Any
-    """From `flat_start_table`; without elements, the denoising begins at zero."""
+    """From `flat_start_table`; without elements where nothing is denoised."""
     taps: Any
     """(n_subapertures, 2, 1 + reach) float32: of the smoothing along x and y, the central one first."""
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.estimators.weighted import Weighted
+from faintspot.estimators.window import Window
 from faintspot.study.arm_names import knows_the_spot
 from faintspot.study.curves import Configuration
 from faintspot.study.specification import BEST, CORRECTED
@@ -27,6 +28,11 @@ EXPECTED_EFFICIENCY = {ML: 0.95, MAP: 0.95, Weighted.name: 0.75}
 """Least photon efficiency, by arm, where there is light enough."""
 NEAR_BEST = 1.04
 """Gain-corrected rms over the smallest of all arms up to which an arm counts as near the best."""
+_OF_WINDOWS = (
+    "True positions are uniform within plus and minus the range that stands behind each cell (±1 px in "
+    "most) on each axis; how near to the limit an arm comes depends on it, that of a fixed window (`window`, "
+    "told the mean light as `trained` is) above all: it lives from a narrow one, as in a closed loop."
+)
 _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dominate its error
 
 
@@ -167,6 +173,7 @@ def markdown(dataset: xarray.Dataset, command: str) -> str:
         f"Made by `{command}`: {dataset.attrs['n']} images of each cell, settings chosen on one half and "
         f"scored on the other, seed {dataset.attrs['seed']}; all arms have the range of true positions as "
         "their search range. The arms are those of [study.md](study.md).\n",
+        *([f"{_OF_WINDOWS}\n"] if Window.name in dataset["arm"].values else []),
         "## What it says\n",
         *(f"- {line}" for line in findings(dataset)),
         "",

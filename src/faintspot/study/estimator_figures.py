@@ -115,7 +115,7 @@ def _error_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
         "Solid: estimators that know the spot; dashed: those that do not, each with its own best k, "
         "strength, width or threshold. Broad grey line: the Cramer-Rao bound. Dotted: R of always "
         "answering the centre. Bars: one standard error. All have the same search range, that of the true "
-        "positions."
+        "positions, from which a fixed window lives: the narrower, the better."
     )
     _legend(figure, dataset, bound=True)
     return _with_data(figure, dataset, group, "error", "Slope error against signal", caption)
@@ -132,7 +132,8 @@ def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
     caption = (
         "The light with which an estimator at the Cramer-Rao bound would have the same R, over the light "
         "that was used. More than 1 at little light: there the search range says more than the light. "
-        "What lies above 1.35 is cut off; the numbers are in the data."
+        "What lies above 1.35 is cut off; the numbers are in the data. The range of true positions is in the "
+        "title; a fixed window depends on it most."
     )
     _legend(figure, dataset, bound=True)
     return _with_data(figure, dataset, group, "efficiency", "Photon efficiency", caption)

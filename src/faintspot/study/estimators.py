@@ -10,6 +10,7 @@ from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.estimators.trained import Trained
 from faintspot.estimators.weighted import Weighted
+from faintspot.estimators.window import Window
 from faintspot.study.arm_names import DEFAULT_ARMS
 from faintspot.study.specification import StudySpecification, Sweep
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 NAME = "estimators"
 ARMS = (
     *DEFAULT_ARMS,
-    *(kind.name for kind in (Weighted, Matched, MaximumLikelihood, MaximumAPosteriori, Trained)),
+    *(kind.name for kind in (Window, Weighted, Matched, MaximumLikelihood, MaximumAPosteriori, Trained)),
 )
 REALISATIONS = 10_000
 QUICK_REALISATIONS = 2_000

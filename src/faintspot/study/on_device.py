@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot.cuda import every_k
 from faintspot.cuda.drawing import drawing_kernel, profile_tables
+from faintspot.cuda.flat_start import inverse_pivots
 from faintspot.cuda.fused import FEWEST_BLOCKS
 from faintspot.cuda.strips import WARP
 from faintspot.estimators.base import Estimator
@@ -180,6 +181,7 @@ class DeviceTables:
             np.float32(option("noise_std") if denoises else 0.0),
             np.float32(option("tolerance") if denoises else 0.0),
             np.int32(option("max_iterations") if denoises else 0),
+            cuda.to_device(inverse_pivots((side, side))),
             cuda.to_device(taps),
             *limits,
             positions,

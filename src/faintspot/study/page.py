@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from faintspot.errors import InputError
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Page, Section, configuration_section, html_of, write_page
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
 from faintspot.study.cell_table import mode_in_words
 from faintspot.study.claims import fixed_mode, verdicts
 from faintspot.study.efficiency import compares_estimators, findings
@@ -134,6 +135,15 @@ def _is_paper(names: Iterable[str]) -> bool:
     return all(name in _PAPER_TITLES or name == _KEPT_PIXELS for name in names)
 
 
+def _widths_in_words(specification: StudySpecification) -> str:
+    widths = {profile: f"{fwhm:.2f} s" for profile, fwhm in FWHM_OF_SIZE_1_PX.items()}
+    said = "FWHM in px: " + ", ".join(f"{width} ({profile})" for profile, width in widths.items())
+    largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"]
+    if _is_paper(sweep.name.split()[0] for sweep in specification.sweeps):
+        said += f"; the paper’s largest, of about 4 px, are s = 2: diffraction spots of {largest:.2f} px"
+    return said
+
+
 def _page(dataset: xarray.Dataset) -> Page:
     attributes = dataset.attrs
     done, total = int(dataset["done"].sum()), dataset.sizes["cell"]
@@ -151,6 +161,7 @@ def _page(dataset: xarray.Dataset) -> Page:
             "Realisations": f"{attributes['n']} a cell: settings chosen on one half, scored on the other",
             "Slope error R": "mean of (|dx| + |dy|) / 2; ± one standard error, brackets 95 % intervals",
             "±1 px, ±4 px": "the range that true positions were drawn from, on each axis",
+            "Spots of size s": _widths_in_words(specification),
             "Seed": str(attributes["seed"]),
             "Measured with": f"faintspot {attributes.get('faintspot_version', 'unknown')}",
         },
