@@ -54,8 +54,9 @@ for command in commands:
 
 @pytest.fixture
 def no_extras(monkeypatch: pytest.MonkeyPatch) -> None:
-    for package in OPTIONAL:
-        monkeypatch.setitem(sys.modules, package, None)
+    known = [name for name in sys.modules if name.partition(".")[0] in OPTIONAL]
+    for name in [*OPTIONAL, *known]:
+        monkeypatch.setitem(sys.modules, name, None)
 
 
 @pytest.mark.usefixtures("no_extras")
