@@ -17,3 +17,7 @@ class MissingExtraError(ImportError):
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(f"{purpose} needs {package}: install it with pip install 'faintspot[{extra}]'")
+
+
+class CacheWarning(RuntimeWarning):
+    """Compiled kernels cannot be kept on disk; the message says what to set."""

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from typing import Any
 
@@ -81,3 +84,34 @@ def test_scratch_is_kept_until_the_shape_of_the_work_changes() -> None:
         run_groups(job, 1, lanes_for(np.float32, 4), window, 1)
     assert used[0] is used[1]
     assert used[2].spare.size == 6 * 6 * 4
+
+
+_FORKED = """
+import multiprocessing, threading, warnings
+import numpy as np
+from faintspot import Layout, Settings, SlopePipeline
+
+warnings.simplefilter("ignore")  # Python 3.12 warns of forks in a process with threads
+layout = Layout.grid((60, 60), pixels=8)
+frame = np.random.default_rng(1).poisson(3, layout.frame_shape).astype(np.float32)
+pipeline = SlopePipeline(layout, Settings("tv", noise_std=3.0, keep_brightest=20), threads=2)
+before = pipeline(frame).vector
+assert threading.active_count() > 1
+fork = multiprocessing.get_context("fork")
+answer = fork.Queue()
+process = fork.Process(target=lambda: answer.put(pipeline(frame).vector))
+process.start()
+found = answer.get(timeout=60)
+process.join()
+assert process.exitcode == 0
+assert np.array_equal(found, before)
+assert np.array_equal(pipeline(frame).vector, before)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a system without fork")
+def test_a_process_that_forks_after_its_threads_have_worked() -> None:
+    """The child has none of the threads, and makes its own."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    done = subprocess.run([sys.executable, "-c", _FORKED], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

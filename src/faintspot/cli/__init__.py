@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from typing import Any
 
 import click
@@ -13,6 +14,7 @@ from faintspot.errors import InputError, MissingExtraError
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
+    "doctor": "Say what is installed, what this machine allows, and what to do about what is missing.",
     "estimators": "List the estimators, or the options of one.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "loop": "Measure what a method gains in a closed adaptive-optics loop, in simulation.",
@@ -89,6 +91,7 @@ def main(arguments: list[str] | None = None) -> Any:
     """Run the command line; an error of the user's ends with one line and exit code 2."""
     # Before NumPy is loaded: small matrices gain nothing from BLAS threads, which get in the way of our own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    warnings.formatwarning = lambda message, *_: f"faintspot: warning: {' '.join(str(message).split())}\n"
     try:
         return group.main(args=arguments, prog_name="faintspot", standalone_mode=False)
     except click.ClickException as error:

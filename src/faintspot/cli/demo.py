@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -12,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from faintspot import configuration
+from faintspot.cli.needs import can_make
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
 from faintspot.files import write_atomically
@@ -20,6 +22,9 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 from faintspot.study import demonstration
 from faintspot.study.demonstration import Comparison
+
+if TYPE_CHECKING:
+    from faintspot.report import Arm
 
 
 @click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
@@ -37,13 +42,14 @@ def command(output: str, frames: int, seed: int) -> None:
     chosen on one half of the frames and scored on the other.
 
     The folder then holds the frames of one flux, their configuration, the slopes of both arms and the report
-    page, made by the same commands that you would use on frames of your own.
+    page, made by the same commands that you would use on frames of your own. The page needs the extra `web`.
 
     \b
     Example:
       faintspot demo -o /tmp/demo --frames 2000
     """
     folder = Path(output)
+    with_report = can_make("report page", "web", "matplotlib", "jinja2")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -54,8 +60,12 @@ def command(output: str, frames: int, seed: int) -> None:
     console = Console()
     for comparison in comparisons:
         console.print(comparison_table(comparison, rng))
-    write_files(folder, comparisons[0], frames, rng)
-    click.echo(f"{folder / 'report.html'}: open it in a browser")
+    page_parts = write_files(folder, comparisons[0], frames, rng)
+    if with_report:
+        write_page(folder, **page_parts)
+        click.echo(f"{folder / 'report.html'}: open it in a browser")
+    else:
+        click.echo(f"{folder}: frames, configurations and slopes")
     click.echo("With frames of your own: faintspot layout --help")
 
 
@@ -92,9 +102,11 @@ def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
     return table
 
 
-def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator) -> None:
-    """Write new frames at one flux, measure them in both arms with what was chosen, and make the report."""
-    from faintspot.report import Arm, slopes_report, write_report
+def write_files(
+    folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Write new frames at one flux, measure them in both arms with what was chosen; return what it shows."""
+    from faintspot.report import Arm
 
     layout = demonstration.demonstration_layout()
     shown = demonstration.FLUXES_E.index(demonstration.SHOWN_FLUX_E)
@@ -113,6 +125,13 @@ def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.ran
         stored = read_slopes(output).variables
         arms.append(Arm(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations"))))
         stages[name] = SlopePipeline.from_file(config).explain(frames[0])
+    return {"arms": arms, "layout": layout, "stages": stages, "truth": truth}
+
+
+def write_page(folder: Path, arms: list[Arm], **shown: Any) -> None:
+    """Make the report."""
+    from faintspot.report import slopes_report, write_report
+
     facts = {
         "Source": "simulated, with known truth",
         "Light": f"{demonstration.SHOWN_FLUX_E:g} e- per sub-aperture and frame",
@@ -121,9 +140,7 @@ def write_files(folder: Path, comparison: Comparison, n_frames: int, rng: np.ran
     }
     html = slopes_report(
         arms,
-        layout=layout,
-        stages=stages,
-        truth=truth,
+        **shown,
         title="faintspot demonstration",
         facts=facts,
         configuration=(folder / "tv.toml").read_text(encoding="utf-8"),

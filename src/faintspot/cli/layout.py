@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from faintspot import configuration
 from faintspot.cli import layout_options
 from faintspot.cli.layout_options import plain
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.cli.needs import can_make, suggested_slopes
+from faintspot.errors import InputError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import SlopePipeline
@@ -172,6 +173,7 @@ def command(
         "move_windows": move_windows,
     }
     optics = layout_options.optics(target, pixel_scale, subaperture_size, diameter)
+    with_picture = can_make("picture", "web", "matplotlib", asked=picture is not None)
     with open_frames(frames, key=key) as source:
         calibration = layout_options.calibration(
             target, dark=dark, flat=flat, bad_pixels=bad_pixels, gain_e_per_adu=gain, read_noise_e=read_noise
@@ -187,7 +189,9 @@ def command(
     if keeps_settings:
         settings = configuration.load(target, "settings")
         notes.append(f"  the settings that {output} has are kept")
-    drawn = _draw(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, picture, target)
+    drawn = with_picture and _draw(
+        np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, picture, target
+    )
     # The layout last: it may be long, and whatever is saved after it reads it again.
     for item in (settings, calibration, layout):
         configuration.save(target, item)
@@ -195,8 +199,9 @@ def command(
         click.echo(line)
     if calibration.gain_e_per_adu == 1.0:
         click.echo("  one electron per ADU assumed; give --gain if your camera has another")
-    click.echo(f"  {drawn}")
-    arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", "slopes.zarr"]
+    if drawn:
+        click.echo(f"  {drawn}")
+    arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", suggested_slopes()]
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
 
@@ -271,16 +276,11 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
 
 
 def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
-    """Draw frame and windows and say where; without matplotlib only a picture that was asked for fails."""
-    path = picture or str(target.with_suffix(".png"))
-    try:
-        from faintspot.report import layout_picture
+    """Draw frame and windows, and say where."""
+    from faintspot.report import layout_picture
 
-        layout_picture(frame, layout, path)
-    except MissingExtraError as error:
-        if picture is not None:
-            raise
-        return f"no picture: {error}"
+    path = picture or str(target.with_suffix(".png"))
+    layout_picture(frame, layout, path)
     return f"picture: {path}"
 
 

@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from faintspot.compare.running import Workplace
+
+
+_needs_loop = needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
 
 
 def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -85,6 +89,7 @@ def show(name: str) -> None:
     click.echo(load_loop(name).to_text(), nl=False)
 
 
+@_needs_loop
 @command.command(short_help="Observe with and without denoising in turn.")
 @_experiment_options
 def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **where: Any) -> None:
@@ -110,6 +115,7 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
     _report(folder)
 
 
+@_needs_loop
 @command.command(short_help="Measure the Strehl ratio against the star's magnitude.")
 @_experiment_options
 @click.option("--arms", metavar="NAMES", help="Methods to compare, with commas. Default: all that suit.")
@@ -153,6 +159,7 @@ def magnitude(
     _report(folder)
 
 
+@_needs_loop
 @command.command(short_help="Say what limits the Strehl ratio, by switching terms off.")
 @_experiment_options
 @click.option("--arms", metavar="NAMES", help="Methods, with commas. Default: brightest,smoothed,tv.")

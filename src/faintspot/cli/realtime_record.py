@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.cli.needs import needs
 from faintspot.errors import InputError
+from faintspot.extras import require
 
 if TYPE_CHECKING:
     from faintspot.realtime.recorder import RecordingReport
@@ -22,6 +24,7 @@ _AO_MODE = click.option(
 )
 
 
+@needs("realtime", "zarr")
 @click.command("record", short_help="Record the telemetry of a running engine.")
 @click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
 @click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
@@ -47,6 +50,8 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
         raise InputError(f"{out}: expected a name that ends in .zarr or .fits")
     if out.suffix == ".fits" and out.exists():
         raise InputError(f"{out}: exists already: choose another name")
+    if out.suffix == ".fits":
+        require("realtime", "aotpy", purpose="Writing an AOT file")
     store = out.with_suffix(".zarr")
     recorder = Recorder(name, store)
     total: Any = frames  # None, where it is not known, makes the bar a moving one
@@ -59,6 +64,7 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
         _export(store, out, ao_mode)
 
 
+@needs("realtime", "zarr", "aotpy")
 @click.command("export", short_help="Turn recorded telemetry into an AOT file.")
 @click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
 @click.argument("out", type=click.Path(path_type=Path), metavar="OUT")

@@ -9,11 +9,13 @@ from typing import Any
 
 import click
 
+from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.realtime_control import summary
 from faintspot.realtime.private_socket import socket_path
 
 
+@needs("realtime", "pyshmem")
 @click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
 @click.option(
     "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Configuration."

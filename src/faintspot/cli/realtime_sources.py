@@ -7,6 +7,7 @@ from contextlib import nullcontext
 
 import click
 
+from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.realtime_camera import stop_on_signal
 
@@ -92,6 +93,7 @@ def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable
     return None if advance is None else lambda published: advance(published, total)
 
 
+@needs("realtime", "pyshmem")
 @click.command("bridge", short_help="Follow the frames of a pyshmem stream.")
 @click.argument("stream")
 @_RING

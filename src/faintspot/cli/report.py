@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from faintspot.cli.needs import needs
 from faintspot.errors import InputError
 from faintspot.io.locations import split_location
 from faintspot.io.zarr_store import holds_telemetry
@@ -13,6 +14,7 @@ from faintspot.loop.stored_results import holds_loop_results
 from faintspot.study.stored_results import study_attributes
 
 
+@needs("web", "matplotlib", "jinja2")
 @click.command(short_help="Make a web page of pictures and tables from slopes, a study, a loop or telemetry.")
 @click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER_ARM]")
 @click.option(

@@ -8,7 +8,9 @@ from pathlib import Path
 import click
 
 from faintspot.cli.progress import progress_bar
+from faintspot.errors import InputError, MissingExtraError
 from faintspot.flags import SubapertureFlag
+from faintspot.io.formats import slope_format
 from faintspot.io.slopes_format import UNITS
 from faintspot.presets import PRESETS
 from faintspot.recorded import Summary, measure_recorded
@@ -105,6 +107,7 @@ def command(
       faintspot slopes night1.fits -o window.zarr --estimator window --mean-light
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
+    _check_format(output)
     with progress_bar("slopes") as advance:
         summary = measure_recorded(
             frames,
@@ -128,6 +131,14 @@ def command(
         )
     for line in describe(summary, output):
         click.echo(line)
+
+
+def _check_format(output: str) -> None:
+    """Refuse a format whose package is missing, before the work, and say which one needs none."""
+    try:
+        slope_format(Path(output)).require()
+    except MissingExtraError as error:
+        raise InputError(f"{error}, or write NumPy's own format: -o {Path(output).stem}.npz") from None
 
 
 def describe(summary: Summary, output: str) -> list[str]:

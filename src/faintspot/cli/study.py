@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def command() -> None:
     """
 
 
+@needs("study", "xarray", "zarr")
 @command.command(short_help="Run a study of your own.")
 @click.argument("specification", metavar="TOML")
 @click.option(
@@ -96,6 +98,7 @@ def run(
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
+@needs("study", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Repeat the study of Basden et al. 2015.")
 @click.option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
 @click.option(
@@ -138,6 +141,7 @@ def paper(
     click.echo(f"{page}: open it in a browser")
 
 
+@needs("study", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Compare all estimators with each other and with the limit.")
 @click.option("--quick", is_flag=True, help="A few cells of fewer realisations: less than a minute.")
 @click.option(

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from faintspot import configuration
+from faintspot.cli.needs import can_make, suggested_slopes
 from faintspot.cli.progress import progress_bar
 from faintspot.compare.photometry import (
     DEFAULT_BAND,
@@ -22,7 +23,7 @@ from faintspot.compare.photometry import (
     DEFAULT_THROUGHPUT,
     ZERO_POINTS,
 )
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.errors import InputError
 from faintspot.files import write_atomically
 from faintspot.io.frames import open_frames
 from faintspot.planner import answer_text
@@ -141,6 +142,9 @@ def command(
     """
     target = Path(output)
     _check_target(target, overwrite)
+    drawing = None
+    if can_make("picture", "web", "matplotlib", asked=picture is not None):
+        drawing = Path(picture) if picture else target.with_name(f"{target.stem}-tune.png")
     given = _given(camera, options)
     known = _sensor(grid, layout_file, target, given)
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
@@ -159,7 +163,7 @@ def command(
     click.echo("This rests on")
     for line in _wrapped(answer_text.foundations(answer), console, "  "):
         click.echo(line)
-    _write(answer, target, picture, frames)
+    _write(answer, target, drawing, frames)
 
 
 def answer_table(answer: Answer) -> Table:
@@ -281,23 +285,20 @@ def _wrapped(lines: list[str], console: Console, indent: str = "") -> list[str]:
     ]
 
 
-def _write(answer: Answer, target: Path, picture: str | None, frames: tuple[str, ...]) -> None:
+def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str, ...]) -> None:
     """Write configuration and picture, and say what comes next."""
     answer.save(target)
     click.echo(f"{target}: written")
-    path = Path(picture) if picture else target.with_name(f"{target.stem}-tune.png")
-    try:
+    if picture is not None:
         from faintspot.report.drawing import png
 
-        write_atomically(path, png(answer.figure()))
-        click.echo(f"{path}: picture")
-    except MissingExtraError as error:
-        if picture is not None:
-            raise
-        click.echo(f"no picture: {error}")
+        write_atomically(picture, png(answer.figure()))
+        click.echo(f"{picture}: picture")
     if answer.question.layout is None:
         pixels = answer.question.pixels
         click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")
     else:
         names = shlex.join(frames) if frames else "FRAMES"
-        click.echo(f"Next: faintspot slopes {names} --config {shlex.quote(str(target))} -o slopes.zarr")
+        click.echo(
+            f"Next: faintspot slopes {names} --config {shlex.quote(str(target))} -o {suggested_slopes()}"
+        )

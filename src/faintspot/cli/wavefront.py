@@ -8,7 +8,9 @@ from typing import Any
 
 import click
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.cli.needs import can_make
+from faintspot.errors import InputError
+from faintspot.extras import require
 from faintspot.recorded.stored_run import open_run
 from faintspot.sensor.layout import Layout
 from faintspot.wavefront import Wavefront, fit_wavefront, save_wavefront
@@ -59,6 +61,9 @@ def command(
     """
     for name in output:
         check_ending(Path(name))
+        if Path(name).suffix.lower() == ".fits":
+            require("io", "astropy", purpose="Writing a FITS file")
+    with_picture = can_make("picture", "web", "matplotlib", asked=picture is not None)
     run = open_run(Path(slopes))
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
@@ -75,7 +80,8 @@ def command(
     for name in output:
         save_wavefront(name, wavefront)
         click.echo(name)
-    click.echo(_draw(wavefront, layout, Path(slopes), picture))
+    if with_picture:
+        click.echo(_draw(wavefront, layout, Path(slopes), picture))
 
 
 def _print(wavefront: Wavefront) -> None:
@@ -97,16 +103,11 @@ def _print(wavefront: Wavefront) -> None:
 
 
 def _draw(wavefront: Wavefront, layout: Layout, slopes: Path, picture: str | None) -> str:
-    """Draw it and say where; without matplotlib only a picture that was asked for fails."""
-    path = picture or str(slopes.with_name(f"{slopes.name.split('.')[0]}_wavefront.png"))
-    try:
-        from faintspot.files import write_atomically
-        from faintspot.report.drawing import png
-        from faintspot.wavefront.figure import wavefront_figure
+    """Draw it and say where."""
+    from faintspot.files import write_atomically
+    from faintspot.report.drawing import png
+    from faintspot.wavefront.figure import wavefront_figure
 
-        write_atomically(path, png(wavefront_figure(wavefront, layout, slopes.name).figure))
-    except MissingExtraError as error:
-        if picture is not None:
-            raise
-        return f"no picture: {error}"
+    path = picture or str(slopes.with_name(f"{slopes.name.split('.')[0]}_wavefront.png"))
+    write_atomically(path, png(wavefront_figure(wavefront, layout, slopes.name).figure))
     return f"picture: {path}"

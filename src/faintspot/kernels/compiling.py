@@ -9,6 +9,9 @@ from typing import Any
 
 from numba import njit
 from numba.core import types as numba_types
+from numba.core.dispatcher import Dispatcher
+
+from faintspot.kernels.cached import kernel_cache
 
 
 @cache
@@ -54,15 +57,10 @@ def allocating(function: Callable[..., Any]) -> Any:
 
 
 def _dispatcher(function: Callable[..., Any], others: tuple[Path, ...] = (), **options: Any) -> Any:
-    """Compile with a cache that asks for all kernels' sources.
-
-    Numba's cache asks only whether a function's own file has changed, but kernels inline each other across
-    files; so their cache is stamped with all of them.
-    """
-    dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if cache_file is not None and hasattr(cache_file, "_source_stamp"):
-        cache_file._source_stamp = _kernels_stamp() + tuple(_stamp(path) for path in others)
+    """Compile with a cache that asks for all kernels' sources."""
+    dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)
+    if isinstance(dispatcher, Dispatcher):  # where NUMBA_DISABLE_JIT is set, it is the function itself
+        dispatcher._cache = kernel_cache(function, _kernels_stamp() + tuple(_stamp(path) for path in others))
     return dispatcher
 
 

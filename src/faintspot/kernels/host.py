@@ -1,4 +1,4 @@
-"""What the machine offers: vector width, and scratch memory aligned to it."""
+"""What the processor offers: vector width, and scratch memory aligned to it."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ from numpy.typing import DTypeLike, NDArray
 
 from faintspot.errors import InputError
 from faintspot.kernels.simd import Lanes
+from faintspot.kernels.target import compile_target
 
 WIDTHS = (4, 8, 16)
 _ENVIRONMENT = "FAINTSPOT_SIMD_WIDTH"
 
 
-@cache
 def _native_width() -> int:
-    """float32 numbers in one vector register of this machine."""
-    import llvmlite.binding as llvm
-
-    features = llvm.get_host_cpu_features()
-    if features.get("avx512f") and features.get("avx512vl"):
+    """float32 numbers in one vector register of the processor that is compiled for."""
+    features = compile_target().features
+    if {"avx512f", "avx512vl"} <= features:
         return 16
-    return 8 if features.get("avx2") else 4
+    return 8 if "avx2" in features else 4
 
 
 @cache
@@ -40,7 +38,7 @@ def lanes_for(dtype: DTypeLike, width: int | None = None) -> Lanes:
     dtype : float32 or float64
     width : int, optional
         float32 lanes: 4, 8 or 16. Default: the environment variable FAINTSPOT_SIMD_WIDTH, else what the
-        machine has.
+        processor has.
 
     Raises
     ------

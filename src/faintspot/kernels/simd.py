@@ -24,6 +24,8 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import NativeValue, unbox
 
+from faintspot.kernels.target import compile_target
+
 intrinsic: Any = extending.intrinsic  # to a type checker, what it returns has the signature of its typing
 
 
@@ -298,7 +300,7 @@ def square_root(typing_context: Any, a: Any) -> Any:
     return a(a), emit
 
 
-# Hardware estimates by processor feature and float32 lanes: LLVM's name, arguments after `a`.
+# Hardware estimates by feature of the target and float32 lanes: LLVM's name, arguments after `a`.
 # With avx512vl all widths use the same estimate, so that results do not depend on the width.
 _ROOT_ESTIMATES = {
     ("avx512vl", 16): "llvm.x86.avx512.rsqrt14.ps.512",
@@ -312,10 +314,8 @@ _INVERSE_ESTIMATES = {key: name.replace("rsqrt", "rcp") for key, name in _ROOT_E
 
 def _estimate(builder: Any, vector: Vector, value: Any, names: dict[tuple[str, int], str]) -> Any:
     """Emit the hardware's estimate, to 4e-4 or better; None where there is none."""
-    import llvmlite.binding as llvm
-
-    features = llvm.get_host_cpu_features()
-    usable = [key for key in names if key[1] == vector.width and features.get(key[0])]
+    features = compile_target().features
+    usable = [key for key in names if key[1] == vector.width and key[0] in features]
     if not usable or vector.scalar != types.float32:
         return None
     feature, width = usable[0]

@@ -1,0 +1,61 @@
+"""What commands need beyond faintspot's own dependencies: asked before their work begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+import click
+
+from faintspot.errors import MissingExtraError
+from faintspot.extras import present, require
+
+
+def needs(extra: str, *packages: str) -> Callable[[click.Command], click.Command]:
+    """Declare which packages a command cannot do without, and the extra that installs them.
+
+    The command then ends before any work, in one line, where one is missing; --help names the extra.
+    """
+
+    def declared(command: click.Command) -> click.Command:
+        work = command.callback
+        assert work is not None
+
+        @wraps(work)
+        def checked(*arguments: Any, **options: Any) -> Any:
+            require(extra, *packages, purpose=click.get_current_context().command_path)
+            return work(*arguments, **options)
+
+        command.callback = checked
+        command.epilog = f"Needs the extra `{extra}`: pip install 'faintspot[{extra}]'"
+        return command
+
+    return declared
+
+
+def can_make(what: str, extra: str, *packages: str, asked: bool = False) -> bool:
+    """Tell whether a command can make a part of its output; if not, say so now, and that it is left out.
+
+    Parameters
+    ----------
+    what : str
+        The part, such as "picture".
+    extra, packages : str
+        As for `needs`.
+    asked : bool
+        Whether the user asked for it: then its absence is an error.
+    """
+    try:
+        require(extra, *packages, purpose=f"A {what}")
+    except MissingExtraError as error:
+        if asked:
+            raise
+        click.echo(f"without {what}: {error}", err=True)
+        return False
+    return True
+
+
+def suggested_slopes() -> str:
+    """Return the name to suggest for a file of slopes: one that can be written here."""
+    return "slopes.zarr" if present("zarr") else "slopes.npz"

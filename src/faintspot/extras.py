@@ -1,0 +1,47 @@
+"""Optional packages: which extra installs them, and whether they are there."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from faintspot.errors import MissingExtraError
+
+EXTRAS = {
+    "io": ("astropy", "tifffile", "zarr"),
+    "web": ("matplotlib", "jinja2"),
+    "study": ("xarray", "dask", "distributed", "bokeh"),
+    "realtime": ("pyshmem", "aotpy"),
+    "loop": ("hcipy",),
+    "gpu": ("numba_cuda",),
+}
+"""Packages by the extra to name where one is missing; some extras bring those of others along."""
+
+
+def present(package: str) -> bool:
+    """Tell whether a package can be imported, without importing it."""
+    try:
+        return importlib.util.find_spec(package) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def require(extra: str, *packages: str, purpose: str) -> None:
+    """Make sure that packages are installed, before work begins.
+
+    Parameters
+    ----------
+    extra : str
+        What installs all of them.
+    packages : str
+        Names to import.
+    purpose : str
+        What needs them, the beginning of the message.
+
+    Raises
+    ------
+    MissingExtraError
+        When one or more are not.
+    """
+    missing = [package for package in packages if not present(package)]
+    if missing:
+        raise MissingExtraError(" and ".join(missing), extra, purpose)

@@ -1,0 +1,85 @@
+"""Compiled kernels on disk, where that can be; where it cannot, a warning says so once, and work goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+
+from faintspot.errors import CacheWarning
+
+
+def kernel_cache(function: Callable[..., Any], stamp: Any) -> Any:
+    """Return the cache of a function's machine code, valid as long as `stamp` is the same.
+
+    Numba's own cache asks only whether the function's own file has changed, but kernels inline each other
+    across files.
+    """
+    try:
+        return _KernelCache(function, stamp)
+    except RuntimeError:  # neither in NUMBA_CACHE_DIR, nor beside the sources, nor in the user's folder
+        _warn_once("no folder for them can be written")
+        return NullCache()
+
+
+def cache_folder() -> Path | None:
+    """Return where compiled kernels are kept; None where nowhere."""
+    try:
+        return Path(FunctionCache(kernel_cache).cache_path)
+    except RuntimeError:
+        return None
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache, except that a disk that is full, read-only or damaged ends nothing."""
+
+    def __init__(self, function: Callable[..., Any], stamp: Any) -> None:
+        super().__init__(function)
+        self._cache_file = _KernelFiles(self._cache_path, self._impl.filename_base, stamp)
+
+    def load_overload(self, *arguments: Any) -> Any:
+        """Return what is kept; None, and forget it, where it cannot be read: it is compiled anew then."""
+        try:
+            return super().load_overload(*arguments)
+        except Exception:  # a damaged pickle raises anything
+            with suppress(OSError):
+                self._cache_file.flush()
+            return None
+
+    def save_overload(self, *arguments: Any) -> None:
+        """Keep machine code if that can be done."""
+        try:
+            super().save_overload(*arguments)
+        except OSError as error:
+            _warn_once(f"{self._cache_path}: {error.strerror or error}")
+
+
+class _KernelFiles(IndexDataCacheFile):
+    """The files of one function: an index, and one for each kind of arguments and processor.
+
+    Numba counts the latter from 1. Where two processes compile at once, both may then write the same file,
+    and the index name it as the code for one processor when it is that for another. Here names say what is
+    inside.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep machine code; of two processes that do so at once, one may have to compile again later."""
+        name = f"{self._index_name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.nbc"
+        self._save_data(name, data)
+        self._save_index({**self._load_index(), key: name})
+
+
+@cache
+def _warn_once(reason: str) -> None:
+    warnings.warn(
+        f"compiled kernels cannot be kept ({reason}): every process compiles them anew, which takes half a "
+        "minute; set NUMBA_CACHE_DIR to a folder that can be written",
+        CacheWarning,
+        stacklevel=2,
+    )
