@@ -227,7 +227,7 @@ def test_a_writer_that_dies_in_the_middle_is_survived(watched: Watched, name: st
     pyshmem.unlink(f"{name}_commands")
     successor = pyshmem.create(f"{name}_commands", shape=(COMMANDS,), dtype=np.float64)
     successor.write(np.full(COMMANDS, 2.0), frame_id=6)
-    wait_for(lambda: watched.truth["command_frame"] == 6, watched.frame)
+    wait_for(lambda: watched.telescope.commands.frame == 6, watched.frame)
     successor.unlink()
 
 

@@ -78,12 +78,10 @@ class CommandStream:
 
     def take(self) -> None:
         """Let the mirror have the newest commands."""
-        if self._source is None or self._source.count == self._seen:
-            now = time.monotonic()
-            if now >= self._next_look_s:
-                self._next_look_s = now + _LOOK_S
-                self._look_after()
-        if self._source is not None and self._source.count != self._seen:
+        now = time.monotonic()
+        if not self._read() and now >= self._next_look_s:
+            self._next_look_s = now + _LOOK_S
+            self._look_after()
             self._read()
 
     def close(self) -> None:
@@ -92,13 +90,16 @@ class CommandStream:
             self._source.close()
             self._source = None
 
-    def _read(self) -> None:
+    def _read(self) -> bool:
+        """Take commands that are new; return whether whole ones had come."""
         counters = self.counters
+        if self._source is None or self._source.count == self._seen:
+            return False
         try:
             publication = self._source.read_publication(timeout=_READ_S)
         except (TimeoutError, self._pyshmem.InconsistentStreamError):
             counters.incomplete += 1
-            return
+            return False
         counters.overtaken += max(0, publication.count - self._seen - 1)
         self._seen = publication.count
         values = publication.payload.astype(np.float64)
@@ -107,10 +108,11 @@ class CommandStream:
             if not self._refuses:
                 self._say(f"stream {self.stream}: not finite, or beyond {LARGEST_NM:g} nm; {self._keeps}")
             self._refuses = True
-            return
+            return True
         counters.taken += 1
         self._refuses = False
         self.commands_nm, self.frame = values, publication.frame_id
+        return True
 
     @property
     def _keeps(self) -> str:
@@ -118,7 +120,7 @@ class CommandStream:
         return f"the mirror {'keeps its last commands' if taken else 'stays flat'}"
 
     def _look_after(self) -> None:
-        """Nothing new: see whether the stream is still the same, and for one where there is none."""
+        """Nothing whole has come: see whether the stream is still the same, and for one where there is none."""
         if self._source is not None:
             try:
                 there = self._pyshmem.stat(self.stream)["instance_id"]
