@@ -120,7 +120,7 @@ class CommandStream:
         return f"the mirror {'keeps its last commands' if taken else 'stays flat'}"
 
     def _look_after(self) -> None:
-        """Nothing whole has come: see whether the stream is still the same, and for one where there is none."""
+        """Nothing whole has come: see whether the stream is the same, look for one where there is none."""
         if self._source is not None:
             try:
                 there = self._pyshmem.stat(self.stream)["instance_id"]
