@@ -23,7 +23,7 @@ from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.loop import load_loop
 from faintspot.loop.control import slope_turbulence
-from faintspot.loop.simulation import prepare
+from faintspot.loop.observatory import prepare
 
 _NOISE_PX = 0.5
 _LARGE, _LARGE_COMMANDS, _ACROSS, _REACH = 9232, 4600, 68, 4

@@ -22,7 +22,7 @@ from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.calibration import make_pipeline
 from faintspot.loop.camera import make_detector
-from faintspot.loop.simulation import LoopOptics, prepare
+from faintspot.loop.observatory import LoopOptics, prepare
 from faintspot.loop.telescope import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0

@@ -102,3 +102,13 @@ def test_r0_drifts_between_its_ends() -> None:
 def test_an_outer_scale_too_large_for_the_screens_is_refused() -> None:
     with pytest.raises(InputError, match=r"outer_scale_m = 150: expected at most"):
         make_atmosphere(load_loop("eight_metre").replace("atmosphere", outer_scale_m=150.0), 1)
+
+
+def test_another_wind_goes_on_from_the_same_wavefront() -> None:
+    """At the moment of the change to 1e-3 of the wavefront's scatter: the rest is rounding of places."""
+    air = make_atmosphere(_one_layer(), 5, 0)
+    faster = air.blown(2 * air.velocity, 300.0)
+    scatter = air.wavefront_nm(300.0).std()
+    np.testing.assert_allclose(faster.wavefront_nm(300.0), air.wavefront_nm(300.0), atol=1e-3 * scatter)
+    np.testing.assert_allclose(faster.wavefront_nm(300.1), air.wavefront_nm(300.2), atol=1e-3 * scatter)
+    assert np.abs(faster.wavefront_nm(300.1) - air.wavefront_nm(300.1)).max() > 0.01 * scatter

@@ -12,7 +12,8 @@ from faintspot.errors import InputError
 from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
 from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, PRIOR, arm_kind
 from faintspot.loop.control import learnt_control, telemetry_of
-from faintspot.loop.simulation import Idealised, prepare
+from faintspot.loop.observatory import prepare
+from faintspot.loop.simulation import Idealised
 
 LEARNT = [kind for kind in CONTROLS if kind != INTEGRATOR]
 FAINT = (

@@ -10,7 +10,8 @@ from faintspot.loop import LoopArm, LoopRecord, load_loop, simulate_loop
 from faintspot.loop.atmosphere import make_atmosphere
 from faintspot.loop.calibration import make_pipeline
 from faintspot.loop.mirror import BestFit
-from faintspot.loop.simulation import measure_gains, prepare
+from faintspot.loop.observatory import prepare
+from faintspot.loop.simulation import measure_gains
 
 pytest.importorskip("hcipy")
 

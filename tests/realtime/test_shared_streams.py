@@ -114,7 +114,7 @@ def test_a_lock_that_is_held_is_not_waited_for(name: str) -> None:
 
 
 def test_publishing_does_not_wait_for_a_lock_for_ever(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.realtime.slope_streams.LOCK_LIMIT_S", 0.05)
+    monkeypatch.setattr("faintspot.realtime.shared_streams.LOCK_LIMIT_S", 0.05)
     streams = SlopeStreams(name, 3)
     path = lock_file(f"{name}_details")
     with path.open("wb") as held:

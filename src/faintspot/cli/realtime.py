@@ -11,6 +11,7 @@ from faintspot.cli import (
     realtime_record,
     realtime_run,
     realtime_sources,
+    realtime_telescope,
 )
 
 
@@ -31,6 +32,9 @@ for each in (
     realtime_camera.camera,
     realtime_sources.replay,
     realtime_sources.bridge,
+    realtime_telescope.telescope,
+    realtime_telescope.telescope_set,
+    realtime_telescope.telescope_status,
     realtime_control.status,
     realtime_control.top,
     realtime_control.get,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,11 @@ class MovingLayers:
             total += self.shifted(screen, start - velocity * time_s)
         total *= np.float32(self.r0_m(time_s) ** (-5 / 6))
         return total
+
+    def blown(self, velocity: NDArray[np.float64], time_s: float) -> MovingLayers:
+        """Return the same air with another wind (as `velocity`), which has the same wavefront at one time."""
+        start = self.start + (velocity - self.velocity) * time_s
+        return replace(self, velocity=velocity, start=start % len(self.screens[0]))
 
     def shifted(self, screen: Floats, corner: NDArray[np.float64]) -> Floats:
         """Return the (points, points) of a periodic screen whose first one is at a fractional place."""

@@ -50,40 +50,46 @@ def arm_layout(layout: Layout, arm: LoopArm) -> Layout:
 
 
 def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: LoopArm) -> SlopePipeline:
-    """Return the pipeline of an arm, with the reference slopes of a flat wavefront.
+    """Return the pipeline of an arm, with the reference slopes of a flat wavefront."""
+    return SlopePipeline(
+        arm_layout(sensor.layout, arm),
+        arm.settings,
+        camera_calibration(configuration),
+        reference_slopes(configuration, sensor, arm),
+        psf=_psf(configuration, arm),
+        score=arm.score,
+        threads=1,
+    )
+
+
+def reference_slopes(
+    configuration: LoopConfiguration, sensor: ShackHartmann, arm: LoopArm
+) -> NDArray[np.float32]:
+    """Return what an arm's estimator measures of a flat wavefront, all x, then all y, (2 n,) px.
 
     References are measured with bright frames without noise, and without what is for faint light:
     at its strength of denoising they would be denoised to nothing.
     """
-    layout = arm_layout(sensor.layout, arm)
-    psf = (
-        _flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
-        if arm.psf is None
-        else arm.psf
-    )
     bright = SlopePipeline(
-        layout,
+        arm_layout(sensor.layout, arm),
         arm.settings.replace(estimator=arm.settings.estimator.for_bright_light(), flux_e=None),
         Calibration(dark=0.0, read_noise_e=1.0),
-        psf=psf,
+        psf=_psf(configuration, arm),
         score=arm.score,
         threads=1,
     )
     flat = sensor.spots(np.zeros((sensor.points, sensor.points), np.float32))
-    reference = bright(sensor.frame(flat) * _BRIGHT_E).vector
-    return SlopePipeline(
-        layout,
-        arm.settings,
-        camera_calibration(configuration),
-        reference,
-        psf=psf,
-        score=arm.score,
-        threads=1,
-    )
+    return bright(sensor.frame(flat) * _BRIGHT_E).vector
+
+
+def _psf(configuration: LoopConfiguration, arm: LoopArm) -> PSF:
+    if arm.psf is not None:
+        return arm.psf
+    return flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
 
 
 @lru_cache(maxsize=4)
-def _flat_psf(width_px: float, elongation: float) -> PSF:
+def flat_psf(width_px: float, elongation: float) -> PSF:
     """Return the PSF of a lenslet without turbulence."""
     return PSF.analytic(size=width_px / 2, elongation=elongation)
 

@@ -21,7 +21,7 @@ from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
 from faintspot.loop.record import LoopRecord
 
 if TYPE_CHECKING:
-    from faintspot.loop.simulation import LoopOptics
+    from faintspot.loop.observatory import LoopOptics
 
 Floats = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ class _Known:
 def _learnt(
     configuration: LoopConfiguration, known: _Known, kind: str, noise_scale: float, seed: int
 ) -> Learnt:
-    from faintspot.loop.simulation import prepare
+    from faintspot.loop.observatory import prepare
 
     optics, control = prepare(configuration), configuration.control
     telemetry = _telemetry(_without_told(configuration), known, seed)

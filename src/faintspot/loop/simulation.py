@@ -14,48 +14,25 @@ from faintspot import configuration as configuration_file
 from faintspot.checks import number_between, numbers_between
 from faintspot.control.commands import CommandLine
 from faintspot.control.learning import INTEGRATOR, Learnt
-from faintspot.control.reconstructor import Reconstructor, check_controllable, make_reconstructor
 from faintspot.errors import InputError
 from faintspot.light import MeanLight
 from faintspot.loop.arms import LoopArm
-from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.calibration import (
     centroid_gain,
-    interaction_matrix,
     make_pipeline,
     mean_light,
     typical_spots,
 )
-from faintspot.loop.camera import Exposing, NoiselessDetector, make_detector
-from faintspot.loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
+from faintspot.loop.camera import Exposing, make_detector
+from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.loop.control import learnt_control, make_controller
-from faintspot.loop.mirror import BestFit, DeformableMirror, make_mirror
+from faintspot.loop.observatory import Observatory, air_of, prepare, without_light
 from faintspot.loop.record import LoopRecord
-from faintspot.loop.telescope import PSF_SAMPLING, Pupil, ScienceCamera, make_pupil
-from faintspot.loop.wavefront_sensor import ShackHartmann, make_sensor
+from faintspot.loop.telescope import PSF_SAMPLING
 from faintspot.pipeline import SlopePipeline
 from faintspot.slopes import Slopes
 
 _MOST_ARMS = 127
-_OF_AIR = (
-    "frame_rate_hz",
-    "delay_frames",
-    "mode",
-    "largest_condition",
-)  # of the control: of typical spots, too
-
-
-@dataclass(frozen=True, eq=False)
-class LoopOptics:
-    """Everything that is the same in all runs of a configuration."""
-
-    pupil: Pupil
-    sensor: ShackHartmann
-    mirror: DeformableMirror
-    interaction: NDArray[np.float64]
-    """(2 n, commands) px for 1 nm."""
-    reconstructor: Reconstructor
-    science: ScienceCamera
 
 
 @dataclass(frozen=True)
@@ -160,23 +137,6 @@ def simulate_loop(
     return _Loop(*what, gains).run(progress).record()
 
 
-def prepare(configuration: LoopConfiguration) -> LoopOptics:
-    """Return telescope, sensor, mirror and their calibration; the last ones made are kept.
-
-    Raises
-    ------
-    InputError
-        When no sub-aperture is lit, or there are more commands than slopes can control.
-    MissingExtraError
-        When HCIPy is not installed.
-    """
-    control = Control(largest_condition=configuration.control.largest_condition)
-    camera = Camera(photons_per_subaperture=1.0)
-    return _prepared(
-        replace(configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=control, run=Run())
-    )
-
-
 def measure_gains(
     configuration: LoopConfiguration,
     pipelines: Sequence[SlopePipeline],
@@ -187,7 +147,7 @@ def measure_gains(
 ) -> NDArray[np.float64]:
     """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
     optics, detector = prepare(configuration), detector or make_detector(configuration)
-    spots = _typical_spots(_without_light(configuration), seed, realisation)
+    spots = _typical_spots(without_light(configuration), seed, realisation)
     return np.array(
         [
             centroid_gain(pipeline, optics.sensor, detector, configuration.photons, spots, seed)
@@ -213,13 +173,14 @@ class _Loop:
         self.arms = arms = tuple(arm for arm, _ in ready)
         self.which, self.idealised = which, idealised
         self.seed, self.realisation = seed, realisation
-        self.optics = optics = prepare(configuration)
-        self.air = _air(_without_light(configuration), seed, realisation)
-        self.best_fit = (
-            BestFit.of(optics.mirror, optics.pupil, piston=False) if idealised.correctable else None
+        self.observatory = Observatory(
+            configuration,
+            seed,
+            realisation,
+            correctable=idealised.correctable,
+            noiseless=idealised.noiseless,
         )
-        camera = make_detector(configuration)
-        self.detector: Exposing = NoiselessDetector(camera) if idealised.noiseless else camera
+        self.optics = optics = self.observatory.optics
         self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
         self.lights = [self._first_light(pipeline) for pipeline in self.pipelines]
         for number in range(len(arms)):
@@ -241,9 +202,9 @@ class _Loop:
         """Return the mean light of every sub-aperture for an estimator that uses it, as before a run."""
         if not pipeline.settings.estimator.uses_light or pipeline.settings.flux_e is not None:
             return None
-        spots = _typical_spots(_without_light(self.configuration), self.seed, self.realisation)
+        spots = _typical_spots(without_light(self.configuration), self.seed, self.realisation)
         photons, sensor = self.configuration.photons, self.optics.sensor
-        return mean_light(pipeline, sensor, self.detector, photons, spots, self.seed)
+        return mean_light(pipeline, sensor, self.observatory.detector, photons, spots, self.seed)
 
     def _follow_light(self, number: int) -> None:
         """Tell an arm's pipeline the mean light."""
@@ -262,7 +223,7 @@ class _Loop:
             self.pipelines,
             seed=self.seed,
             realisation=self.realisation,
-            detector=self.detector,
+            detector=self.observatory.detector,
         )
         gains = np.where([arm.true_slopes for arm in self.arms], 1.0, gains)
         return gains, np.where([arm.correct_gain for arm in self.arms], gains, 1.0)
@@ -278,15 +239,11 @@ class _Loop:
 
     def step(self, frame: int) -> None:
         """Simulate one frame."""
-        control, number = self.configuration.control, int(self.which[frame])
-        commands = self.line.acting
-        time = self.idealised.time_s(frame, control.frame_rate_hz)
-        air = self.air.wavefront_nm(time)
-        if self.best_fit is not None:
-            air = self.best_fit.fitted(air)
-        after = air + self.optics.mirror.wavefront_nm(commands)
+        number, commands = int(self.which[frame]), self.line.acting
+        time = self.idealised.time_s(frame, self.configuration.control.frame_rate_hz)
+        after, seen = self.observatory.wavefronts(time, commands)
         self._observe(frame, time, after)
-        slopes = self._measure(frame, after if control.mode == CLOSED else air)
+        slopes = self._measure(frame, seen)
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
         vector = slopes.vector.astype(np.float64) / self.divisors[number]
         self.controllers[number].update(vector, error.astype(np.float64) / self.divisors[number])
@@ -295,23 +252,20 @@ class _Loop:
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
         """Take the science image and write down the truth."""
-        optics = self.optics
-        field = optics.pupil.field(wavefront, self.configuration.science.wavelength_m)
-        self.truth[:, frame] = optics.pupil.strehl(field), optics.pupil.rms(wavefront), self.air.r0_m(time)
+        truth = self.observatory.truth(time, wavefront)
+        self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
         if frame >= self.configuration.run.settle_frames:
-            self.images[self.which[frame]] += optics.science.image(field)
+            self.images[self.which[frame]] += self.optics.science.image(truth.field)
 
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
         """Measure the slopes of the frame that the sensor's camera takes."""
         number, sensor = int(self.which[frame]), self.optics.sensor
         if self.arms[number].true_slopes:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
-        light = sensor.frame(sensor.spots(wavefront)) * self.configuration.photons
-        rng = np.random.default_rng([self.seed, self.realisation, frame, 2])
         prior = None
         if self.arms[number].predict_prior:
             prior = self.controllers[number].expected().mean_px
-        slopes = self.pipelines[number](self.detector.expose(light, rng), prior)
+        slopes = self.pipelines[number](self.observatory.frame(frame, wavefront), prior)
         known = self.lights[number]
         if known is not None:
             self.lights[number] = known.updated(slopes.flux)
@@ -385,31 +339,9 @@ def _checked_schedule(
     return which.astype(np.int64)
 
 
-def _without_light(configuration: LoopConfiguration) -> LoopConfiguration:
-    """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
-    control = Control(**{name: getattr(configuration.control, name) for name in _OF_AIR})
-    camera = Camera(photons_per_subaperture=1.0)
-    return replace(configuration, name="-", camera=camera, control=control, run=Run())
-
-
-@lru_cache(maxsize=2)
-def _prepared(configuration: LoopConfiguration) -> LoopOptics:
-    pupil = make_pupil(configuration)
-    sensor, mirror = make_sensor(configuration, pupil), make_mirror(configuration, pupil)
-    check_controllable(mirror.commands, 2 * len(sensor.layout))
-    interaction = interaction_matrix(sensor, mirror)
-    reconstructor = make_reconstructor(interaction, configuration.control.largest_condition)
-    return LoopOptics(pupil, sensor, mirror, interaction, reconstructor, ScienceCamera.of(pupil))
-
-
-@lru_cache(maxsize=2)
-def _air(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
-    return make_atmosphere(configuration, seed, realisation)
-
-
 @lru_cache(maxsize=2)
 def _typical_spots(
     configuration: LoopConfiguration, seed: int, realisation: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    optics, air = prepare(configuration), _air(configuration, seed, realisation)
+    optics, air = prepare(configuration), air_of(configuration, seed, realisation)
     return typical_spots(configuration, optics.sensor, optics.mirror, air, optics.reconstructor.matrix)

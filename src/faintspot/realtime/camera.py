@@ -120,6 +120,13 @@ class Readout(ABC):
         Rows that are published together.
     first_number : int
         Number of the first frame.
+    spins : bool
+        Whether to keep the processor for the last 0.15 ms before each moment; a sleep may wake up that late.
+
+    Attributes
+    ----------
+    late, overruns : int
+        Of the run under way; as `CameraReport`.
 
     Raises
     ------
@@ -137,6 +144,7 @@ class Readout(ABC):
         readout_fraction: float = 0.8,
         rows_per_block: int = 4,
         first_number: int = 0,
+        spins: bool = True,
     ) -> None:
         if (ring.shape, ring.dtype) != (shape, dtype):
             raise InputError(
@@ -147,6 +155,7 @@ class Readout(ABC):
         rows = ring.shape[0]
         block = int(number_between("rows_per_block", rows_per_block, 1, rows, integer=True))
         self._ring, self._period_ns, self._next = ring, 1e9 / rate, first_number
+        self._spins, self.late, self.overruns = spins, 0, 0
         ends = [*range(block, rows, block), rows]
         # First row, last row and, from the start of the frame, the moment of each block.
         self._blocks = [
@@ -176,37 +185,45 @@ class Readout(ABC):
             When `n_frames` is not a whole number of at least 1.
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
-        start, tick, published, late, told = time.monotonic_ns(), 0, 0, 0, 0
+        start, tick, published, told = time.monotonic_ns(), 0, 0, 0
+        self.late = self.overruns = 0
         while (limit is None or published < limit) and not (stop is not None and stop.is_set()):
             frame = self._frame()  # before its moment: it may have to be fetched
             if frame is None:
                 break
             moment = start + round(tick * self._period_ns)
-            _wait_until(moment)
+            self._wait_until(moment)
             now = time.monotonic_ns()
-            late += now - moment > LATE * self._period_ns
+            self.late += now - moment > LATE * self._period_ns
             self._publish(moment, frame)
             published += 1
             tick = max(tick + 1, int((time.monotonic_ns() - start) // self._period_ns))
+            self.overruns = tick - published
             if progress is not None and now - told > _BETWEEN_REPORTS_NS:
                 progress(published)
                 told = now
         if published:
             # The last frame has its frame time, too, so that rates come out right.
-            _wait_until(start + round(tick * self._period_ns))
+            self._wait_until(start + round(tick * self._period_ns))
         if progress is not None:
             progress(published)
-        return CameraReport(published, tick - published, (time.monotonic_ns() - start) / 1e9, late)
+        return CameraReport(published, self.overruns, (time.monotonic_ns() - start) / 1e9, self.late)
 
     def _publish(self, moment: int, frame: NDArray[Any]) -> None:
         """Read out one frame that starts at that moment."""
         ring = self._ring
         slot = ring.begin(self._next)
         for first, last, delay in self._blocks:
-            _wait_until(moment + delay)
+            self._wait_until(moment + delay)
             slot[first:last] = frame[first:last]
             ring.rows_ready(last)
         self._next += 1
+
+    def _wait_until(self, moment: int) -> None:
+        if self._spins:
+            _wait_until(moment)
+        else:
+            time.sleep(max(0, moment - time.monotonic_ns()) / 1e9)
 
 
 class Camera(Readout):

@@ -21,7 +21,14 @@ from typing import Any
 import numpy as np
 
 from faintspot.errors import InputError
-from faintspot.realtime.private_socket import bound_listener, engine_name, lock_path, locked_beside, peer_uid
+from faintspot.realtime.private_socket import (
+    ENGINE,
+    bound_listener,
+    lock_path,
+    locked_beside,
+    peer_uid,
+    server_of,
+)
 
 Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
 """What a command does: takes the request without its command, returns what the reply says."""
@@ -53,7 +60,8 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
     InputError
         When no engine listens there, when it says no, and when it does not answer in time.
     """
-    name = engine_name(Path(path))
+    kind, name = server_of(Path(path))
+    starts = "run" if kind == ENGINE else kind
     try:
         line = _encoded({"command": command, **fields})
     except (TypeError, ValueError) as error:
@@ -65,21 +73,21 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         try:
             _connect(connection, Path(path), end)
             if peer_uid(connection) != os.geteuid():
-                raise InputError(f"the engine {name} belongs to another user")
+                raise InputError(f"the {kind} {name} belongs to another user")
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it may say why
                 connection.sendall(line)
             reply = _received_line(connection, end)
         except TimeoutError:
-            raise InputError(f"the engine {name} does not answer: waited {timeout_s:g} s") from None
+            raise InputError(f"the {kind} {name} does not answer: waited {timeout_s:g} s") from None
         except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
             raise InputError(
-                f"no engine runs under the name {name}; faintspot realtime run starts one"
+                f"no {kind} runs under the name {name}; faintspot realtime {starts} starts one"
             ) from None
         except PermissionError:
-            raise InputError(f"the engine {name} belongs to another user") from None
+            raise InputError(f"the {kind} {name} belongs to another user") from None
         except OSError as error:
-            raise InputError(f"the engine {name} cannot be reached: {error.strerror or error}") from None
-    return _checked_reply(name, reply)
+            raise InputError(f"the {kind} {name} cannot be reached: {error.strerror or error}") from None
+    return _checked_reply(f"{kind} {name}", reply)
 
 
 class ControlServer:
@@ -193,7 +201,8 @@ class ControlServer:
         with contextlib.suppress(OSError, TimeoutError):
             try:
                 if peer_uid(connection) != os.geteuid():
-                    raise InputError("this engine answers only the user that runs it")
+                    kind, _ = server_of(self.path)
+                    raise InputError(f"this {kind} answers only the user that runs it")
                 while line := await _next_line(connection, inbox):
                     await _send(connection, await self._reply(line))
                     if task in self._connections:  # it becomes the one that was idle last
@@ -332,15 +341,15 @@ def _set_timeout(connection: socket.socket, end: float) -> None:
     connection.settimeout(remaining)
 
 
-def _checked_reply(name: str, line: bytes) -> dict[str, Any]:
+def _checked_reply(server: str, line: bytes) -> dict[str, Any]:
     if not line.endswith(b"\n"):
-        raise InputError(f"the engine {name} went away before it had answered")
+        raise InputError(f"the {server} went away before it had answered")
     try:
         reply = json.loads(line)
     except ValueError:
         reply = None
     if not isinstance(reply, dict) or not isinstance(reply.get("ok"), bool):
-        raise InputError(f"the engine {name} replied what is not understood: {line[:40]!r}")
+        raise InputError(f"the {server} replied what is not understood: {line[:40]!r}")
     if not reply.pop("ok"):
         raise InputError(str(reply.get("error", "refused without a reason")))
     return reply

@@ -18,10 +18,12 @@ _BACKLOG = 64
 _LONGEST_PATH = 107  # bytes, of a Unix socket on Linux
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _PREFIX, _SUFFIX = "faintspot-", ".sock"
+ENGINE, TELESCOPE = "engine", "telescope"
+_TELESCOPE_SUFFIX = f"+{TELESCOPE}"  # no name has a "+"
 
 
-def socket_path(name: str) -> Path:
-    """Return where the engine of that name listens: in a folder that only this user can open.
+def socket_path(name: str, kind: str = ENGINE) -> Path:
+    """Return where the engine, or telescope, of that name listens: in a folder that only this user can open.
 
     $XDG_RUNTIME_DIR/faintspot-NAME.sock, or, where that is not a folder of the user's, in a private one in
     the temporary directory, which the server makes.
@@ -41,14 +43,19 @@ def socket_path(name: str) -> Path:
     # After a change of user the variable may still name the other one's folder.
     if runtime and os.path.isdir(runtime) and os.stat(runtime).st_uid == os.geteuid():
         folder = Path(runtime)
-    return folder / f"{_PREFIX}{name}{_SUFFIX}"
+    kind_suffix = _TELESCOPE_SUFFIX if kind == TELESCOPE else ""
+    return folder / f"{_PREFIX}{name}{kind_suffix}{_SUFFIX}"
 
 
-def engine_name(path: Path) -> str:
-    """Return the name of the engine that listens there; any other path is its own name."""
+def server_of(path: Path) -> tuple[str, str]:
+    """Return what listens there, an engine or a telescope, and its name; any other path is its own name."""
     name = path.name
-    ours = name.startswith(_PREFIX) and name.endswith(_SUFFIX)
-    return name[len(_PREFIX) : -len(_SUFFIX)] if ours else str(path)
+    if not (name.startswith(_PREFIX) and name.endswith(_SUFFIX)):
+        return ENGINE, str(path)
+    name = name[len(_PREFIX) : -len(_SUFFIX)]
+    if name.endswith(_TELESCOPE_SUFFIX):
+        return TELESCOPE, name.removesuffix(_TELESCOPE_SUFFIX)
+    return ENGINE, name
 
 
 def locked_beside(path: Path) -> int:
@@ -92,7 +99,9 @@ def _locked(path: Path) -> int:
         fcntl.flock(lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(lock_file)
-        raise InputError(f"an engine runs under the name {engine_name(path)} already") from None
+        kind, name = server_of(path)
+        article = "an" if kind == ENGINE else "a"
+        raise InputError(f"{article} {kind} runs under the name {name} already") from None
     return lock_file
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 
 import numpy as np
 
-from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.telemetry_rows import fill_telemetry_rows
-from faintspot.realtime.shared_streams import LOCK_LIMIT_S, create_stream, lock_file
+from faintspot.realtime.shared_streams import create_stream, held
 from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -52,25 +50,9 @@ class SlopeStreams:
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
 
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Keep the streams' locks, which only writers need, while publishing: readers do not wait for them.
-
-        Taking a lock for every frame would take three times as long as publishing itself.
-
-        Raises
-        ------
-        InputError
-            When somebody else holds one.
-        """
-        with ExitStack() as stack:
-            for stream in (self._slopes, self._details, self._marks):
-                try:
-                    stack.enter_context(stream.locked(timeout=LOCK_LIMIT_S))
-                except TimeoutError:
-                    held = lock_file(stream.name)
-                    raise InputError(f"{stream.name}: another process holds {held}; end it") from None
-            yield
+    def held(self) -> AbstractContextManager[None]:
+        """Keep the streams' locks while publishing; see `shared_streams.held`."""
+        return held(self._slopes, self._details, self._marks)
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
         """Publish the vector of slopes; by the thread that holds the streams."""

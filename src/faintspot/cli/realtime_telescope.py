@@ -1,0 +1,138 @@
+"""faintspot realtime telescope, telescope-set, telescope-status: a simulated telescope."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import Any
+
+import click
+
+from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.realtime.control import request
+from faintspot.realtime.private_socket import TELESCOPE, socket_path
+
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the telescope.")
+
+
+@click.command("telescope", short_help="Simulate a telescope whose mirror follows a command stream.")
+@click.argument("configuration", metavar="[CONFIG]", default="canary")
+@click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring and the streams.")
+@click.option("--rate", type=float, metavar="HZ", help="Frames a second. Default: the configuration's.")
+@click.option(
+    "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."
+)
+@click.option(
+    "--readout-fraction", type=float, default=0.8, show_default=True, help="Part of the frame time."
+)
+@click.option(
+    "--rows-per-block", type=int, metavar="K", help="Rows published together. Default: a sub-aperture's."
+)
+@click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
+@click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
+@click.option("--seed", type=click.IntRange(0), help="Of air and noise. Default: the configuration's.")
+@click.option("--realisation", type=click.IntRange(0), default=0, help="Others have other air and noise.")
+def telescope(
+    configuration: str,
+    name: str,
+    rate: float | None,
+    write_config: str | None,
+    frames: int | None,
+    **options: Any,
+) -> None:
+    """Simulate a telescope: turbulence, mirror, Shack-Hartmann sensor and camera, at a camera's pace.
+
+    CONFIG is a TOML file or the name of a shipped configuration, as of `faintspot loop`; default: canary.
+    Rows go into the pixel ring NAME. When an exposure begins, the mirror takes the newest commands of the
+    pyshmem stream NAME_commands, nm; whole frames are published as NAME_frames, and what nobody at a
+    telescope knows, the Strehl ratio first, as NAME_truth. Needs the extras `loop` and `realtime`.
+
+    \b
+    In three terminals:
+      faintspot realtime telescope canary --rate 250 --write-config bench
+      faintspot realtime run --config bench/faintspot.toml
+      faintspot realtime telescope-set photons=50 seeing_arcsec=1.2
+    """
+    from faintspot.loop.configuration import load_loop
+    from faintspot.loop.engine_files import write_engine_files
+    from faintspot.realtime.control import ControlServer
+    from faintspot.realtime.scheduling import real_time
+    from faintspot.realtime.telescope import SimulatedTelescope
+    from faintspot.realtime.telescope_orders import LENGTHY, commands_of
+
+    observed = load_loop(configuration)
+    if rate is not None:
+        observed = observed.replace("control", frame_rate_hz=rate)
+    if write_config is not None:
+        click.echo(f"{name}: {write_engine_files(observed, write_config)} written")
+    say = partial(click.echo, err=True)
+    with SimulatedTelescope(observed, name, say=lambda line: say(f"{name}: {line}"), **options) as simulated:
+        optics = simulated.observatory.optics
+        rows, columns = optics.sensor.layout.frame_shape
+        server = ControlServer(socket_path(name, TELESCOPE), commands_of(simulated), lengthy=LENGTHY)
+        with server, real_time(), stop_on_signal() as stop:
+            click.echo(
+                f"{name}: {observed.name}, {rows} x {columns} pixels, {len(optics.sensor.layout)} "
+                f"sub-apertures, {optics.mirror.commands} commands, {observed.control.frame_rate_hz:g} "
+                "frames/s; Ctrl-C stops"
+            )
+            report = simulated.run(frames, stop)
+    click.echo(
+        f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.late} started late, "
+        f"{report.overruns} frame times without a frame"
+    )
+
+
+@click.command("telescope-set")
+@_NAME
+@click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
+def telescope_set(name: str, changes: tuple[str, ...]) -> None:
+    """Change star or air of a simulated telescope from its next exposure on.
+
+    \b
+    photons        photo-electrons of a fully lit sub-aperture in a frame, or
+    magnitude      of the star, in the configuration's band
+    r0_m           Fried parameter at 500 nm; two values: the ends of its drift, or
+    seeing_arcsec  0.976 x 500 nm / r0
+    wind_factor    all winds, as a multiple of the configuration's
+
+    \b
+    Example:
+      faintspot realtime telescope-set magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
+    """
+    from faintspot.written_changes import parse_changes
+
+    reply = request(socket_path(name, TELESCOPE), "set", changes=parse_changes(changes))
+    frame, conditions = reply["frame"], reply["conditions"]
+    first = "taken at the next exposure" if frame is None else f"in effect from frame {frame}"
+    click.echo(f"{first}: {_in_words(conditions)}")
+
+
+@click.command("telescope-status")
+@_NAME
+@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+def telescope_status(name: str, as_json: bool) -> None:
+    """Say what a simulated telescope sees, and whether it keeps its pace."""
+    reply = request(socket_path(name, TELESCOPE), "status")
+    if as_json:
+        click.echo(json.dumps(reply, indent=1))
+        return
+    commands, truth = reply["commands"], reply["truth"]
+    click.echo(
+        f"{name}: {reply['configuration']}, {reply['frames']} frames at {reply['frame_rate_hz']:g} a second, "
+        f"{reply['late']} late, {reply['overruns']} frame times without a frame"
+    )
+    click.echo(f"  {_in_words(reply['conditions'])}")
+    state = commands["obstacle"] or f"{commands['taken']} taken, {commands['refused']} refused"
+    click.echo(f"  {commands['stream']}: {state}")
+    if truth is not None:
+        click.echo(
+            f"  frame {truth['frame']:.0f}: Strehl ratio {truth['strehl']:.3f}, {truth['rms_nm']:.0f} nm"
+        )
+
+
+def _in_words(conditions: dict[str, Any]) -> str:
+    low, high = sorted(conditions["r0_m"])
+    r0 = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+    photons, winds = conditions["photons"], conditions["wind_factor"]
+    return f"{photons:g} photons, r0 {r0} m, winds x {winds:g}"

@@ -1,0 +1,258 @@
+"""A simulated telescope at a camera's pace: commands in, pixels and the truth out, through shared memory."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.loop.camera import make_detector
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.observatory import Observatory
+from faintspot.realtime.camera import CameraReport, Readout, StopEvent, readout_type
+from faintspot.realtime.command_stream import CommandStream
+from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.shared_streams import create_stream, held
+from faintspot.realtime.telescope_orders import Conditions
+
+TRUTH = ("frame", "strehl", "rms_nm", "r0_m", "time_s", "begun_s", "command_frame", "photons")
+"""What NAME_truth holds of a frame, float64.
+
+Strehl ratio and rms of the wavefront after the mirror, r0, the middle of the exposure in the air's own time,
+when the exposure began (CLOCK_MONOTONIC), the frame number with which the commands that acted were stamped
+(-1: none yet), photo-electrons of a fully lit sub-aperture.
+"""
+_BETWEEN_COMPLAINTS_S = 10.0
+
+
+@dataclass(eq=False)
+class Order:
+    """Conditions that somebody has asked for."""
+
+    conditions: Conditions
+    frame: int = -1
+    """The first with them."""
+    in_effect: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """A frame, and the truth as `TRUTH`."""
+
+    pixels: NDArray[Any]
+    truth: tuple[float, ...]
+
+
+class SimulatedTelescope(Readout):
+    """Observes as `simulate_loop` does, with the commands of a stream.
+
+    The exposure of a frame takes a frame time, its read-out a part of the next one. When an exposure begins,
+    the mirror takes the newest commands of the stream NAME_commands and holds them until it ends. Frame k is
+    that of `simulate_loop` with the same commands, seed and realisation; where frames come late, so does the
+    air. Simulation and read-out are threads of their own.
+
+    Rows go into the pixel ring NAME. When the last one is out, the stream NAME_truth says what the frame
+    was (`TRUTH`) and NAME_frames has it as a whole, both stamped with its number.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+        Its frame rate is the camera's.
+    name : str
+        Of the pixel ring, and of the streams.
+    seed : int, optional
+        Default: the configuration's.
+    realisation : int
+    readout_fraction : float
+        Part of the frame time in which the rows arrive, 0 to 1.
+    rows_per_block : int, optional
+        Rows that are published together. Default: those of a sub-aperture.
+    slots : int
+        Frames in the ring.
+    say : function, optional
+        Told in one line what happens to the commands, and when the pace cannot be kept.
+
+    Attributes
+    ----------
+    observatory : Observatory
+    commands : CommandStream
+
+    Raises
+    ------
+    InputError
+        When a value is out of its range, parts do not fit together, or the ring or a stream cannot be made.
+    MissingExtraError
+        Without HCIPy or pyshmem.
+    """
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        name: str,
+        *,
+        seed: int | None = None,
+        realisation: int = 0,
+        readout_fraction: float = 0.8,
+        rows_per_block: int | None = None,
+        slots: int = 4,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
+        self._conditions = Conditions.of(configuration)
+        start = configuration.run.seed if seed is None else seed
+        self.observatory = observatory = Observatory(configuration, start, realisation)
+        self._wind = observatory.air.velocity
+        layout, mirror = observatory.optics.sensor.layout, observatory.optics.mirror
+        dtype = readout_type(make_detector(configuration))
+        with ExitStack() as undo:
+            ring = undo.enter_context(PixelRing.create(name, layout.frame_shape, dtype, slots=slots))
+            super().__init__(
+                ring,
+                layout.frame_shape,
+                dtype,
+                frame_rate_hz=configuration.control.frame_rate_hz,
+                readout_fraction=readout_fraction,
+                rows_per_block=layout.window[0] if rows_per_block is None else rows_per_block,
+                spins=False,  # the simulation needs the processor
+            )
+            self._frames = create_stream(f"{name}_frames", layout.frame_shape, dtype)
+            undo.callback(self._frames.unlink)
+            self._truth = create_stream(f"{name}_truth", (len(TRUTH),), np.float64)
+            undo.callback(self._truth.unlink)
+            self.commands = CommandStream(f"{name}_commands", mirror.commands, self._say)
+            undo.callback(self.commands.close)
+            self._resources = undo.pop_all()
+        self._worker = ThreadPoolExecutor(1, "faintspot-exposure")
+        self._resources.callback(self._worker.shutdown)
+        self._underway: Future[Exposure] | None = None
+        self._last: Exposure | None = None
+        self._orders = threading.Lock()
+        self._order: Order | None = None
+        self._complained_s, self._complained_of = -np.inf, 0
+
+    def __enter__(self) -> SimulatedTelescope:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove the ring and the streams; closing again does nothing."""
+        self._resources.close()
+
+    def run(
+        self,
+        n_frames: int | None = None,
+        stop: StopEvent | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> CameraReport:
+        """Observe until there are `n_frames` or `stop` is set; a later run goes on.
+
+        Raises
+        ------
+        InputError
+            When `n_frames` is not a whole number of at least 1, or somebody else holds a stream's lock.
+        """
+        self._complained_of = 0
+        with held(self._frames, self._truth):
+            return super().run(n_frames, stop, progress)
+
+    def order(self, changes: dict[str, Any]) -> Order:
+        """Change conditions from the next exposure on; see `telescope_orders.ORDERS`.
+
+        Raises
+        ------
+        InputError
+            For a name or value that is not understood; nothing changes then.
+        """
+        with self._orders:
+            before = self._conditions if self._order is None else self._order.conditions
+            self._order = Order(before.ordered(self.configuration, changes))
+            return self._order
+
+    def status(self) -> dict[str, Any]:
+        """Return what the telescope has done and sees, for the control channel."""
+        last = self._last
+        return {
+            "name": self.name,
+            "configuration": self.configuration.name,
+            "frame_rate_hz": self.configuration.control.frame_rate_hz,
+            "frames": self._next,
+            "late": self.late,
+            "overruns": self.overruns,
+            "truth": None if last is None else dict(zip(TRUTH, last.truth, strict=True)),
+            "conditions": asdict(self._conditions),
+            "commands": {
+                "stream": self.commands.stream,
+                "obstacle": self.commands.state,
+                **asdict(self.commands.counters),
+            },
+        }
+
+    # ---- frame by frame
+
+    def _frame(self) -> NDArray[Any]:
+        """Return frame number `_next`, whose exposure began a frame time ago, but for the first one."""
+        if self._underway is None:
+            self._underway = self._begin(self._next)
+        self._last = self._underway.result()
+        return self._last.pixels
+
+    def _publish(self, moment: int, frame: NDArray[Any]) -> None:
+        """Read out one frame; the exposure of the next one begins."""
+        number, exposure = self._next, self._last
+        assert exposure is not None
+        self._underway = self._begin(number + 1)
+        super()._publish(moment, frame)
+        self._truth.write_locked(np.array(exposure.truth), frame_id=number)
+        self._frames.write_locked(frame, frame_id=number)
+        self._complain()
+
+    def _begin(self, number: int) -> Future[Exposure]:
+        """Begin an exposure: with the conditions and commands of this moment."""
+        begun_s = time.monotonic()
+        self.commands.take()
+        time_s = (number + 0.5) / self.configuration.control.frame_rate_hz
+        with self._orders:
+            order, self._order = self._order, None
+            if order is not None:
+                self._set(order.conditions, time_s)
+                order.frame = number
+                order.in_effect.set()
+        stamps = begun_s, float(self.commands.frame), self._conditions.photons
+        return self._worker.submit(self._expose, number, time_s, self.commands.commands_nm, stamps)
+
+    def _set(self, conditions: Conditions, time_s: float) -> None:
+        """Change light and air; the wind goes on from where it has blown the air to."""
+        air = self.observatory.air.blown(self._wind * conditions.wind_factor, time_s)
+        self.observatory.air = replace(air, r0_range_m=conditions.r0_m)
+        self.observatory.photons = conditions.photons
+        self._conditions = conditions
+
+    def _expose(
+        self, number: int, time_s: float, commands_nm: NDArray[np.float64], stamps: tuple[float, ...]
+    ) -> Exposure:
+        """Simulate one frame; in a thread of its own."""
+        after, seen = self.observatory.wavefronts(time_s, commands_nm)
+        truth = self.observatory.truth(time_s, after)
+        known = (float(number), truth.strehl, truth.rms_nm, truth.r0_m, time_s)
+        return Exposure(self.observatory.frame(number, seen), known + stamps)
+
+    def _complain(self) -> None:
+        """Say that the pace cannot be kept, now and then."""
+        now = time.monotonic()
+        if self.overruns <= self._complained_of or now - self._complained_s < _BETWEEN_COMPLAINTS_S:
+            return
+        rate = self.configuration.control.frame_rate_hz
+        self._say(
+            f"cannot keep {rate:g} frames/s: {self.overruns} frame times went by without a frame, "
+            f"{self.late} frames were late"
+        )
+        self._complained_of, self._complained_s = self.overruns, now

@@ -1,0 +1,103 @@
+"""What a simulated telescope can be told while it runs, and what it answers on its control channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from faintspot.checks import number_between, numbers_between
+from faintspot.errors import InputError
+from faintspot.loop.configuration import ARCSEC, R0_WAVELENGTH_M, LoopConfiguration
+from faintspot.toml_files import check_keys
+
+if TYPE_CHECKING:
+    from faintspot.realtime.control import Handler
+    from faintspot.realtime.telescope import SimulatedTelescope
+
+ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")
+LENGTHY = ("set",)
+"""Commands that wait for the next exposure: other commands are answered meanwhile."""
+_EFFECT_TIMEOUT_S = 0.5  # for an order to take effect, before the reply says that no exposure has begun yet
+_FWHM = 0.976  # of a long exposure, in wavelength / r0, without outer scale (Roddier 1981)
+_LARGEST_PHOTONS = 1e9
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """The star's light and the air.
+
+    Raises
+    ------
+    InputError
+        For more light than a camera can take.
+    """
+
+    photons: float
+    """Photo-electrons of a fully lit sub-aperture in a frame."""
+    r0_m: tuple[float, float]
+    """Between which the Fried parameter at 500 nm drifts."""
+    wind_factor: float = 1.0
+    """Winds as a multiple of the configuration's."""
+
+    def __post_init__(self) -> None:
+        number_between("photons", self.photons, 0, _LARGEST_PHOTONS, low_open=True)
+
+    @classmethod
+    def of(cls, configuration: LoopConfiguration) -> Conditions:
+        """Return the configuration's own."""
+        r0 = configuration.atmosphere.r0_m
+        return cls(configuration.photons, r0 if isinstance(r0, tuple) else (r0, r0))
+
+    def ordered(self, configuration: LoopConfiguration, changes: Mapping[str, Any]) -> Conditions:
+        """Return them with changes, by the names of `ORDERS`.
+
+        Raises
+        ------
+        InputError
+            For an unknown name, a value out of its range, two amounts of light or two kinds of seeing.
+        """
+        check_keys("", changes, ORDERS, what="order")
+        for pair in (("photons", "magnitude"), ("r0_m", "seeing_arcsec")):
+            if all(name in changes for name in pair):
+                raise InputError(f"{' and '.join(pair)}: expected one of them, got both")
+        new: dict[str, Any] = {}
+        if "photons" in changes:
+            new["photons"] = number_between("photons", changes["photons"], 0, _LARGEST_PHOTONS, low_open=True)
+        if "magnitude" in changes:
+            magnitude = number_between("magnitude", changes["magnitude"], -30, 60)
+            new["photons"] = float(configuration.photometry.electrons(magnitude))
+        if "r0_m" in changes:
+            new["r0_m"] = _two_ends("r0_m", changes["r0_m"], 0.01, 1e3)
+        if "seeing_arcsec" in changes:
+            ends = _two_ends("seeing_arcsec", changes["seeing_arcsec"], 0.01, 10)
+            new["r0_m"] = tuple(_FWHM * R0_WAVELENGTH_M / (ARCSEC * seeing) for seeing in ends)
+        if "wind_factor" in changes:
+            new["wind_factor"] = number_between("wind_factor", changes["wind_factor"], 0, 100)
+        return replace(self, **new)
+
+
+def _two_ends(name: str, value: Any, low: float, high: float) -> tuple[float, float]:
+    """Return one number twice, or two as they are."""
+    ends = numbers_between(name, value, low, high)
+    if ends.size not in (1, 2) or ends.ndim > 1:
+        raise InputError(f"{name}: expected one number, or two to drift between, got {value!r:.80}")
+    first, last = ends.flat[0], ends.flat[-1]
+    return float(first), float(last)
+
+
+def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
+    """Return the commands: status and set."""
+
+    def status(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return telescope.status()
+
+    def change(fields: dict[str, Any]) -> Mapping[str, Any]:
+        changes = fields.get("changes")
+        if not isinstance(changes, dict) or not changes:
+            raise InputError("changes: expected values by name, got none")
+        order = telescope.order(changes)
+        frame = order.frame if order.in_effect.wait(_EFFECT_TIMEOUT_S) else None
+        return {"frame": frame, "conditions": asdict(order.conditions)}
+
+    return {"status": status, "set": change}
