@@ -101,6 +101,8 @@ def show(answer: LoopAnswer) -> None:
     say([heading])
     say(rest, "  ")
     console.print(gain_table(answer))
+    if answer.question.radius is not None:
+        console.print(sky_table(answer))
     say(loop_text.about_the_sky(answer), "  ")
     click.echo("This rests on")
     say(loop_text.foundations(answer), "  ")
@@ -123,22 +125,33 @@ def strehl_table(answer: LoopAnswer) -> Table:
 
 
 def gain_table(answer: LoopAnswer) -> Table:
-    """Return limiting magnitudes, gains and the fraction of the sky as a table."""
+    """Return limiting magnitudes and what is gained over both references as a table."""
     from faintspot.planner import loop_text
-    from faintspot.planner.sky import PLACES
 
-    table, has_sky = _table(), answer.question.radius is not None
-    headings = ["limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest"]
-    headings += ["pole\n%", "30 deg\n%", "plane\n%"] if has_sky else []
-    for heading in headings:
+    table = _table()
+    for heading in ("limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest"):
         table.add_column(heading, justify="right", no_wrap=True)
     for result in answer.results:
         cells = [loop_text.limit_in_words(answer, result.name)]
         for reference in loop_text.REFERENCES:
             same = result.name == reference
             cells.append("" if same else loop_text.gain_in_words(answer, result.name, reference))
+        table.add_row(result.name, *cells, style="bold" if result is answer.best else None)
+    table.caption = f"Limiting magnitude: for a Strehl ratio of {answer.level:.3g}, interpolated."
+    return table
+
+
+def sky_table(answer: LoopAnswer) -> Table:
+    """Return the fraction of the sky that every candidate opens as a table."""
+    from faintspot.planner import loop_text
+    from faintspot.planner.sky import PLACES
+
+    table = _table()
+    for place in PLACES:
+        table.add_column(f"{place}\n%", justify="right", no_wrap=True)
+    for result in answer.results:
         found = [answer.coverage(result.name, place) for place in PLACES]
-        cells += [loop_text.coverage_in_words(each) for each in found if each is not None]
+        cells = [loop_text.coverage_in_words(each) for each in found if each is not None]
         table.add_row(result.name, *cells, style="bold" if result is answer.best else None)
     return table
 

@@ -21,7 +21,7 @@ from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice, LoopArm
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.magnitude import with_flux
-from faintspot.loop.statistics import MagnitudeGain, falling, limiting_magnitudes, magnitude_gain
+from faintspot.loop.statistics import falling, limiting_magnitudes, magnitude_gain
 from faintspot.planner.loop_question import BASELINE, SECOND, LoopQuestion
 from faintspot.planner.sky import MODEL_ERROR, PLACES, known_magnitudes, sky_coverage
 from faintspot.tables import save_tables
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
-
-_FINE_POINTS = 2000  # of the smooth curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +54,12 @@ class LoopArmResult:
 
 @dataclass(frozen=True)
 class Limit:
-    """Where a curve of the Strehl ratio falls below a level."""
+    """Where a curve of the Strehl ratio falls below a level, or how far apart two curves are there."""
 
     magnitude: Estimate
     """Infinite: above the level with every star that was measured; minus infinite: below it."""
     interpolation_error: float
-    """Difference between straight lines and a smooth monotone curve through what was measured."""
+    """How far straight lines between what was measured may be off, as the curve bends."""
 
     @property
     def is_known(self) -> bool:
@@ -164,23 +162,24 @@ class LoopAnswer:
 
     def limit(self, name: str) -> Limit:
         """Return an arm's limiting magnitude."""
-        faint, strehl = self._rising(name)
-        value, smooth = self._crossings(name)
+        faint, strehl = self._from_bright(name)
+        value = float(limiting_magnitudes(faint, strehl.mean(axis=1), self.level))
+        if not math.isfinite(value):
+            return Limit(Estimate(value), 0.0)
+        between = _interpolation_error(faint, strehl.mean(axis=1), value)
         realisations = strehl.shape[1]
-        if not math.isfinite(value) or realisations < FEWEST_PIECES:
-            return Limit(Estimate(value), abs(smooth - value) if math.isfinite(value) else 0.0)
+        if realisations < FEWEST_PIECES:
+            return Limit(Estimate(value), between)
         draws = np.random.default_rng(SEED).integers(0, realisations, (DRAWS, realisations))
         drawn = limiting_magnitudes(faint, strehl[:, draws].mean(axis=2).T, self.level)
-        return Limit(of_draws(value, drawn, realisations), abs(smooth - value))
+        return Limit(of_draws(value, drawn, realisations), between)
 
-    def gain(self, name: str, reference: str) -> tuple[MagnitudeGain, float]:
-        """Return by how much fainter an arm's limiting magnitude is than another's, and its interpolation error."""
-        faint, strehl = self._rising(name)
-        found = magnitude_gain(faint, strehl, self._rising(reference)[1], self.level)
-        (value, smooth), (other, other_smooth) = self._crossings(name), self._crossings(reference)
-        if not math.isfinite(found.gain.value):
-            return found, 0.0
-        return found, abs((smooth - other_smooth) - (value - other))
+    def gain(self, name: str, reference: str) -> Limit:
+        """Return the gain in limiting magnitude over another arm; NaN where one of them has no limit."""
+        faint, strehl = self._from_bright(name)
+        found = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
+        errors = (self.limit(each).interpolation_error for each in (name, reference))
+        return Limit(found.gain, math.hypot(*errors))
 
     def coverage(self, name: str, place: str) -> Coverage | None:
         """Return what part of a place of `faintspot.planner.sky.PLACES` an arm can use; None: no radius."""
@@ -203,10 +202,9 @@ class LoopAnswer:
         strehl_error = float(more - less) / 2 if math.isfinite(error) else math.nan
         return Coverage(float(fraction), strehl_error, (many - few) / 2, bound)
 
-    def curve(self, name: str, magnitudes: Any) -> Floats:
-        """Return an arm's Strehl ratio at other magnitudes: interpolated, and not beyond what is measured."""
-        faint, strehl = self._rising(name)
-        return np.asarray(_smooth(faint, strehl.mean(axis=1))(magnitudes), np.float64)
+    def curve(self, name: str) -> Floats:
+        """Return an arm's mean Strehl ratios (F,), made to fall with magnitude; straight lines join them."""
+        return falling(self._from_bright(name)[1].mean(axis=1))[::-1]
 
     def star(self, flux: int) -> LoopConfiguration:
         """Return the loop with the star of a measured flux."""
@@ -278,24 +276,23 @@ class LoopAnswer:
 
         return loop_figure(self)
 
-    def _rising(self, name: str) -> tuple[Floats, Floats]:
-        """Return magnitudes, from bright to faint, and the Strehl ratios (F, R) there."""
+    def _from_bright(self, name: str) -> tuple[Floats, Floats]:
+        """Return rising magnitudes (F,), and the Strehl ratios (F, R) there."""
         return self.magnitudes[::-1], self[name].strehl[::-1]
 
-    def _crossings(self, name: str) -> tuple[float, float]:
-        """Return the limiting magnitude by straight lines and by a smooth curve."""
-        faint, strehl = self._rising(name)
-        mean = strehl.mean(axis=1)
-        fine = np.linspace(faint[0], faint[-1], _FINE_POINTS)
-        value = float(limiting_magnitudes(faint, mean, self.level))
-        return value, float(limiting_magnitudes(fine, _smooth(faint, mean)(fine), self.level))
 
+def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
+    """Return how far a crossing that was read off a straight line may be off because the curve bends.
 
-def _smooth(faint: Floats, strehl: Floats) -> Any:
-    """Return a monotone cubic through the falling curve nearest to what was measured."""
-    from scipy.interpolate import PchipInterpolator
-
-    return PchipInterpolator(faint, falling(strehl), extrapolate=False)
+    That is the second divided difference, the larger of those at both ends of the line, times the distances
+    from the ends, over the slope.
+    """
+    curve = falling(strehl)
+    end = int(np.clip(np.searchsorted(faint, value), 1, len(faint) - 1))
+    slopes = np.diff(curve) / np.diff(faint)
+    bends = np.abs(np.diff(slopes) / (faint[2:] - faint[:-2]))  # of the knots but the first and the last
+    bend = bends[max(0, end - 2) : end].max()
+    return float(bend * (value - faint[end - 1]) * (faint[end] - value) / abs(slopes[end - 1]))
 
 
 def _simplicity(result: LoopArmResult) -> tuple[Any, ...]:

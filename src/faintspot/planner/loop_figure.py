@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.control.learning import INTEGRATOR
+from faintspot.planner.loop_question import SECOND
 from faintspot.planner.sky import MODEL_ERROR, PLACES
 from faintspot.report.drawing import GREY, LIGHT_GREY, new_figure, styled
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from faintspot.planner.loop_answer import LoopAnswer, LoopArmResult
 
 _WIDTH, _HEIGHT = 13.0, 5.6
-_FINE_POINTS = 300
 _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 
@@ -26,20 +26,21 @@ def loop_figure(answer: LoopAnswer) -> Figure:
     """Draw Strehl ratios with errors and limiting magnitudes; where there is a radius, bars of the sky."""
     figure = new_figure(_WIDTH, _HEIGHT)
     if answer.question.radius is None:
-        _draw_strehl(figure.subplots(), answer)
-        return figure
-    left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+        left = figure.subplots()
+    else:
+        left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+        _draw_sky(right, answer)
     _draw_strehl(left, answer)
-    _draw_sky(right, answer)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure
 
 
 def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
     magnitudes = answer.magnitudes
-    fine = np.linspace(magnitudes.min(), magnitudes.max(), _FINE_POINTS)
     for result in answer.results:
         drawn = _look(result)
-        axes.plot(fine, answer.curve(result.name, fine), lw=1.6, color=drawn["color"], ls=drawn["ls"])
+        axes.plot(magnitudes, answer.curve(result.name), lw=1.6, color=drawn["color"], ls=drawn["ls"])
         values = [answer.strehl(result.name, flux) for flux in range(len(magnitudes))]
         axes.errorbar(
             magnitudes,
@@ -62,10 +63,11 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
     axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
     axes.annotate(
         f"Strehl {answer.level:.2f}: limiting magnitudes",
-        (0.01, answer.level),
+        (0.99, answer.level),
         xycoords=("axes fraction", "data"),
         xytext=(0, 3),
         textcoords="offset points",
+        ha="right",
         color="#666666",
     )
     if answer.question.configuration.photons in answer.photons:
@@ -79,7 +81,6 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
     loop = answer.question.configuration
     axes.set_xlabel(f"guide star magnitude ({loop.camera.band}); markers are measured, lines interpolated")
     axes.set_ylabel(f"Strehl ratio at {1e6 * loop.science.wavelength_m:.3g} µm")
-    axes.legend(frameon=False, loc="lower left")
     top = axes.secondary_xaxis("top")
     top.set_xticks(magnitudes, [f"{float(f'{flux:.3g}'):g}" for flux in answer.photons])
     top.set_xlabel("photo-electrons per sub-aperture and frame")
@@ -133,12 +134,13 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
 def _look(result: LoopArmResult) -> dict[str, Any]:
     """Return colour, line and marker: the estimator's, open and dash-dotted where control learns."""
     style = result.kind.estimator.style
+    colour = GREY if result.kind.estimator.name == SECOND else style.colour
     learns = result.kind.control != INTEGRATOR
     return {
-        "color": style.colour,
+        "color": colour,
         "ls": _LEARNING_LINE if learns else style.line,
         "marker": style.marker,
-        "mfc": "white" if learns else style.colour,
+        "mfc": "white" if learns else colour,
     }
 
 

@@ -73,10 +73,9 @@ def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
 
 def gain_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     """Return the gain in limiting magnitude with its error, or what is known of it."""
-    found, interpolation = answer.gain(name, reference)
-    if math.isfinite(found.gain.value):
-        error = math.hypot(found.gain.standard_error, interpolation)
-        return _signed(Estimate(found.gain.value, error), 2, _SMALLEST_ERROR_MAG)
+    found = answer.gain(name, reference)
+    if found.is_known:
+        return _signed(Estimate(found.magnitude.value, found.error), 2, _SMALLEST_ERROR_MAG)
     mine, other = (answer.limit(each).magnitude.value for each in (name, reference))
     if math.isinf(mine) and mine == other:
         return "not within what was measured"
@@ -102,7 +101,7 @@ def coverage_in_words(coverage: Coverage) -> str:
     if coverage.bound or not math.isfinite(coverage.strehl_error):
         return f"{sign}{plain_number(value, 2)}"
     error = 100 * coverage.strehl_error
-    digits = max(0, 1 - math.floor(math.log10(max(error, 1e-3))))
+    digits = max(0, -math.floor(math.log10(max(error, 1e-3))))
     return f"{value:.{digits}f}±{error:.{digits}f}"
 
 
@@ -114,20 +113,16 @@ def about_the_sky(answer: LoopAnswer) -> list[str]:
             "sky coverage: not known, as all turbulence is on the ground (--radius: how far a star serves)"
         ]
     given = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
-    best = answer.best.name
-    parts = []
+    best, parts = answer.best.name, []
     for place in PLACES:
         found = answer.coverage(best, place)
         assert found is not None
-        parts.append(
-            f"{plain_number(100 * found.model_error, 2)} at the {place}".replace("the latitude", "latitude")
-        )
+        parts.append(f"{plain_number(100 * found.model_error, 2)} ({place})")
     return [
         f"percentage of the sky with a star bright enough for a Strehl ratio of {answer.level:.3g} within "
-        f"{radius:.3g} arcsec ({given}; on the axis, the target itself has less)",
-        "errors in the table: of the limiting magnitude. Those of the star counts "
-        f"({100 * MODEL_ERROR:.0f} % of a density) are the same for all methods: "
-        f"for {best} {', '.join(parts)} per cent",
+        f"{radius:.3g} arcsec ({given}; the ratio is that towards the star, a target beside it has less)",
+        "errors in the table: of the limiting magnitude. Star counts are off by about "
+        f"{100 * MODEL_ERROR:.0f} %, for all methods alike: {best} ± {', '.join(parts)}",
     ]
 
 
@@ -138,8 +133,8 @@ def foundations(answer: LoopAnswer) -> list[str]:
     lines = [
         f"measured at magnitudes {measured} (photo-electrons "
         f"{', '.join(plain_number(flux) for flux in answer.photons[::-1])}); limiting magnitudes are "
-        f"interpolated between these, up to {step:.2f} apart, with straight lines on a falling curve; the "
-        "difference to a smooth curve is part of their errors",
+        f"interpolated between these, up to {step:.2f} apart, with straight lines on a falling curve; how "
+        "far off that may be, by the curves' bends, is part of their errors",
         f"{answer.realisations} realisations of the air, {answer.scored_frames} scored frames each, the same "
         "for all candidates; settings tuned coarsely on other air, so a longer search may add to any of them",
         "differences are paired; their intervals (95 %, Student's t) hold for all candidates together",

@@ -57,7 +57,7 @@ class LoopPlan:
 
     def __post_init__(self) -> None:
         lowest = {
-            "fluxes": 2,
+            "fluxes": 3,
             "tuning_frames": self.tuning_settle_frames + 1,
             "frames": self.settle_frames + 1,
             "realisations": 1,
@@ -71,7 +71,7 @@ class LoopPlan:
         return loop.replace("run", **run, photons_per_subaperture=())
 
     def sizes(self, loop: LoopConfiguration) -> tuple[int, int, int]:
-        """Return about how much work it is to tune an arm, to score a run, to tune and score one that learns."""
+        """Return about how much work are: tuning an arm, scoring a run, and an arm that learns."""
         trial, score = (_PREPARING_FRAMES + frames for frames in (self.tuning_frames, self.frames))
         learning = loop.control.telemetry_frames + _LEARNING_FRAMES
         return _TRIALS * trial, score, learning + 3 * trial + self.realisations * score
