@@ -47,5 +47,5 @@ def made_up(
         choice = {option: _VALUES.get(option, each.first[0]) for option, each in tuned.items()}
         ends = tuple(("window_fwhm_px",) if name == "window" else () for _ in PHOTONS)
         gain = np.full(strehl.shape, 0.9)
-        results.append(LoopArmResult(kind, (choice,) * len(PHOTONS), strehl, gain, ends))
+        results.append(LoopArmResult(kind, (choice,) * len(PHOTONS), np.maximum(strehl, 0.0), gain, ends))
     return LoopAnswer(question, tuple(results), np.array(PHOTONS), 300, {"map+kalman": "no time"})

@@ -12,7 +12,6 @@ from tests.planner.loop_answer_cases import BRIGHT, MIDDLE, PHOTONS, SHIFTS, con
 from faintspot import configuration as configuration_file
 from faintspot.errors import InputError
 from faintspot.loop.configuration import load_loop
-from faintspot.loop.results import Floats
 from faintspot.planner import loop_text
 from faintspot.planner.loop_answer import LoopAnswer
 from faintspot.planner.sky import MODEL_ERROR, sky_coverage
@@ -21,7 +20,7 @@ from faintspot.settings import Settings
 PAIR = ("brightest", "window")
 
 
-def magnitudes() -> Floats:
+def magnitudes() -> np.ndarray:
     return configuration().photometry.magnitude(PHOTONS)
 
 
@@ -98,10 +97,10 @@ def test_limits_and_gains_are_right_within_their_errors() -> None:
     answer = made_up(strehl=BRIGHT / 2)
     for name in ("window", "map_predicted", "window+kalman"):
         limit = answer.limit(name)
-        assert limit.magnitude.value == pytest.approx(MIDDLE + SHIFTS[name], abs=2 * limit.error)
+        assert limit.magnitude.value == pytest.approx(MIDDLE + SHIFTS[name], abs=3 * limit.error)
         assert 0.01 < limit.error < 0.2
         gain = answer.gain(name, "brightest")
-        assert gain.magnitude.value == pytest.approx(SHIFTS[name] + 2.0, abs=2 * gain.error)
+        assert gain.magnitude.value == pytest.approx(SHIFTS[name] + 2.0, abs=3 * gain.error)
 
 
 def test_straight_curves_have_no_interpolation_error() -> None:
