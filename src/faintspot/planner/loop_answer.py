@@ -16,6 +16,7 @@ from faintspot.compare.arms import Knowledge
 from faintspot.compare.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
 from faintspot.control.learning import INTEGRATOR
 from faintspot.errors import InputError
+from faintspot.estimators.base import Need
 from faintspot.files import write_atomically
 from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice, LoopArm
 from faintspot.loop.camera import camera_calibration
@@ -24,6 +25,7 @@ from faintspot.loop.magnitude import with_flux
 from faintspot.loop.statistics import falling, limiting_magnitudes, magnitude_gain
 from faintspot.planner.loop_question import BASELINE, SECOND, LoopQuestion
 from faintspot.planner.sky import MODEL_ERROR, PLACES, known_magnitudes, sky_coverage
+from faintspot.sensor.psf import PSF
 from faintspot.tables import save_tables
 
 if TYPE_CHECKING:
@@ -241,7 +243,10 @@ class LoopAnswer:
         settings = arm.settings
         if settings.estimator.uses_light:
             settings = settings.replace(flux_e=float(f"{star.photons:.4g}"))
-        for item in (settings, arm.psf, arm.score):
+        psf = arm.psf
+        if psf is None and settings.estimator.needs & {Need.PSF, Need.WIDTH}:  # what the loop gives it
+            psf = PSF.analytic(size=star.spot_width_px / 2, elongation=star.sensor.spot_elongation)
+        for item in (settings, psf, arm.score):
             if item is not None:
                 configuration_file.save(path, item)
         if not configuration_file.has(path, "calibration"):
