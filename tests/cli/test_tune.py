@@ -5,9 +5,12 @@ from pathlib import Path
 
 import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
+from tests.planner.loop_answer_cases import made_up
 
 from faintspot import Calibration, SlopePipeline
-from faintspot.planner import tuning
+from faintspot.planner import loop_tuning, tuning
+from faintspot.planner.loop_answer import LoopAnswer
+from faintspot.planner.loop_question import LoopQuestion
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
 
@@ -99,6 +102,15 @@ def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ((*KNOWN, "--layout", "nothere.toml"), ("nothere.toml",)),
         ((*KNOWN, "--dark", "dark.fits"), ("--frames",)),
         ((*KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
+        (("--loop", "nothere"), ("nothere", "shipped")),
+        (("--loop", "canary", "--read-noise-e", 3), ("--read-noise-e", "without --loop")),
+        (("--loop", "canary", "--frames", "a.fits", "--grid", "7x7"), ("--frames, --grid",)),
+        (("--loop", "canary", "--magnitude", 9, "--photons", 10), ("--magnitude", "both")),
+        (("--loop", "canary", "--magnitudes", "8"), ("--magnitudes 8", "8,14")),
+        (("--loop", "canary", "--strehl", 2), ("strehl = 2",)),
+        (("--loop", "canary", "--arms", "kog"), ("kog",)),
+        (("--loop", "canary", "-o", "nofolder/faintspot.toml"), ("nofolder",)),
+        ((*KNOWN, "--strehl", 0.3, "--magnitudes", "8,9"), ("--magnitudes, --strehl", "with --loop")),
         (("--camera", "nothere.toml"), ("nothere.toml",)),
         (("--camera", "broken.toml"), ("broken.toml", "TOML")),
         (("--camera", "typo.toml"), ("read_noise", "did you mean read_noise_e")),
@@ -121,3 +133,35 @@ def test_mistakes_are_named_in_one_line(
     (tmp_path / "layout.toml").write_text("[layout.grid]\npixels = 8\n")
     run.refused("tune", *arguments, naming=naming)  # type: ignore[arg-type]
     assert not (tmp_path / "faintspot.toml").exists()
+
+
+def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a made-up answer; how it comes about is tested where it is made."""
+    monkeypatch.chdir(tmp_path)
+    asked: dict[str, object] = {}
+
+    def made(question: LoopQuestion, folder: str, **options: object) -> LoopAnswer:
+        asked.update(options, question=question, folder=folder)
+        return made_up()
+
+    monkeypatch.setattr(loop_tuning, "tune_loop", made)
+    result = run.ok(
+        *("tune", "--loop", "diffraction_limit", "--magnitudes", "9,13", "--magnitude", "12"),
+        *("--arms", "tv, map+kalman", "--strehl", 0.3, "--radius", 20, "--minutes", 2, "--workers", 1),
+    )
+    question = asked["question"]
+    assert isinstance(question, LoopQuestion)
+    assert (question.magnitudes, question.arms) == ((9.0, 13.0), ["tv", "map+kalman"])
+    assert (question.strehl, question.radius_arcsec, question.minutes) == (0.3, 20.0, 2.0)
+    assert question.configuration.camera.magnitude == 12.0
+    assert asked["folder"] == "diffraction_limit-tune"
+    for text in ("Recommended: window+kalman", "against window", "galactic pole", "This rests on"):
+        assert text in result.out
+    assert max(len(line) for line in result.out.splitlines()[:-3]) <= 80
+    assert "…" not in result.out
+    assert (tmp_path / "faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
+    LAYOUT.save("faintspot.toml")
+    assert SlopePipeline.from_file("faintspot.toml").settings.estimator.name == "window"
+    assert (tmp_path / "faintspot-loop.toml").is_file()
+    run.refused("tune", "--loop", "canary", naming=("faintspot.toml", "--overwrite"))
+    run.ok("tune", "--loop", "canary", "--overwrite")

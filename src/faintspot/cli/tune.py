@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import shlex
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
+from click.core import ParameterSource
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from faintspot import configuration
-from faintspot.cli.needs import can_make, suggested_slopes
+from faintspot.cli import tune_loop
+from faintspot.cli.needs import suggested_slopes
 from faintspot.cli.progress import progress_bar
+from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
 from faintspot.compare.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
@@ -24,7 +26,6 @@ from faintspot.compare.photometry import (
     ZERO_POINTS,
 )
 from faintspot.errors import InputError
-from faintspot.files import write_atomically
 from faintspot.io.frames import open_frames
 from faintspot.planner import answer_text
 from faintspot.planner.camera_file import TABLES, read_camera
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from faintspot.planner.question import Question
 
 _MOST_FRAMES = 200
-_WIDEST_TEXT = 110
 
 # Name, type, metavar and help of every option that is also a key of the camera file.
 _VALUES: tuple[tuple[str, Any, str | None, str], ...] = (
@@ -113,7 +113,12 @@ def _values(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--picture", metavar="PNG", help="The plot. Default: beside the output, with -tune.png.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the simulation.")
 @click.option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
+@tune_loop.loop_options
+@click.pass_context
 def command(
+    context: click.Context,
+    /,
+    loop: str | None,
     camera: str | None,
     frames: tuple[str, ...],
     dark: tuple[str, ...],
@@ -134,17 +139,26 @@ def command(
 
     What is not known is left out; recorded frames (and darks) tell most of it.
 
+    With --loop it is the closed loop that counts: estimators and control are tuned in quick simulations of it
+    and compared by their Strehl ratio, limiting magnitude and the fraction of the sky that they open, with a
+    fixed window and an integrator as the baseline. A few minutes; interrupted, the same command goes on.
+
     \b
     Examples:
       faintspot tune --camera camera.toml --budget 0.1
       faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
       faintspot tune --frames cube.fits --dark dark.fits --magnitude 11 --lenslet-m 0.5 --frame-rate-hz 500
+      faintspot tune --loop diffraction_limit
+      faintspot tune --loop mine.toml --magnitudes 8,14 --strehl 0.3
     """
+    _check_kind(context)
+    if loop is not None:
+        tune_loop.tune_for_loop(loop, context.params)
+        return
+    options = {name: value for name, value in options.items() if name not in tune_loop.NAMES}
     target = Path(output)
-    _check_target(target, overwrite)
-    drawing = None
-    if can_make("picture", "web", "matplotlib", asked=picture is not None):
-        drawing = Path(picture) if picture else target.with_name(f"{target.stem}-tune.png")
+    check_target(target, overwrite)
+    drawing = picture_file(target, picture)
     given = _given(camera, options)
     known = _sensor(grid, layout_file, target, given)
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
@@ -154,14 +168,14 @@ def command(
 
         answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
     console = Console(highlight=False)
-    for line in _wrapped([answer_text.situation(answer)], console):
+    for line in wrapped([answer_text.situation(answer)], console):
         click.echo(line)
     console.print(answer_table(answer))
     heading, *rest = answer_text.recommendation(answer)
-    for line in [*_wrapped([heading], console), *_wrapped(rest, console, "  ")]:
+    for line in [*wrapped([heading], console), *wrapped(rest, console, "  ")]:
         click.echo(line)
     click.echo("This rests on")
-    for line in _wrapped(answer_text.foundations(answer), console, "  "):
+    for line in wrapped(answer_text.foundations(answer), console, "  "):
         click.echo(line)
     _write(answer, target, drawing, frames)
 
@@ -194,11 +208,19 @@ def answer_table(answer: Answer) -> Table:
     return table
 
 
-def _check_target(target: Path, overwrite: bool) -> None:
-    if not target.absolute().parent.is_dir():
-        raise InputError(f"{target}: the folder {target.parent} does not exist: create it or choose another")
-    if target.exists() and not overwrite:
-        raise InputError(f"{target}: exists already; --overwrite replaces its settings and keeps its layout")
+def _check_kind(context: click.Context) -> None:
+    """Refuse options of the other kind of question."""
+    given = {
+        name for name in context.params if context.get_parameter_source(name) == ParameterSource.COMMANDLINE
+    }
+    if "loop" in given:
+        wrong = given - {"loop", *tune_loop.NAMES, *tune_loop.SHARED}
+        why = "without --loop: what is known of the loop is in its configuration"
+    else:
+        wrong, why = given & set(tune_loop.NAMES), "with --loop"
+    flags = [option.opts[0] for option in context.command.params if option.name in wrong]
+    if flags:
+        raise InputError(f"{', '.join(sorted(flags))}: expected only {why}")
 
 
 def _given(camera: str | None, options: dict[str, Any]) -> dict[str, Any]:
@@ -274,26 +296,11 @@ def _read(paths: tuple[str, ...], key: str | None) -> NDArray[Any]:
         return source.block(0, min(_MOST_FRAMES, source.n_frames))
 
 
-def _wrapped(lines: list[str], console: Console, indent: str = "") -> list[str]:
-    width = min(console.width, _WIDEST_TEXT)
-    return [
-        part
-        for line in lines
-        for part in textwrap.wrap(
-            line, width, initial_indent=indent, subsequent_indent=f"{indent}  ", break_long_words=False
-        )
-    ]
-
-
 def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str, ...]) -> None:
     """Write configuration and picture, and say what comes next."""
     answer.save(target)
     click.echo(f"{target}: written")
-    if picture is not None:
-        from faintspot.report.drawing import png
-
-        write_atomically(picture, png(answer.figure()))
-        click.echo(f"{picture}: picture")
+    write_picture(answer, picture)
     if answer.question.layout is None:
         pixels = answer.question.pixels
         click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")

@@ -19,7 +19,7 @@ from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.registry import estimator_named, estimators
 from faintspot.estimators.window import Window
 from faintspot.loop.camera import make_detector
-from faintspot.loop.configuration import CLOSED, LoopConfiguration
+from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
 from faintspot.options import AUTO, Option
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import Score, TrainedScore
@@ -233,7 +233,7 @@ class ArmKind:
             control=self.control,
             noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
             psf=_flat_psf(configuration) if Need.PSF in estimator.required else None,
-            score=_trained_score(configuration) if Need.SCORE in estimator.required else None,
+            score=_trained_score(_without_runs(configuration)) if Need.SCORE in estimator.required else None,
             **changes,
         )
 
@@ -324,6 +324,11 @@ def _flat_psf(configuration: LoopConfiguration) -> PSF:
 @functools.lru_cache(maxsize=4)
 def _psf(size: float, elongation: float, radius_px: float) -> PSF:
     return PSF.analytic(size=size, elongation=elongation, radius_px=radius_px)
+
+
+def _without_runs(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without what no score depends on, so that one serves runs of any length."""
+    return replace(configuration, run=Run(seed=configuration.run.seed))
 
 
 @functools.lru_cache(maxsize=4)

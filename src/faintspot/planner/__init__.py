@@ -9,6 +9,9 @@ from faintspot.lazy import lazy_attributes
 if TYPE_CHECKING:
     from faintspot.compare.photometry import Photometry as Photometry
     from faintspot.planner.answer import Answer as Answer
+    from faintspot.planner.loop_answer import LoopAnswer as LoopAnswer
+    from faintspot.planner.loop_question import LoopQuestion as LoopQuestion
+    from faintspot.planner.loop_tuning import tune_loop as tune_loop
     from faintspot.planner.promise import Promise as Promise
     from faintspot.planner.promise import check_promise as check_promise
     from faintspot.planner.question import Question as Question
@@ -17,23 +20,18 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Answer": "faintspot.planner.answer",
+    "LoopAnswer": "faintspot.planner.loop_answer",
+    "LoopQuestion": "faintspot.planner.loop_question",
     "Photometry": "faintspot.compare.photometry",
     "Promise": "faintspot.planner.promise",
     "Question": "faintspot.planner.question",
     "check_promise": "faintspot.planner.promise",
     "question_from_frames": "faintspot.planner.recorded",
     "tune": "faintspot.planner.tuning",
+    "tune_loop": "faintspot.planner.loop_tuning",
 }
 
-__all__ = [
-    "Answer",
-    "Photometry",
-    "Promise",
-    "Question",
-    "check_promise",
-    "question_from_frames",
-    "tune",
-]
+__all__ = sorted(_HOMES)
 
 
 __getattr__ = lazy_attributes(__name__, _HOMES)

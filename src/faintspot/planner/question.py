@@ -218,6 +218,11 @@ class Question:
         return float(self.photometry.electrons(self.magnitude))
 
     @property
+    def light_is_known(self) -> bool:
+        """Whether estimators are told the star's light: it is assumed, not that of a recording's spots."""
+        return self.relative_light is None and self.psf is None
+
+    @property
     def budget_px(self) -> float | None:
         """The error budget in px."""
         if self.budget is None:

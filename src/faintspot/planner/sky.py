@@ -29,7 +29,7 @@ _MEAN_MAGNITUDES = np.arange(5.0, 17.0)
 _MEAN_DENSITIES = np.array(
     [0.0423, 0.129, 0.400, 1.177, 3.379, 9.282, 25.41, 71.65, 178.1, 417.3, 954.8, 2154.9]
 )
-_FAINTEST = 21.0
+_BRIGHTEST, _FAINTEST = 5.0, 21.0
 # V of a K0 dwarf, a typical star of these counts, less its magnitude in a band (Bessell & Brett 1988, PASP
 # 100, 1134; Bessell 1979).
 _V_MINUS = {"B": -0.81, "V": 0.0, "R": 0.45, "I": 0.85, "J": 1.45, "H": 1.85, "K": 1.95}
@@ -61,7 +61,7 @@ def star_density(magnitude: ArrayLike, latitude_deg: float, band: str = "V") -> 
     """
     latitude = abs(number_between("latitude_deg", latitude_deg, -90.0, 90.0))
     colour = _V_MINUS[one_of("band", band, tuple(_V_MINUS))]
-    visual = numbers_between("magnitude", magnitude, 5.0 - colour, _FAINTEST - colour) + colour
+    visual = numbers_between("magnitude", magnitude, *known_magnitudes(band)) + colour
     if latitude >= _LOWEST_LATITUDE_DEG:
         return _averaged(visual, latitude)
     above = math.sin(math.radians(_LOWEST_LATITUDE_DEG))  # the fraction of the sky that is below
@@ -72,6 +72,12 @@ def star_density(magnitude: ArrayLike, latitude_deg: float, band: str = "V") -> 
     mean = np.exp(within + slope * np.maximum(visual - _MEAN_MAGNITUDES[-1], 0.0))
     density: Floats = np.maximum((mean - (1 - above) * away) / above, away)
     return density
+
+
+def known_magnitudes(band: str = "V") -> tuple[float, float]:
+    """Return the brightest and the faintest magnitude that `star_density` knows."""
+    colour = _V_MINUS[one_of("band", band, tuple(_V_MINUS))]
+    return _BRIGHTEST - colour, _FAINTEST - colour
 
 
 def sky_coverage(magnitude: ArrayLike, radius_arcsec: float, latitude_deg: float, band: str = "V") -> Floats:

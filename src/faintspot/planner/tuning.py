@@ -204,6 +204,8 @@ class _Trial:
         """Choose an estimator's options on the first sample, and score it on the second."""
         scene = self._question.scene(flux_e)
         arm = arm_for_scene(kind, scene, psf=self._psf, score=score)
+        if arm.estimator.uses_light and self._question.light_is_known:
+            arm = arm.with_options({"flux_e": float(f"{flux_e:.4g}")})
         return _chosen_and_scored(arm, tuned_options(arm, scene), self._spots, *samples)
 
     @cached_property

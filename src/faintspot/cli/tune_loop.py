@@ -1,0 +1,196 @@
+"""faintspot tune --loop: which estimator and control, for a closed loop."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from faintspot.cli.progress import progress_bar
+from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
+from faintspot.errors import InputError
+
+if TYPE_CHECKING:
+    from faintspot.planner.loop_answer import LoopAnswer
+    from faintspot.planner.loop_question import LoopQuestion
+
+NAMES = ("magnitudes", "arms", "strehl", "radius", "minutes", "workers", "folder")
+"""Options that only --loop has."""
+SHARED = ("magnitude", "flux_e", "output", "picture", "overwrite")
+"""Options that both kinds of question have."""
+
+
+def loop_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that only --loop has."""
+    for option in (
+        click.option("--folder", metavar="FOLDER", help="Loop: where finished work is. Default: NAME-tune."),
+        click.option("--workers", type=click.IntRange(0), metavar="N", help="Loop: processes. Default: all."),
+        click.option(
+            "--minutes",
+            type=float,
+            metavar="M",
+            help="Loop: begin no further candidate after so long. Default: 5.",
+        ),
+        click.option(
+            "--radius",
+            type=float,
+            metavar="ARCSEC",
+            help="Loop: how far a star serves. Default: the isoplanatic angle.",
+        ),
+        click.option(
+            "--strehl",
+            type=float,
+            metavar="S",
+            help="Loop: that limiting magnitudes are for. Default: half of that of a bright star.",
+        ),
+        click.option(
+            "--arms", metavar="NAMES", help="Loop: candidates, with commas, as for `loop magnitude`."
+        ),
+        click.option("--magnitudes", metavar="FIRST,LAST", help="Loop: range of stars to answer for."),
+        click.option(
+            "--loop",
+            "loop",
+            metavar="CONFIG",
+            help="Answer for this closed loop (TOML, or a name of `faintspot loop list`) by Strehl ratio.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def tune_for_loop(config: str, options: dict[str, Any]) -> None:
+    """Answer for a closed loop: print, draw and write it."""
+    target = Path(options["output"])
+    check_target(target, options["overwrite"])
+    picture = picture_file(target, options["picture"])
+    question = _question(config, options)
+    from faintspot.compare.running import Workplace
+    from faintspot.planner.loop_tuning import tune_loop
+
+    folder = options["folder"] or f"{question.configuration.name}-tune"
+    with progress_bar("loop") as advance:
+        place = Workplace(options["workers"], progress=advance)
+        answer = tune_loop(question, folder, place=place, overwrite=options["overwrite"])
+    show(answer)
+    loop = answer.save(target)
+    click.echo(f"{target}: written, and {loop}, the loop with this star and gain")
+    write_picture(answer, picture)
+    best, photons = answer.best.name, f"{answer.photons[answer.at_star]:g}"
+    command = shlex.join(["faintspot", "loop", "magnitude", str(loop), "--arms", f"brightest,window,{best}"])
+    click.echo(f"Next, a long search and long runs: {command} --photons {photons}")
+
+
+def show(answer: LoopAnswer) -> None:
+    """Print the answer."""
+    from faintspot.planner import loop_text
+
+    console = Console(highlight=False)
+
+    def say(lines: list[str], indent: str = "") -> None:
+        for line in wrapped(lines, console, indent):
+            click.echo(line)
+
+    say([loop_text.situation(answer)])
+    console.print(strehl_table(answer))
+    heading, *rest = loop_text.recommendation(answer)
+    say([heading])
+    say(rest, "  ")
+    console.print(gain_table(answer))
+    if answer.question.radius is not None:
+        console.print(sky_table(answer))
+    say(loop_text.about_the_sky(answer), "  ")
+    click.echo("This rests on")
+    say(loop_text.foundations(answer), "  ")
+
+
+def strehl_table(answer: LoopAnswer) -> Table:
+    """Return the Strehl ratios of all candidates at all measured magnitudes as a table."""
+    from faintspot.planner.answer_text import plain_number
+
+    table = _table()
+    for flux in reversed(range(len(answer.photons))):
+        heading = f"{answer.magnitudes[flux]:.2f}\n{plain_number(answer.photons[flux])} e-"
+        table.add_column(heading, justify="right", no_wrap=True)
+    for result in answer.results:
+        values = [answer.strehl(result.name, flux) for flux in reversed(range(len(answer.photons)))]
+        texts = [f"{each.value:.3f}±{each.standard_error:.3f}".removesuffix("±nan") for each in values]
+        table.add_row(result.name, *texts, style="bold" if result is answer.best else None)
+    table.caption = "Strehl ratio and its standard error, at magnitudes that were measured."
+    return table
+
+
+def gain_table(answer: LoopAnswer) -> Table:
+    """Return limiting magnitudes and what is gained over both references as a table."""
+    from faintspot.planner import loop_text
+
+    table = _table()
+    for heading in ("limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for result in answer.results:
+        cells = [loop_text.limit_in_words(answer, result.name)]
+        for reference in loop_text.REFERENCES:
+            same = result.name == reference
+            cells.append("" if same else loop_text.gain_in_words(answer, result.name, reference))
+        table.add_row(result.name, *cells, style="bold" if result is answer.best else None)
+    table.caption = f"Limiting magnitude: for a Strehl ratio of {answer.level:.3g}, interpolated."
+    return table
+
+
+def sky_table(answer: LoopAnswer) -> Table:
+    """Return the fraction of the sky that every candidate opens as a table."""
+    from faintspot.planner import loop_text
+    from faintspot.planner.sky import PLACES
+
+    table = _table()
+    for place in PLACES:
+        table.add_column(f"{place}\n%", justify="right", no_wrap=True)
+    for result in answer.results:
+        found = [answer.coverage(result.name, place) for place in PLACES]
+        cells = [loop_text.coverage_in_words(each) for each in found if each is not None]
+        table.add_row(result.name, *cells, style="bold" if result is answer.best else None)
+    return table
+
+
+def _table() -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("method", no_wrap=True)
+    table.caption_justify = "left"
+    return table
+
+
+def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
+    from faintspot.loop.configuration import load_loop
+    from faintspot.planner.loop_question import LoopQuestion
+
+    loop = load_loop(config)
+    if options["magnitude"] is not None and options["flux_e"] is not None:
+        raise InputError("--magnitude, --photons: expected one of them, got both")
+    if options["magnitude"] is not None:
+        loop = loop.replace("camera", magnitude=options["magnitude"], photons_per_subaperture=None)
+    if options["flux_e"] is not None:
+        loop = loop.replace("camera", photons_per_subaperture=options["flux_e"], magnitude=None)
+    arms, minutes = options["arms"], options["minutes"]
+    return LoopQuestion(
+        loop,
+        magnitudes=_range(options["magnitudes"]),
+        arms=None if arms is None else [name.strip() for name in arms.split(",") if name.strip()],
+        strehl=options["strehl"],
+        radius_arcsec=options["radius"],
+        **({} if minutes is None else {"minutes": minutes}),
+    )
+
+
+def _range(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        first, last = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--magnitudes {text}: expected the first and the last, such as 8,14") from None
+    return first, last
