@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from benchmarks.measuring import Row, Table, best, interleaved, pinned
+from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
 from faintspot.control.kalman import SlopePredictor
@@ -80,9 +80,13 @@ def large_table() -> Table:
             matrix @ slopes
 
     # Correction 2, onward 2, and what the mirror added and its command 3 halves of a square matrix.
-    candidates = {
+    def of_neighbours() -> None:
+        of(near, local, 4)
+        of(commands, local, 3)
+
+    candidates: dict[str, Candidate] = {
         "whole matrices, float32": partial(of, whole, vector, 6),
-        "neighbours within 4": lambda: (of(near, local, 4), of(commands, local, 3)),
+        "neighbours within 4": of_neighbours,
     }
     with pinned():
         times = interleaved(candidates, fewest=3)

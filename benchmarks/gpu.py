@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks import rivals, study
 from benchmarks.measuring import Row, Table, Times, absolute_spread, best, pinned, spread
-from benchmarks.rival_numpy import momenta
+from benchmarks.rival_numpy import FIRST_MULTIPLIER, momenta
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.kernels.sweeps import FGP_STEP
-from faintspot.kernels.total_variation import FIRST_MULTIPLIER
 from faintspot.study.cell import measure_cell
 from faintspot.study.running import run as run_study
 from faintspot.study.sweep import Sweep

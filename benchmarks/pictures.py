@@ -34,7 +34,8 @@ def frames(layout: fs.Layout) -> dict[str, NDArray[np.uint16]]:
         frame, _ = fs.simulate.sensor_frames(
             layout.corners, layout.window, layout.frame_shape, 1, flux_e=flux_e, detector=camera, rng=rng
         )
-        return np.clip(np.rint(frame[0] + 100.0), 0, 65535).astype(np.uint16)
+        pixels: NDArray[np.uint16] = np.clip(np.rint(frame[0] + 100.0), 0, 65535).astype(np.uint16)
+        return pixels
 
     return {
         "faint": spots(40.0),

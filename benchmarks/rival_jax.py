@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.rival_numpy import momenta
+from benchmarks.rival_numpy import FIRST_MULTIPLIER, momenta
 from faintspot.kernels.sweeps import FGP_STEP
-from faintspot.kernels.total_variation import FIRST_MULTIPLIER
 
 # Must be in the environment before JAX is first imported.
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.kernels.sweeps import FGP_STEP
-from faintspot.kernels.total_variation import FIRST_MULTIPLIER
 
 Floats = NDArray[np.float32]
+
+
+FIRST_MULTIPLIER = 0.4  # lambda of the first iteration from p = 0, in units of the noise: rivals begin there
 
 
 def momenta(iterations: int) -> Floats:

@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.rival_numpy import momenta
+from benchmarks.rival_numpy import FIRST_MULTIPLIER, momenta
 from faintspot.kernels.sweeps import FGP_STEP
-from faintspot.kernels.total_variation import FIRST_MULTIPLIER
 
 
 def compiles() -> bool:

@@ -75,9 +75,11 @@ def test_all_that_is_missing_is_named(folder: Path, run: Commands) -> None:
 
 def test_help_names_the_extra(run: Commands) -> None:
     for line, extra in NEEDING.items():
-        command, names = group, line.split()
+        command: click.Command | None = group
+        names = line.split()
         while isinstance(command, click.Group):
             command = command.get_command(click.Context(command), names.pop(0))
+        assert command is not None
         if command.epilog:
             assert f"faintspot[{extra}]" in command.epilog
     assert "faintspot[loop]" in run.ok("loop", "run", "--help").out

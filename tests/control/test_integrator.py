@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from tests.control.control_cases import ERRORS, INTERACTION
 
 from faintspot.control.commands import CommandLine
@@ -70,9 +71,10 @@ def test_equal_gains_of_all_modes_are_one_gain_on_what_is_driven() -> None:
     reconstructor = make_reconstructor(INTERACTION)
     lines = [CommandLine(INTERACTION.shape[1], 2) for _ in range(2)]
     equal = np.full(reconstructor.modes.shape[1], 0.4)
+    gains: tuple[float | NDArray[np.float64], ...] = (0.4, equal)
     one, several = (
         Integrator(line, INTERACTION, reconstructor, gain, 0.01)
-        for line, gain in zip(lines, (0.4, equal), strict=True)
+        for line, gain in zip(lines, gains, strict=True)
     )
     rng = np.random.default_rng(3)
     for _ in range(5):

@@ -31,7 +31,8 @@ def tolerance_of(dtype: Any) -> float:
 
 def rounding_of(g: Any, dtype: Any) -> float:
     """What rounding may leave of a denoised image, in units of its largest pixel."""
-    return 50 * max(1.0, (max(g.shape) / 12) ** 2) * tolerance_of(dtype)
+    size: int = max(g.shape)
+    return 50 * max(1.0, (size / 12) ** 2) * tolerance_of(dtype)
 
 
 def strengths_of(stack: Any, fraction: float) -> Any:

@@ -99,7 +99,7 @@ def test_the_search_climbs_to_the_best_and_looks_at_nothing_twice() -> None:
 
     def score(choice: Any) -> float:
         seen.append((choice["gain"], choice["width"]))
-        return -((choice["gain"] - 7) ** 2) - (choice["width"] - 2.0) ** 2
+        return -float((choice["gain"] - 7) ** 2 + (choice["width"] - 2.0) ** 2)
 
     assert best_choice(tuned_values, score) == {"gain": 7, "width": 2.0}
     assert len(seen) == len(set(seen)) < 14

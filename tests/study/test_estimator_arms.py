@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import faintspot as fs
+from faintspot.compare.arms import score_for_scene
 from faintspot.study import StudySpecification, Sweep, measure_cell
-from faintspot.study import arms as study_arms
 from faintspot.study.arms import CellArms
 from faintspot.study.cell import realisations
 
@@ -30,8 +30,8 @@ def specification_of(**cell: Any) -> StudySpecification:
 def quick_training() -> Iterator[None]:
     """Train on fewer spots: worse by 2 % (30 e-)."""
     with pytest.MonkeyPatch.context() as patch:
-        quick = functools.partial(study_arms.score_for_scene, realisations=3000)
-        patch.setattr(study_arms, "score_for_scene", quick)
+        quick = functools.partial(score_for_scene, realisations=3000)
+        patch.setattr("faintspot.study.arms.score_for_scene", quick)
         yield
 
 

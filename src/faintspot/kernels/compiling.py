@@ -9,7 +9,6 @@ from typing import Any
 
 from numba import njit
 from numba.core import types as numba_types
-from numba.core.dispatcher import Dispatcher
 
 from faintspot.kernels.cached import kernel_cache
 
@@ -59,7 +58,7 @@ def allocating(function: Callable[..., Any]) -> Any:
 def _dispatcher(function: Callable[..., Any], others: tuple[Path, ...] = (), **options: Any) -> Any:
     """Compile with a cache that asks for all kernels' sources."""
     dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)
-    if isinstance(dispatcher, Dispatcher):  # where NUMBA_DISABLE_JIT is set, it is the function itself
+    if hasattr(dispatcher, "_cache"):  # where NUMBA_DISABLE_JIT is set, it is the function itself
         dispatcher._cache = kernel_cache(function, _kernels_stamp() + tuple(_stamp(path) for path in others))
     return dispatcher
 
