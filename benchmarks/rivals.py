@@ -48,7 +48,7 @@ MODULES = {
 """Optional rivals: what to import, and what to install."""
 SKIMAGE_IMAGES = 36  # takes one image after the other: so many tell the time of one
 TARGETS = {"scikit-image": 200.0, "NumPy": 9.0, "JAX": 9.0}
-SAME_POSITION_PX = 1e-4  # same algorithm: only float32 rounding may differ
+SAME_POSITION_PX = 2e-3  # same algorithm from p = 0: after so many iterations the start is all but forgotten
 SAME_SOLUTION_PX = 0.01  # another algorithm, where both have converged
 SAME_FIELD = 1e-4  # dual fields, of order one, after 20 sweeps in another order of rounding
 

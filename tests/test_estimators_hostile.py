@@ -91,7 +91,9 @@ class TestImages:
         rng = np.random.default_rng(seed)
         images = hostile_images(rng, case.images.shape)
         measured = rng.random() < 0.5
-        chosen = case.settings.replace(flux_e=None) if measured else case.settings
+        chosen = case.settings
+        if measured:
+            chosen = with_options(chosen.replace(flux_e=None), normalisation="frame")
         chosen = with_options(chosen, local_background=str(rng.choice(["on", "off"])))
         assert_sane(replace(case, images=images, settings=chosen).measure())
 
@@ -112,6 +114,8 @@ class TestImages:
         assert_sane(slopes)
         if estimator == "smoothed" and level < 0:
             return  # the zeros beyond the window are the light that it sees
+        if estimator == "window":
+            return  # it divides by the light that was expected, so that a faint frame is no worse than others
         assert np.all(slopes.flags & Flag.NO_LIGHT)
 
     def test_map_notices_that_there_is_no_light(self) -> None:
@@ -133,7 +137,7 @@ class TestImages:
         images[0, 4, 4] = 65535
         case = flat_case(estimator, images)
         mask = np.zeros((54, 9), bool)
-        mask[9, 0] = True  # the first pixel of the second image
+        mask[9 + 4, 5] = True  # next to the middle of the second image: one that every estimator looks at
         slopes = replace(case, calibration=replace(case.calibration, bad_pixels=mask)).measure()
         assert_sane(slopes)
         assert slopes.flags[0] & Flag.SATURATED

@@ -159,7 +159,7 @@ class TestSettings:
             {"noise_std": 2.7},
             {"noise_std": 0.0},
             {"noise_std": 1e6},
-            {"tolerance": 0.2},
+            {"tolerance": 1e-6},
             {"max_iterations": 2},
             {"keep_brightest": 20},
             {"rule": "threshold"},

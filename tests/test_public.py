@@ -68,7 +68,7 @@ def test_sensor_needs_no_kernels() -> None:
         "import faintspot, faintspot.options, faintspot.tables\n"
         "faintspot.Layout.grid((2, 2), pixels=4)\nfaintspot.Calibration()"
     )
-    assert imported_by(statement) == set()
+    assert imported_by(statement) <= {"scipy"}
 
 
 def test_settings_load_no_more_than_numba_and_scipy() -> None:

@@ -40,7 +40,7 @@ class TestSettings:
         settings = fs.Settings(noise_std=1.0)
         assert settings.values("keep_brightest", 3, 256).tolist() == [20] * 3
         assert settings.values("keep_brightest", 1, 16).tolist() == [5]
-        assert settings.values("tolerance", 2, 16).tolist() == [0.01, 0.01]
+        assert settings.values("tolerance", 2, 16).tolist() == [0.02, 0.02]
         fast = settings.replace(preset="fast")
         assert fast.values("tolerance", 2, 16).tolist() == [0.0, 0.0]
         assert fast.values("max_iterations", 2, 16).tolist() == [8, 8]

@@ -116,7 +116,7 @@ def test_options(folder: Path, run: Commands) -> None:
     assert is_png(folder / "p.png")
     assert not (folder / "new.png").exists()
     assert "slopes 'a b.npz' --key night --config" in result.out
-    for option, value in (("--pixels", "3"), ("--pitch", "-1"), ("--gain", "0"), ("--gain", "nan")):
+    for option, value in (("--pixels", "1"), ("--pitch", "-1"), ("--gain", "0"), ("--gain", "nan")):
         result = run.refused("layout", "a b.npz", "--key", "night", "-o", "o.toml", option, value)
         assert option.removeprefix("--") in result.error
     assert not (folder / "o.toml").exists()
@@ -204,7 +204,7 @@ def test_which_lenslets(folder: Path, run: Commands) -> None:
         ("--pupil", "80,80,-3", "radius"),
         ("--roi", "0,0,1000,10", "within the frame's 160 columns"),
         ("--window", "12", "height and width"),
-        ("--window", "3,12", "pixels = 3"),
+        ("--window", "1,12", "pixels = 1"),
         ("--lit-fraction", "2", "lit-fraction = 2"),
         ("--pitch", "2", "spots of quad cells overlap"),
     ):
@@ -308,7 +308,7 @@ def test_dark_level_and_hot_pixels_of_the_frame(run: Commands, folder: Path) -> 
     # The median of some hundred background pixels with 3 e- of noise and faint wings of the spots.
     assert calibration.dark == pytest.approx(OFFSET_ADU, abs=1.5)
     assert not calibration.vouches_for_dark
-    assert run("layout", "frames.npy", "-o", "new.toml", "--dark", "70").code == 0
+    assert run("layout", "frames.npy", "-o", "new.toml", "--dark", "70", "--overwrite").code == 0
     assert Calibration.load(folder / "new.toml").vouches_for_dark
 
 

@@ -119,7 +119,7 @@ CONFIGURATIONS: list[tuple[str, tuple[str, ...]]] = [
         "[layout]\nframe_shape = [32, 32]\nwindow = [8, 8]\ncorners = []\n[settings]\nnoise_std = 2.0",
         ("layout.corners", "empty"),
     ),
-    (CONFIGURATION + "[calibration]\ngain_e_per_adu = 0.0", ("calibration.gain_e_per_adu", "above 0")),
+    (CONFIGURATION + "[calibration]\ngain_e_per_adu = 0.0", ("calibration.gain_e_per_adu", "from 1e-09")),
     (CONFIGURATION + '[calibration]\ndark = "dark.fits"', ("calibration.dark", "dark.fits", "no such file")),
     ("settings = 3\n[layout.grid]\nshape = [4, 4]\npixels = 8", ("settings", "expected a table")),
 ]

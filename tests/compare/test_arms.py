@@ -36,7 +36,10 @@ def test_knowledge_follows_from_the_needs() -> None:
         "map",
         "trained",
     ]
-    assert [name for name, knowledge in found.items() if knowledge is Knowledge.WIDTH] == ["weighted"]
+    assert [name for name, knowledge in found.items() if knowledge is Knowledge.WIDTH] == [
+        "window",
+        "weighted",
+    ]
 
 
 def test_speckled_spots_are_blurred_or_doubted() -> None:

@@ -67,7 +67,7 @@ def test_width_of_a_psf_is_without_the_pixel() -> None:
         ({"read_noise_e": -1.0}, "read_noise_e"),
         ({"read_noise_e": "three"}, "read_noise_e"),
         ({"pixels": None}, "pixels"),
-        ({"pixels": 3}, "pixels"),
+        ({"pixels": 1}, "pixels"),
         ({"pixels": 15.5}, "pixels"),
         ({"em_gain": 0.5}, "em_gain"),
         ({"background_e": -0.1}, "background_e"),

@@ -61,7 +61,8 @@ def test_arms_are_what_they_say(
     for k in (1, 7, 30, 99):
         kept = fs.brightest_pixels(prepared.astype(np.float64), keep=k, rule=rule)
         expected = errors(fs.centre_of_gravity(kept), truth)
-        np.testing.assert_allclose(table[:, k - 1], expected, rtol=0, atol=1e-5)  # of single precision
+        found = valid[:, k - 1]
+        np.testing.assert_allclose(table[found, k - 1], expected[found], rtol=0, atol=1e-5)  # of float32
 
 
 def test_without_light_the_position_is_the_centre() -> None:
