@@ -88,8 +88,8 @@ def tune(
     All combinations of a few values of each option first, then steps from the best of them to
     neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
     which takes much longer than a run, the estimator's options and the gain at which telemetry is taken are
-    those that are best with the integrator, and only what is the control's own is sought with it. All see the same air and noise; realisations are
-    those from `FIRST_TUNING_REALISATION` on, which are not scored.
+    those that are best with the integrator, and only what is the control's own is sought with it. All see
+    the same air and noise; realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
 
     Parameters
     ----------
