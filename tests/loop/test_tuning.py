@@ -62,7 +62,8 @@ def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
 
 
 def test_is_repeatable_and_stored() -> None:
-    one, other = (tuning_unit(arm_kind("centroid"), small(), SEARCH, lambda frames: None) for _ in range(2))
+    centroid = arm_kind("centroid")
+    one, other = (tuning_unit(centroid, small(), SEARCH, None, lambda frames: None) for _ in range(2))
     assert stored_choice(one) == stored_choice(other)
     np.testing.assert_array_equal(one["strehl"], other["strehl"])
     assert 0 < one["strehl"] < 1
@@ -73,3 +74,11 @@ def test_search_is_checked() -> None:
         Search(frames=50, settle_frames=60)
     with pytest.raises(InputError, match=r"search.rounds"):
         Search(rounds=-1)
+
+
+def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
+    kind = arm_kind("brightest+modal")
+    found = tune(kind, small(), Search(rounds=9), slopes={LOOP_GAIN: 0.9, "keep_brightest": BEST + 0.1})
+    highest = max(kind.tuned(small())[LOOP_GAIN].values)
+    assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST}
+    assert found.tried == 1

@@ -30,6 +30,7 @@ from faintspot.loop.tuning import (
     stored_choice,
     tuning_frames,
     tuning_unit,
+    with_integrator,
 )
 
 KIND = "magnitude"
@@ -116,18 +117,36 @@ def tuned_choices(
     *,
     overwrite: bool,
 ) -> dict[tuple[str, float], dict[str, Any]]:
-    """Return the tuned values of every arm at every flux, tuned now where they are not stored."""
-    units = {}
-    for kind in kinds:
-        for flux in fluxes:
-            star = with_flux(configuration, flux)
-            frames = tuning_frames(kind, star, search)
-            units[kind.name, flux] = Unit(f"{kind.name}-{flux:g}", (kind, star, search), frames)
-    every = list(units.values())
+    """Return the tuned values of every arm at every flux, tuned now where they are not stored.
+
+    Slopes first, with the integrator, also of arms whose control learns; then what is that control's own.
+    """
+    plain = {kind.name: kind for kind in map(with_integrator, kinds)}
+    learning = {kind.name: kind for kind in kinds if kind.name not in plain}
+    choices: dict[tuple[str, float], dict[str, Any]] = {}
+
+    def units(kinds: Mapping[str, ArmKind]) -> dict[tuple[str, float], Unit]:
+        return {
+            (name, flux): _tuning_unit(
+                kind, with_flux(configuration, flux), search, choices.get((with_integrator(kind).name, flux))
+            )
+            for name, kind in kinds.items()
+            for flux in fluxes
+        }
+
+    every = [*units(plain).values(), *units(learning).values()]
     store = unit_store(folder, f"{experiment}-tuning", (configuration, search), every, overwrite=overwrite)
-    place.say("tuning")
-    results = run_units(tuning_unit, every, store, place)
-    return {key: stored_choice(results[unit.key]) for key, unit in units.items()}
+    for stage, kinds_now in (("tuning", plain), ("tuning of control", learning)):
+        if now := units(kinds_now):
+            place.say(stage)
+            results = run_units(tuning_unit, list(now.values()), store, place)
+            choices.update({key: stored_choice(results[unit.key]) for key, unit in now.items()})
+    return choices
+
+
+def _tuning_unit(kind: ArmKind, star: LoopConfiguration, search: Search, slopes: Choice | None) -> Unit:
+    key = f"{kind.name}-{star.camera.photons_per_subaperture:g}"
+    return Unit(key, (kind, star, search, slopes), tuning_frames(kind, star, search))
 
 
 def unit_store(

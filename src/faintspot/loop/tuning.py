@@ -80,14 +80,16 @@ def tune(
     configuration: LoopConfiguration,
     search: Search | None = None,
     advance: Advance | None = None,
+    *,
+    slopes: Choice | None = None,
 ) -> Tuned:
     """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
 
     All combinations of a few values of each option first, then steps from the best of them to
     neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
-    which takes much longer than a run, the estimator's options are those that are best with the integrator,
-    and only what is the control's own is sought with it. All see the same air and noise; realisations are
-    those from `FIRST_TUNING_REALISATION` on, which are not scored.
+    which takes much longer than a run, the estimator's options and the gain at which telemetry is taken are
+    those that are best with the integrator, and only what is the control's own is sought with it. All see
+    the same air and noise; realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
 
     Parameters
     ----------
@@ -96,17 +98,24 @@ def tune(
     search : Search, optional
     advance : callable, optional
         Told the number of frames simulated, after every run.
+    slopes : mapping, optional
+        For control that learns: what was found for its slopes with the integrator. Default: sought first.
     """
     search = Search() if search is None else search
     tuned = kind.tuned(configuration)
     if kind.control == INTEGRATOR:
         return _sought(kind, configuration, search, tuned, advance)
-    slopes = tune(replace(kind, control=INTEGRATOR), configuration, search, advance)
+    if slopes is None:
+        slopes = tune(with_integrator(kind), configuration, search, advance).choice
     for name, each in tuned.items():
-        if name in slopes.choice:
-            tuned[name] = each.nearest(slopes.choice[name])
-    found = _sought(kind, configuration, search, tuned, advance)
-    return replace(found, tried=found.tried + slopes.tried)
+        if name in slopes:
+            tuned[name] = each.nearest(slopes[name])
+    return _sought(kind, configuration, replace(search, finalists=1), tuned, advance)
+
+
+def with_integrator(kind: ArmKind) -> ArmKind:
+    """Return the arm with the same slopes whose control need not learn."""
+    return replace(kind, control=INTEGRATOR)
 
 
 def _sought(
@@ -127,7 +136,7 @@ def _sought(
         return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
     best = max(ranked[: search.finalists], key=trials.fine)
     for _ in range(search.rounds):
-        better = max(_neighbours(best, tuned), key=trials.fine)
+        better = max(_neighbours(best, tuned), key=trials.fine, default=best)
         if trials.fine(better) <= trials.fine(best):
             break
         best = better
@@ -135,10 +144,10 @@ def _sought(
 
 
 def tuning_unit(
-    kind: ArmKind, configuration: LoopConfiguration, search: Search, advance: Advance
+    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None, advance: Advance
 ) -> dict[str, NDArray[Any]]:
     """Return what `tune` found, as arrays that can be stored."""
-    tuned = tune(kind, configuration, search, advance)
+    tuned = tune(kind, configuration, search, advance, slopes=slopes)
     return {
         "choice": np.asarray(json.dumps(dict(tuned.choice))),
         "strehl": np.asarray(tuned.strehl),
@@ -153,16 +162,14 @@ def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def tuning_frames(kind: ArmKind, configuration: LoopConfiguration, search: Search) -> int:
-    """Return about how many frames tuning an arm simulates."""
+    """Return about how many frames tuning an arm simulates, where its slopes are tuned already."""
     tuned = kind.tuned(configuration)
-    frames = 0
     if kind.control != INTEGRATOR:
-        slopes = replace(kind, control=INTEGRATOR)
-        frames = tuning_frames(slopes, configuration, search)
-        tuned = {name: each for name, each in tuned.items() if name not in slopes.tuned(configuration)}
+        options = with_integrator(kind).tuned(configuration)
+        tuned = {name: each for name, each in tuned.items() if name not in options}
     combinations = math.prod(len(each.first) for each in tuned.values())
     looks = search.finalists + 2 * len(tuned) * min(2, search.rounds) if search.rounds else 0
-    return frames + combinations * search.coarse_frames + looks * search.frames * search.realisations
+    return combinations * search.coarse_frames + looks * search.frames * search.realisations
 
 
 class _Trials:
