@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
 
 import faintspot as fs
 
@@ -125,11 +127,21 @@ def tv_denoise(
     return Denoised(image, iteration, multiplier * scale, converged, lowered, p, margin)
 
 
+def second_difference(n: int) -> Any:
+    """The divergence of the gradient along one axis."""
+    middle = np.full(n, -2.0)
+    middle[0] += 1.0
+    middle[-1] += 1.0
+    return sparse.diags([np.ones(n - 1), middle, np.ones(n - 1)], [-1, 0, 1])
+
+
 def flat_field(g: Floats, strength: float) -> tuple[tuple[Floats, Floats], float]:
     """The dual field that a solution without structure has, cut to length 1, and its multiplier."""
-    pixels = np.eye(g.size).reshape(-1, *g.shape)
-    laplacian = np.array([divergence(*gradient(pixel)).ravel() for pixel in pixels]).T
-    field = gradient(np.linalg.lstsq(laplacian, g.ravel())[0].reshape(g.shape))
+    along_y, along_x = (second_difference(n) for n in g.shape)
+    laplacian = sparse.kronsum(along_x, along_y, format="csc")
+    potential = np.zeros(g.size)  # up to a constant, so that of one pixel is chosen
+    potential[1:] = spsolve(laplacian[1:, 1:], g.ravel()[1:])
+    field = gradient(potential.reshape(g.shape))
     radius = np.sqrt(g.size) * strength
 
     def cut(multiplier: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
