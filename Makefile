@@ -1,6 +1,7 @@
 # make demo   simulate a faint star, measure it with and without denoising, write a report
 # make test   lint, types, tests
 # make fuzz   hostile values at every door for MINUTES=60; a finding names its seed
+# make docs   the documentation as pages, build/docs/index.html; QUICK=1 leaves out what tutorials compute
 # make bench  speed against other packages, as ratios in one run, as a page (about 15 minutes)
 # make bench-compare  what changed since the run before, beyond noise (or: OLD=file NEW=file)
 # make clean  remove what these made
@@ -14,7 +15,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint types unit fuzz bench bench-compare clean
+.PHONY: demo test lint types unit fuzz docs bench bench-compare clean
 
 demo: $(VENV)/installed
 	$(BIN)/faintspot demo
@@ -34,6 +35,10 @@ unit: $(VENV)/installed
 fuzz: $(VENV)/installed
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
+docs: $(VENV)/installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html $(if $(QUICK),-D plot_gallery=0) docs build/docs
+	@echo "build/docs/index.html: open it in a browser"
+
 bench: $(VENV)/installed-benchmarks
 	$(BIN)/python -m benchmarks
 
@@ -48,10 +53,14 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --editable '.[develop]'
 	@touch $@
 
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	@touch $@
+
 $(VENV)/installed-benchmarks: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable '.[benchmarks]'
 	@touch $@
 
 clean:
-	rm -rf $(VENV) faintspot-demo .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build faintspot-demo docs/auto_tutorials docs/reference/generated docs/sg_execution_times.rst .mypy_cache .pytest_cache .ruff_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

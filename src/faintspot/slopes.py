@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.flags import INVALID
+from faintspot.notebook import slopes_in_words, table
 
 if TYPE_CHECKING:
     import pandas
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4")))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Slopes:
     """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures)."""
 
@@ -48,6 +49,12 @@ class Slopes:
     def vector(self) -> NDArray[np.float32]:
         """All x, then all y, along the last axis: what a reconstructor multiplies."""
         return np.concatenate([self.x, self.y], axis=-1)
+
+    def __repr__(self) -> str:
+        return f"Slopes({', '.join(f'{name} {value}' for name, value in slopes_in_words(self).items())})"
+
+    def _repr_html_(self) -> str:
+        return table("Slopes", slopes_in_words(self))
 
     def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
         """Return an xarray.Dataset with dimensions frame and subaperture, units as attributes.

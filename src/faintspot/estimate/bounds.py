@@ -155,8 +155,8 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     Parameters
     ----------
     error_px : float or array_like
-        Slope error R of the estimator: mean of |x error| and |y error|, px, above 0. For a root mean square
-        error per axis, multiply it by `MEAN_ABSOLUTE`.
+        Slope error R of the estimator: mean of the absolute errors in x and y, px, above 0. For a root mean
+        square error per axis, multiply it by `MEAN_ABSOLUTE`.
     flux_e : float or array_like
         Electrons that it used, counted as in `cramer_rao`; broadcast with `error_px`.
     **conditions

@@ -115,6 +115,11 @@ class Layout:
 
     __hash__ = None  # type: ignore[assignment]
 
+    def _repr_html_(self) -> str:
+        from faintspot.notebook import layout_picture
+
+        return layout_picture(self)
+
     def __len__(self) -> int:
         """Return the number of sub-apertures."""
         return len(self.corners)

@@ -106,6 +106,11 @@ class PSF:
         of = "" if self.index is None else f" for {len(self.index)} sub-apertures"
         return f"PSF({n} of {size}{of}, oversampling {self.oversampling})"
 
+    def _repr_html_(self) -> str:
+        from faintspot.notebook import psf_picture
+
+        return psf_picture(self)
+
     @classmethod
     def analytic(
         cls,

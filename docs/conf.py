@@ -1,0 +1,102 @@
+"""How the documentation is built: `make docs`."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.metadata import version as version_of
+from pathlib import Path
+from typing import Any
+
+from sphinx_gallery.scrapers import figure_rst
+from sphinx_gallery.sorting import FileNameSortKey
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+project = "faintspot"
+author = "the faintspot developers"
+copyright = "the faintspot developers, BSD-3-Clause"
+version = release = version_of("faintspot")
+
+extensions = [
+    "myst_parser",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx_click",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["tutorials/GALLERY_HEADER.rst", "sg_execution_times.rst"]
+nitpicky = False
+
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 4
+# The option tables have marks for the test that compares them with the declarations.
+suppress_warnings = ["config.cache", "myst.header"]
+
+autosummary_generate = True
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+
+def figure_of_block(block: object, block_vars: dict[str, Any], gallery_conf: dict[str, Any]) -> str:
+    """Save what a block of a tutorial leaves in its variable `figure`."""
+    figure = block_vars["example_globals"].pop("figure", None)
+    if figure is None:
+        return ""
+    path = next(block_vars["image_path_iterator"])
+    figure.savefig(path, dpi=110)
+    return str(figure_rst([path], gallery_conf["src_dir"]))
+
+
+sphinx_gallery_conf = {
+    "image_scrapers": (figure_of_block,),
+    "examples_dirs": "tutorials",
+    "gallery_dirs": "auto_tutorials",
+    "within_subsection_order": FileNameSortKey,
+    "filename_pattern": r"plot_",
+    "download_all_examples": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "capture_repr": (),
+    "remove_config_comments": True,
+    "abort_on_example_error": True,
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "faintspot"
+html_static_path = ["_static"]
+html_css_files = ["house.css"]
+html_copy_source = html_show_sourcelink = False
+html_theme_options = {
+    "show_prev_next": True,
+    "navigation_with_keys": False,
+    "header_links_before_dropdown": 6,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+html_sidebars: dict[str, list[str]] = {"index": [], "start": []}
+copybutton_prompt_text = r"\$ |>>> "
+copybutton_prompt_is_regexp = True
+# Formulas are drawn by MathJax, which a browser fetches; nothing is fetched while the pages are built.
+
+
+def _links_to_the_house(app: object, document: str, source: list[str]) -> None:
+    """Pages also read well beside the code, where they link to files that are no pages."""
+    source[0] = re.sub(
+        r"\]\(\.\./((?:examples|benchmarks|src|tests|README|CONTRIBUTING|SECURITY)[^)#]*)\)",
+        r"](<path:../\1>)",
+        source[0],
+    )
+
+
+def setup(app: object) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", _links_to_the_house)  # type: ignore[attr-defined]

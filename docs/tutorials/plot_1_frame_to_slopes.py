@@ -1,0 +1,93 @@
+"""
+From a frame to slopes
+======================
+
+One frame of a sensor that faintspot has never seen: where are its lenslets, where are the spots, and what
+is the wavefront? The frame is real: an on-sky exposure of the 6.5 m MMT's active optics (mmtwfs,
+BSD-3-Clause), with faint spots, hot pixels and no dark.
+"""
+
+# %%
+# Find the lenslets
+# -----------------
+# No hints are needed: neither pitch, nor angle, nor the shape of the pupil.
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import faintspot as fs
+from faintspot.data import mmt_frame
+from faintspot.sensor.found_layout import find_layout
+from faintspot.sensor.hot_pixels import find_hot_pixels
+
+frame = mmt_frame()
+hot = find_hot_pixels(frame)
+bad = np.zeros(frame.shape, bool)
+bad[tuple(hot.T)] = True
+
+found = find_layout(np.where(bad, np.median(frame), frame), bad_pixels=bad)
+layout = found.layout
+print(f"{len(layout)} sub-apertures, {layout.pitch_px:.2f} px apart, turned by {layout.angle_deg:.2f} deg")
+print(f"{len(hot)} hot pixels")
+
+# %%
+from matplotlib.patches import Rectangle
+
+figure = Figure(figsize=(7, 6.6), layout="constrained")
+axes = figure.add_subplot(xlabel="column, px", ylabel="row, px")
+shown = axes.imshow(frame, vmin=1200, vmax=2200, cmap="cividis", origin="lower")
+for row, column in layout.corners:
+    height, width = layout.window
+    axes.add_patch(Rectangle((column - 0.5, row - 0.5), width, height, fill=False, color="white", lw=0.6))
+figure.colorbar(shown, label="ADU", shrink=0.8)
+
+# %%
+# Measure
+# -------
+# What is known of the detector goes into a `Calibration`, what is wanted into `Settings`. Nobody gave a
+# dark, so the background of the frame itself stands for it, and says so (`rough_dark`). The strength of the
+# denoising is a noise level in electrons.
+
+dark = float(np.median(frame))
+calibration = fs.Calibration(dark=dark, rough_dark=True, bad_pixels=hot)
+denoised = fs.SlopePipeline(layout, fs.Settings("tv", noise_std=15.0, keep_brightest=30), calibration)
+plain = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30), calibration)
+
+slopes = denoised(frame)
+print(slopes)
+print(f"{slopes.valid.sum()} of {len(layout)} valid; rms {slopes.vector.std():.2f} px")
+
+# %%
+# One of the fainter sub-apertures, after every step:
+
+stages = denoised.explain(frame)
+which = int(np.argsort(slopes.flux)[len(layout) // 4])
+steps = {
+    "calibrated": stages.calibrated,
+    "denoised": stages.denoised,
+    "background subtracted": stages.background_subtracted,
+}
+figure = Figure(figsize=(9, 3.2), layout="constrained")
+for axes, (title, images) in zip(figure.subplots(1, 3), steps.items(), strict=True):
+    axes.imshow(images[which], cmap="cividis", origin="lower", vmin=-30, vmax=stages.denoised[which].max())
+    axes.set(title=title, xlabel="px")
+
+# %%
+# The wavefront
+# -------------
+# Zernike modes in Noll's order, fitted to the slopes. Tip and tilt are left out of the picture; without a
+# pixel scale in the layout, the unit is that of the slopes.
+
+from faintspot.wavefront.figure import wavefront_figure
+
+wavefront = fs.fit_wavefront(slopes, layout)
+figure = wavefront_figure(wavefront, layout, "the frame").figure
+
+# %%
+# On the command line the same is
+#
+# .. code-block:: sh
+#
+#    faintspot layout frame.npy -o faintspot.toml --mask-hot-pixels
+#    faintspot slopes frame.npy --config faintspot.toml -o slopes.zarr
+#    faintspot wavefront slopes.zarr

@@ -1,0 +1,53 @@
+"""
+Which settings for my camera and star?
+======================================
+
+`faintspot tune` answers from a simulation of your spots: every estimator, tuned on other spots than those
+that score. The same from Python.
+"""
+
+# %%
+# A sensor of 0.6 m lenslets with a camera of 3 electrons, at 500 frames a second; a star of magnitude 10;
+# seeing with r0 of 0.12 m. Numbers of your own go in the same places.
+
+import numpy as np
+
+import faintspot as fs
+from faintspot.planner import Question
+
+question = Question(
+    read_noise_e=3.0,
+    pixels=10,
+    pixel_scale_arcsec=0.25,
+    lenslet_m=0.6,
+    wavelength_nm=650.0,
+    r0_m=0.12,
+    frame_rate_hz=500.0,
+    magnitude=10.0,
+)
+answer = fs.tune(question, rng=np.random.default_rng(1), realisations=1000)
+print(f"{answer.best.arm.label}: R = {answer.best.error_px[answer.at_star]:.3f} px")
+print(answer.best.settings)
+
+# %%
+# The slope error of every estimator against magnitude, with the limit that the photons set (Cramer-Rao),
+# and where a small change of magnitude changes the choice:
+
+figure = answer.figure()
+
+# %%
+# What a magnitude means on the sky
+# ---------------------------------
+# How much of the sky has a star that is bright enough, near enough? From star counts (Bahcall and Soneira
+# 1980; good to about 25 %).
+
+from faintspot.planner.sky import PLACES, sky_coverage
+
+for magnitude in (12.0, 14.0, 16.0):
+    found = {place: sky_coverage(magnitude, 30.0, latitude, "R") for place, latitude in PLACES.items()}
+    text = ", ".join(f"{place} {100 * part:.1f} %" for place, part in found.items())
+    print(f"R = {magnitude:g}, within 30 arcsec: {text}")
+
+# %%
+# `answer.save("faintspot.toml")` writes what `faintspot slopes` and `SlopePipeline.from_file` read. For a
+# closed loop, where a slope error is only part of the story, ask `faintspot tune --loop`.

@@ -1,0 +1,26 @@
+from __future__ import annotations
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from faintspot.data import mmt_frame
+from faintspot.sensor.found_layout import find_layout
+from faintspot.sensor.hot_pixels import find_hot_pixels
+
+
+def test_the_frame_has_the_lenslets_of_its_sensor() -> None:
+    frame = mmt_frame()
+    assert frame.dtype == np.uint16
+    bad = np.zeros(frame.shape, bool)
+    bad[tuple(find_hot_pixels(frame).T)] = True
+    layout = find_layout(frame.astype(float), bad_pixels=bad).layout
+    assert 150 <= len(layout) <= 165  # some at the edge are doubtful
+    assert layout.pitch_px == pytest.approx(22.08, abs=0.05)
+
+
+def test_its_licence_is_beside_it() -> None:
+    text = (files("faintspot.data") / "LICENSE_mmtwfs.rst").read_text(encoding="utf-8")
+    assert "MMT Observatory" in text
+    assert "Redistribution" in text

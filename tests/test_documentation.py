@@ -1,0 +1,106 @@
+"""Every block of Python in README and docs runs, with what its page takes for granted."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import faintspot as fs
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs/how_to").glob("*.md")),
+]
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+
+NOT_RUN = {
+    'device="cuda"': "needs a GPU",
+    "faintspot.cuda": "needs a GPU",
+    "import hcipy": "run by the adapter's own tests",
+    'LoopRecord.load("canary': "needs half an hour of results",
+    "simulate_loop(": "the tutorial on loops runs it",
+    "open_study(": "needs a study's results",
+    "study.run(": "starts processes of its own",
+    "PixelRing.create": "needs a camera",
+    "pyshmem.open": "needs a running engine",
+    "read_telemetry(": "needs a recording",
+    "...\n": "a sketch",
+}
+"""What marks a block that is not run here, and why."""
+
+
+def blocks() -> list[Any]:
+    """Return all blocks, page by page; those of a page share their names."""
+    return [
+        pytest.param(page, id=str(page.relative_to(ROOT)))
+        for page in PAGES
+        if BLOCK.search(page.read_text(encoding="utf-8"))
+    ]
+
+
+@pytest.fixture
+def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Return what pages take for granted: a sensor, frames of it, and files of slopes."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    rng = np.random.default_rng(1)
+    layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+    calibration = fs.Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=3.0)
+    electrons, truth = fs.simulate.sensor_frames(
+        layout.corners, layout.window, layout.frame_shape, 1000, flux_e=400.0, rng=rng
+    )
+    frames = electrons / 2.0 + 100.0
+    images, positions = fs.simulate.subapertures(500, flux_e=40.0, rng=rng)
+    settings = fs.Settings("window", flux_e=400.0, spot_fwhm_px=1.8)
+    pipeline = fs.SlopePipeline(layout, settings, calibration)
+    slopes = pipeline(frames)
+    for ending in ("npz", "fits", "zarr"):
+        write_slopes(tmp_path / f"slopes.{ending}", frames[:20], layout, calibration)
+    return {
+        "fs": fs,
+        "np": np,
+        "layout": layout,
+        "calibration": calibration,
+        "frames": frames,
+        "frame": frames[0],
+        "first_frames": frames[:10],
+        "images": images,
+        "positions": positions,
+        "truth": truth,
+        "settings": settings,
+        "pipeline": pipeline,
+        "slopes": slopes,
+        "n": len(layout),
+    }
+
+
+def write_slopes(path: Path, frames: Any, layout: fs.Layout, calibration: fs.Calibration) -> None:
+    """Measure frames into a file, as `faintspot slopes` does."""
+    from faintspot.recorded.measuring import measure_recorded
+
+    toml = path.parent / "faintspot.toml"
+    if not toml.exists():
+        for item in (layout, calibration, fs.Settings("brightest")):
+            item.save(toml)
+    np.save(path.parent / "frames.npy", frames)
+    measure_recorded([path.parent / "frames.npy"], toml, path)
+
+
+@pytest.mark.parametrize("page", blocks())
+def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
+    for number, code in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
+        if not any(mark in code for mark in NOT_RUN):
+            exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+
+
+def test_what_is_not_run_is_there() -> None:
+    """A reason whose block is gone is gone, too."""
+    text = "\n".join("\n".join(BLOCK.findall(page.read_text(encoding="utf-8"))) for page in PAGES)
+    assert [mark for mark in NOT_RUN if mark not in text] == []
