@@ -53,8 +53,15 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     rng = np.random.default_rng(1)
     layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
     calibration = fs.Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=3.0)
+    dithered = 0.2 * np.sin(2 * np.pi * np.arange(1000) * 0.13)[:, None, None]
     electrons, truth = fs.simulate.sensor_frames(
-        layout.corners, layout.window, layout.frame_shape, 1000, flux_e=400.0, rng=rng
+        layout.corners,
+        layout.window,
+        layout.frame_shape,
+        1000,
+        flux_e=400.0,
+        positions=dithered + rng.uniform(-0.3, 0.3, (1000, len(layout), 2)),
+        rng=rng,
     )
     frames = electrons / 2.0 + 100.0
     images, positions = fs.simulate.subapertures(500, flux_e=40.0, rng=rng)
