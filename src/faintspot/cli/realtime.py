@@ -7,6 +7,7 @@ import click
 from faintspot.cli import (
     realtime_camera,
     realtime_control,
+    realtime_loop,
     realtime_modules,
     realtime_record,
     realtime_run,
@@ -40,6 +41,7 @@ for each in (
     realtime_control.get,
     realtime_control.set_settings,
     realtime_control.stop_engine,
+    realtime_loop.loop,
     realtime_modules.modules,
     realtime_modules.load,
     realtime_modules.swap,

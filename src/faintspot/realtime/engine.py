@@ -10,8 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from faintspot.configuration import to_text
+from faintspot.control.configuration import Control
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
+from faintspot.realtime.control_loop import NONE, STATES, ControlLoop
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.live import LiveSettings
@@ -42,7 +44,7 @@ class FrameSource(Protocol):
 
 
 class Engine:
-    """Measures the frames of a pixel ring and publishes their slopes, until it is told to stop.
+    """Measures the frames of a pixel ring and publishes their slopes, and commands that follow from them.
 
     Parameters
     ----------
@@ -65,6 +67,13 @@ class Engine:
         Default: another process writes into the ring.
     images_every : int
         Of so many frames of an arm, telemetry keeps one's images; 0: of none.
+    control : Control, optional
+        Makes commands of slopes; the loop is open at first. Default: there are none. The reference slopes
+        are for the pipelines.
+
+    Attributes
+    ----------
+    loop : ControlLoop or None
 
     Raises
     ------
@@ -84,6 +93,7 @@ class Engine:
         source: FrameSource | None = None,
         deadline_s: float = DEADLINE_S,
         images_every: int = IMAGES_EVERY,
+        control: Control | None = None,
     ) -> None:
         self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
         self.interleaving = Interleaving() if interleaving is None else interleaving
@@ -102,10 +112,19 @@ class Engine:
         self.modules = EngineModules(self.live, self.preparer)
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
-        self._streams = SlopeStreams(name, len(layout))
+        if control is not None:
+            control.check_fits(len(layout))
+        commands = 0 if control is None else control.commands
+        self._streams = SlopeStreams(name, len(layout), commands)
         try:
+            self.loop = None if control is None else ControlLoop(control, layout, self._streams.held_commands)
             self._telemetry = TelemetryRing.create(
-                name, layout, settings=to_text(settings), arms=self.interleaving.labels
+                name,
+                layout,
+                settings=to_text(settings),
+                arms=self.interleaving.labels,
+                commands=commands,
+                reference=None if control is None else control.reference,
             )
         except InputError:
             self._streams.close()
@@ -133,6 +152,7 @@ class Engine:
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
+            "loop": {"state": NONE} if self.loop is None else self.loop.status(),
         }
 
     # The engine's thread ----------------------------------------------------------------------------
@@ -246,11 +266,18 @@ class Engine:
         self._streams.publish_slopes(slopes, number)
         published = time.monotonic_ns()
         latency = published - moment
+        loop, state, commands = self.loop, 0, None
+        if loop is not None:
+            state = STATES.index(loop.state)
+            commands = loop.follow(slopes, number)
+            self._streams.publish_commands(commands, number)
+            loop.latencies.add(time.monotonic_ns() - moment)
+            loop.look_after()
         self.latencies.add(latency)
         change = self.live.change_number
         self._streams.publish_marks((number, arm, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
-        self._telemetry.write(number, arm, change, moment, published, slopes)
+        self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
@@ -295,6 +322,7 @@ class Engine:
         And do all that takes time: tell telemetry what was changed, replace workers, take out modules.
         """
         looks = told = 0
+        loop_told: dict[str, Any] = {}
         while True:
             stopping = self._stopping.wait(_WATCH_S)
             looks += 1
@@ -308,9 +336,19 @@ class Engine:
             if path is not None:
                 self.modules.take_out(path)
             self.live.let_go()
+            loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
                 self._telemetry.write_change(*change)
                 told = change[1]
             if stopping and (ring is None or not self._waiting):
                 return
+
+    def _tell_of_loop(self, told: dict[str, Any]) -> dict[str, Any]:
+        """Write into telemetry when the loop was opened, and why, or closed, or its gain changed."""
+        if self.loop is None:
+            return told
+        now = {"loop": self.loop.state, "gain": self.loop.gain, "opened_because": self.loop.opened_because}
+        if now != told:
+            self._telemetry.write_change(self._number, self.live.change_number, now, None)
+        return now
