@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from faintspot.cli import (
+    realtime_calibrate,
     realtime_camera,
     realtime_control,
     realtime_loop,
@@ -42,6 +43,7 @@ for each in (
     realtime_control.set_settings,
     realtime_control.stop_engine,
     realtime_loop.loop,
+    realtime_calibrate.calibrate,
     realtime_modules.modules,
     realtime_modules.load,
     realtime_modules.swap,
