@@ -37,14 +37,18 @@ def configured(folder: Path) -> tuple[Path, Control]:
     return path, control
 
 
-def make_engine(name: str, path: Path, control: Control | None, **options: Any) -> Engine:
-    layout, settings, calibration, psf, score = configuration_file.load_all(path)
+def make_engine(
+    name: str, path: Path, control: Control | None, settings: fs.Settings | None = None, **options: Any
+) -> Engine:
+    layout, written, calibration, psf, score = configuration_file.load_all(path)
     reference = None if control is None else control.reference
 
     def make(each: fs.Settings) -> fs.SlopePipeline:
         return fs.SlopePipeline(layout, each, calibration, reference, psf=psf, score=score)
 
-    return Engine(name, make, settings, control=control, images_every=0, **options)
+    return Engine(
+        name, make, written if settings is None else settings, control=control, images_every=0, **options
+    )
 
 
 class RunningEngine:
@@ -69,6 +73,7 @@ class Sky:
         self.name, self.lines = name, list[str]()
         self.telescope = SimulatedTelescope(configuration, name, say=self.lines.append, **options)
         self._truth = pyshmem.open(f"{name}_truth")
+        self._pixels = pyshmem.open(f"{name}_frames")
         self.running: RunningEngine | None = None
 
     def start(self, engine: Engine) -> None:
@@ -89,6 +94,11 @@ class Sky:
         if counters is not None:
             self.until(lambda: counters.frames_in > before)
         return dict(zip(TRUTH, self._truth.read().tolist(), strict=True))
+
+    @property
+    def pixels(self) -> np.ndarray:
+        """The last frame."""
+        return np.array(self._pixels.read())
 
     def frames(self, count: int) -> np.ndarray:
         """Return the Strehl ratios of so many more frames."""
@@ -115,6 +125,7 @@ class Sky:
     def close(self) -> None:
         self.stop()
         self._truth.close()
+        self._pixels.close()
         self.telescope.close()
         (FOLDER / self.name).unlink(missing_ok=True)
         pyshmem.unlink_quiet(f"{self.name}_commands")

@@ -54,6 +54,12 @@ from faintspot.realtime.private_socket import socket_path
 )
 @click.option("--close-loop", is_flag=True, help="With the first frame; see loop.")
 @click.option("--no-control", is_flag=True, help="Make no commands, whatever [control] says.")
+@click.option(
+    "--mean-light",
+    type=click.FloatRange(1),
+    metavar="FRAMES",
+    help="Tell estimators the light of every sub-aperture, averaged over so many frames.",
+)
 @click.option("--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="To begin with; see load.")
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
 def run(
@@ -69,6 +75,7 @@ def run(
     images_every: int,
     close_loop: bool,
     no_control: bool,
+    mean_light: float | None,
     modules: tuple[str, ...],
     frames: int | None,
 ) -> None:
@@ -99,6 +106,8 @@ def run(
     if close_loop and control is None:
         raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
     processors = parse_subapertures(cpus) if cpus else None
+    if control is not None:
+        settings = control.settings(settings)
     engine = Engine(
         name,
         partial(_pipeline, layout, calibration, psf, score, None if control is None else control.reference),
@@ -110,6 +119,7 @@ def run(
         deadline_s=deadline * 1e-6,
         images_every=images_every,
         control=control,
+        mean_light=mean_light,
     )
     if engine.loop is not None and close_loop:
         engine.loop.close()

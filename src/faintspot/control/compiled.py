@@ -108,6 +108,9 @@ class CompiledIntegrator:
         """See `Controller`."""
         return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
 
+    def begin(self) -> None:
+        """See `Controller`: all that it knows is on the line."""
+
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`; slopes that were not measured are 0."""
         line = self._line

@@ -15,11 +15,12 @@ from faintspot.checks import finite_array
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
 from faintspot.control.compiled import CompiledIntegrator
-from faintspot.control.learning import CONTROLS, INTEGRATOR
+from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, Learnt, Model, Plant
 from faintspot.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.options import Options, option
+from faintspot.settings import Settings
 from faintspot.tables import errors_of_table, read_tables, save_tables
 from faintspot.toml_files import check_keys
 
@@ -27,7 +28,11 @@ Floats = NDArray[np.float64]
 
 TABLE = "control"
 INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
-FILES = (INTERACTION, REFERENCE)
+MODEL = "model"
+FILES = (INTERACTION, REFERENCE, MODEL)
+NONE, CONTROLLER, STREAM = "none", "controller", "stream"
+"""Where predictions come from."""
+PRIOR = "prior_std_px"
 _LARGEST_SLOPE_PX = 1e4
 _BEYOND_ALL = 1e30  # of commands without a limit: finite in float32, too
 _setting = partial(option, per_subaperture=False)
@@ -37,8 +42,12 @@ _setting = partial(option, per_subaperture=False)
 class ControlOptions(Options):
     """Numbers of [control]."""
 
-    controller: str = _setting(INTEGRATOR, "What makes commands of slopes.", choices=tuple(CONTROLS))
-    gain: float = _setting(0.4, "Loop gain.", low=0, high=2)
+    controller: str = _setting(
+        INTEGRATOR,
+        "What makes commands of slopes; all but the integrator need a `model`.",
+        choices=tuple(CONTROLS),
+    )
+    gain: float = _setting(0.4, "Loop gain of the integrator.", low=0, high=2)
     leak: float = _setting(0.01, "Part of the command that is forgotten in every frame.", low=0, high=1)
     delay_frames: int = _setting(
         2,
@@ -66,6 +75,12 @@ class ControlOptions(Options):
         "for a matrix that was measured with the same estimator and as much light.",
         low=0.01,
         high=100,
+    )
+    prediction: str | None = _setting(
+        None,
+        'Where the slopes come from that estimators with a prior expect: "controller", this one; "stream", '
+        "another program, by NAME_prediction. Default: the controller if it is a Kalman filter, else none.",
+        choices=(NONE, CONTROLLER, STREAM),
     )
     guard_frames: int = _setting(
         50,
@@ -107,16 +122,20 @@ class Control:
     reference : (2 n,) or (n, 2) array, optional
         Reference slopes, px from each sub-aperture's centre. Default: 0.
     options : ControlOptions
+    model : path, optional
+        What the controller has learnt, a file of `Model.save`; not for the plain integrator.
 
     Raises
     ------
     InputError
-        For numbers that are not finite, shapes that do not fit, and a mirror that slopes cannot control.
+        For a model that does not fit, numbers that are not finite, shapes that do not fit, and a mirror that
+        slopes cannot control.
     """
 
     interaction: Any
     reference: Any = None
     options: ControlOptions = field(default_factory=ControlOptions)
+    model: Any = None
 
     def __post_init__(self) -> None:
         matrix = finite_array(INTERACTION, self.interaction).astype(np.float64)
@@ -138,11 +157,47 @@ class Control:
         object.__setattr__(self, "interaction", matrix)
         object.__setattr__(self, "reference", reference)
         assert self.reconstructor  # which refuses what is no interaction matrix
+        object.__setattr__(self, "model", self._checked_model())
+
+    def _checked_model(self) -> Model | None:
+        kind = self.options.controller
+        if kind == KALMAN and self.options.prediction == STREAM:
+            raise InputError(
+                'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
+            )
+        if kind == INTEGRATOR:
+            return None
+        if self.model is None:
+            raise InputError(f"{MODEL}: expected a file with what {CONTROLS[kind]} has learnt, got none")
+        model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
+        if model.kind != kind:
+            raise InputError(f"{MODEL}: expected what {kind!r} has learnt, got that of {model.kind!r}")
+        return model
 
     @cached_property
     def reconstructor(self) -> Reconstructor:
         """From slopes to the commands that cause them."""
         return make_reconstructor(self.interaction, self.options.largest_condition)
+
+    @property
+    def plant(self) -> Plant:
+        """What controllers know of the loop."""
+        options = self.options
+        return Plant(self.interaction, self.reconstructor, options.delay_frames, options.leak)
+
+    @property
+    def prediction(self) -> str:
+        """Where predictions come from: NONE, CONTROLLER or STREAM."""
+        usual = CONTROLLER if self.options.controller == KALMAN else NONE
+        return self.options.prediction or usual
+
+    def settings(self, settings: Settings) -> Settings:
+        """Return settings whose prior is as wide as the controller is sure, where both know of one."""
+        std = None if self.model is None else self.model.expected_std_px
+        if std is None or PRIOR not in settings.declared() or self.prediction != CONTROLLER:
+            return settings
+        changes: dict[str, Any] = {PRIOR: np.sqrt(np.square(std).reshape(2, -1).mean(axis=0))}
+        return settings.replace(**changes)
 
     @property
     def commands(self) -> int:
@@ -171,10 +226,14 @@ class Control:
 
     def controller(self, line: CommandLine) -> Controller:
         """Return the controller, which sends its commands along `line`."""
-        options = self.options
-        return CompiledIntegrator(
-            line, self.interaction, self.reconstructor.matrix, options.gain, options.leak
-        )
+        options, matrix = self.options, self.reconstructor.matrix
+        if options.controller == INTEGRATOR:
+            return CompiledIntegrator(line, self.interaction, matrix, options.gain, options.leak)
+        if options.controller == MODAL:
+            modes = self.reconstructor.modes
+            matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
+            return CompiledIntegrator(line, self.interaction, matrix, 1.0, options.leak)
+        return Learnt(self.plant, self.model).controller(line)
 
 
 def load_control(path: str | Path) -> Control | None:
@@ -196,9 +255,14 @@ def load_control(path: str | Path) -> Control | None:
 def _of_table(path: Path, values: Mapping[str, Any]) -> Control:
     declared = ControlOptions.declared()
     check_keys(f"{TABLE}.", values, [*FILES, *declared], required=[INTERACTION])
-    arrays = {name: _read(path, name, values[name]) for name in FILES if name in values}
+    arrays = {name: _read(path, name, values[name]) for name in FILES[:2] if name in values}
+    model = values.get(MODEL)
+    if model is not None and not isinstance(model, str):
+        raise InputError(f"{MODEL}: expected the name of a file, found {model!r:.80}")
     options = ControlOptions(**{name: value for name, value in values.items() if name in declared})
-    return Control(arrays[INTERACTION], arrays.get(REFERENCE), options)
+    return Control(
+        arrays[INTERACTION], arrays.get(REFERENCE), options, None if model is None else path.parent / model
+    )
 
 
 def _read(path: Path, name: str, location: Any) -> NDArray[Any]:

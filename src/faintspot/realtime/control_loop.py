@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between
 from faintspot.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
 from faintspot.control.configuration import Control
+from faintspot.control.guarded import Guarded
 from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.realtime.timing import Latencies
@@ -38,6 +39,8 @@ class ControlLoop:
     layout : Layout
     held : (commands,) array, optional
         What the mirror holds at the start. Default: it is flat.
+    prior : (1, 2, n) float32 array, optional
+        Where the slopes go that the controller expects of the next frame, px; 0 while the loop is open.
 
     Attributes
     ----------
@@ -50,13 +53,22 @@ class ControlLoop:
         When the control is for another number of sub-apertures.
     """
 
-    def __init__(self, control: Control, layout: Layout, held: NDArray[np.floating] | None = None) -> None:
+    def __init__(
+        self,
+        control: Control,
+        layout: Layout,
+        held: NDArray[np.floating] | None = None,
+        prior: NDArray[np.float32] | None = None,
+    ) -> None:
         control.check_fits(len(layout))
         self.control, self.latencies = control, Latencies()
         self._line = control.line()
         if held is not None:
             self._line.hold(held.astype(np.float64))
         self.controller = control.controller(self._line)
+        self._guarded = self.controller if isinstance(self.controller, Guarded) else None
+        self._prior = None if prior is None else prior.reshape(-1)
+        self._largest_px = max(layout.frame_shape)
         self._is_compiled = isinstance(self.controller, CompiledIntegrator)  # whose commands are finite
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
         self._said = np.zeros(2)
@@ -64,12 +76,14 @@ class ControlLoop:
         self._centroid_gain = float(control.options.centroid_gain)
         self.guard = Guard(control, layout)
         self.closed, self.opened_because = False, _AT_START
-        self._flattened, self._number = False, -1
+        self._flattened, self._begins, self._number = False, False, -1
         self._warm_up(len(layout))
 
     # The engine's thread ----------------------------------------------------------------------------
 
-    def follow(self, slopes: Slopes, number: int) -> NDArray[np.float64]:
+    def follow(
+        self, slopes: Slopes, number: int, prior_std_px: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """Return the commands that follow from a frame's slopes; good until the next frame.
 
         Parameters
@@ -77,6 +91,8 @@ class ControlLoop:
         slopes : Slopes
         number : int
             Of the frame. While others were lost, what was on its way has come nearer to the mirror.
+        prior_std_px : (2 n,) array, optional
+            How wide the prior around the expected slopes was that these are drawn to. Default: they are not.
         """
         line = self._line
         if self._number >= 0:
@@ -98,26 +114,38 @@ class ControlLoop:
             self._flattened = False
             line.hold(np.zeros_like(line.latest))
         if self.closed:
+            if self._guarded is not None:
+                self._guarded.prior_std_px = prior_std_px
             self._update()
         else:
             line.put(line.latest)
         return line.latest
 
     def look_after(self) -> None:
-        """Open the loop where the frame that was followed last shows that it does harm."""
+        """Open the loop where the frame that was followed last shows harm, and expect the next one."""
         if not self.closed:
             self.guard.watch(self._said)
-            return
-        reason = self.guard.objection(self._said, self._line.latest)
-        if reason:
+        elif reason := self.guard.objection(self._said, self._line.latest):
             self.closed, self.opened_because = False, reason
             self._flattened = self.guard.flattens
+        if self._prior is not None:
+            self._expect(self._prior)
+
+    def _expect(self, prior: NDArray[np.float32]) -> None:
+        """Write down the slopes of the next frame; what no frame can hold counts as not expected."""
+        prior[:] = 0.0
+        if self.closed and not self._begins:
+            mean = self.controller.expected().mean_px
+            np.copyto(prior, mean, where=np.abs(mean) <= self._largest_px, casting="same_kind")
 
     def _update(self) -> None:
         """Let the controller send its command; one that fails opens the loop."""
         line = self._line
         before = line.latest
         try:
+            if self._begins:
+                self._begins = False
+                self.controller.begin()
             self.controller.update(self._slopes, self._errors)
             if self._is_compiled or math.isfinite(line.latest.sum()):
                 return
@@ -132,7 +160,7 @@ class ControlLoop:
     def close(self) -> None:
         """Close the loop, from what the mirror holds on."""
         self.guard.begin()
-        self.opened_because = ""
+        self.opened_because, self._begins = "", True
         self.closed = True
 
     def open(self) -> None:
@@ -194,7 +222,7 @@ class ControlLoop:
         held = self._line.latest.copy()
         self.closed = True
         self.follow(Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), -1)
-        self.closed = False
+        self.closed, self._begins = False, False
         self._line.hold(held)
 
 

@@ -10,14 +10,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from faintspot.configuration import to_text
-from faintspot.control.configuration import Control
+from faintspot.control.configuration import CONTROLLER, NONE, STREAM, Control
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
-from faintspot.realtime.control_loop import NONE, STATES, ControlLoop
+from faintspot.realtime.control_loop import STATES, ControlLoop
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import Interleaving
+from faintspot.realtime.light_following import LightFollower
 from faintspot.realtime.live import LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
 from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
@@ -70,6 +72,9 @@ class Engine:
     control : Control, optional
         Makes commands of slopes; the loop is open at first. Default: there are none. The reference slopes
         are for the pipelines.
+    mean_light : float, optional
+        Frames over which the light of every sub-aperture is averaged, which estimators that use it are told.
+        Default: they keep `flux_e`.
 
     Attributes
     ----------
@@ -94,6 +99,7 @@ class Engine:
         deadline_s: float = DEADLINE_S,
         images_every: int = IMAGES_EVERY,
         control: Control | None = None,
+        mean_light: float | None = None,
     ) -> None:
         self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
         self.interleaving = Interleaving() if interleaving is None else interleaving
@@ -107,9 +113,13 @@ class Engine:
         self._measured = [0 for _ in self.interleaving.arms]
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
-        self.preparer = SettingsPreparer(make_pipeline, self.interleaving, self._workers, deadline_s)
+        prior = None
+        if control is not None and control.prediction != NONE:
+            prior = np.zeros((1, 2, len(control.interaction) // 2), np.float32)
+        self.preparer = SettingsPreparer(make_pipeline, self.interleaving, self._workers, deadline_s, prior)
         self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
         self.modules = EngineModules(self.live, self.preparer)
+        self._light = None if mean_light is None else LightFollower(self.live, mean_light)
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
         if control is not None:
@@ -117,7 +127,12 @@ class Engine:
         commands = 0 if control is None else control.commands
         self._streams = SlopeStreams(name, len(layout), commands)
         try:
-            self.loop = None if control is None else ControlLoop(control, layout, self._streams.held_commands)
+            self.loop, self._prediction = None, None
+            if control is not None:
+                own = prior if control.prediction == CONTROLLER else None
+                self.loop = ControlLoop(control, layout, self._streams.held_commands, own)
+                if control.prediction == STREAM and prior is not None:
+                    self._prediction = PredictionStream(name, prior, max(layout.frame_shape))
             self._telemetry = TelemetryRing.create(
                 name,
                 layout,
@@ -153,6 +168,7 @@ class Engine:
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
             "loop": {"state": NONE} if self.loop is None else self.loop.status(),
+            "prediction": None if self._prediction is None else self._prediction.status(),
         }
 
     # The engine's thread ----------------------------------------------------------------------------
@@ -161,6 +177,8 @@ class Engine:
         """Measure frames until `stop`, or so many; wait for the source where there is none."""
         watcher = threading.Thread(target=self._watch, name="faintspot-watcher", daemon=True)
         watcher.start()
+        if self._light is not None:
+            self._light.start()
         try:
             with self._streams.held():
                 while not self._done(n_frames):
@@ -174,6 +192,10 @@ class Engine:
         finally:
             self._stopping.set()
             watcher.join()
+            if self._light is not None:
+                self._light.close()
+            if self._prediction is not None:
+                self._prediction.close()
             if self._workers is not None:
                 self._workers.close()
             if self._source is not None:
@@ -238,6 +260,9 @@ class Engine:
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
         explain = self._images_every > 0 and self._measured[arm] % self._images_every == 0
+        if self._prediction is not None:
+            path.await_start(arrival)
+            self._prediction.fill(self._number + 1)
         whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
         number = ring.number_of(arrival)
         if whole and number >= 0 and number != self._number + 1:  # it lies in another slot than expected
@@ -269,7 +294,7 @@ class Engine:
         loop, state, commands = self.loop, 0, None
         if loop is not None:
             state = STATES.index(loop.state)
-            commands = loop.follow(slopes, number)
+            commands = loop.follow(slopes, number, path.prior_std_px)
             self._streams.publish_commands(commands, number)
             loop.latencies.add(time.monotonic_ns() - moment)
             loop.look_after()
@@ -278,6 +303,8 @@ class Engine:
         self._streams.publish_marks((number, arm, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
         self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
+        if self._light is not None:
+            self._light.take(slopes.flux)
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
@@ -336,6 +363,8 @@ class Engine:
             if path is not None:
                 self.modules.take_out(path)
             self.live.let_go()
+            if self._prediction is not None:
+                self._prediction.look_after()
             loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
