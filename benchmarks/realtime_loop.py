@@ -6,8 +6,8 @@ the integrator's product alone: the compiled loop and the BLAS that NumPy has, o
 
 Loop: a simulated telescope and an engine as processes of their own, an integrator on brightest pixels,
 compared with `simulate_loop` on the same air, frame by frame. The frame rate is low and the read-out short,
-so that a busy machine holds it and commands act after the delay that is set (how often is said); the winds are
-as much slower, so that the loop is as late as at 250 frames/s. Two processors at least should be free.
+so that a busy machine holds it and commands act after the delay that is set (how often is said); the winds
+are as much slower, so that the loop is as late as at 250 frames/s. Two processors at least should be free.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from benchmarks.measuring import Row, Table, best, interleaved, pinned
+from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot import configuration as configuration_file
 from faintspot.control.compiled import integrate
@@ -103,7 +103,7 @@ def _large() -> Table:
     slopes, latest, out = rng.standard_normal(_ELT_SLOPES), np.zeros(_ELT_COMMANDS), np.zeros(_ELT_COMMANDS)
     single = columns.astype(np.float32)
     few = slopes.astype(np.float32)
-    candidates = {
+    candidates: dict[str, Candidate] = {
         "compiled, float64": partial(Direct(integrate), slopes, columns, 0.4, 0.99, 1e30, latest, out),
         "BLAS, float64": lambda: slopes @ columns,
         "BLAS, float32": lambda: few @ single,
@@ -182,7 +182,7 @@ def _observed(name: str, telescope: subprocess.Popen[bytes]) -> np.ndarray[Any, 
 
 
 def compared(
-    configuration: LoopConfiguration, settings: Settings, gain: float, realisations: int = REALISATIONS
+    configuration: LoopConfiguration, arm: LoopArm, realisations: int = REALISATIONS
 ) -> dict[str, float]:
     """Return mean Strehl ratios of the engine's loop and of the simulated one, and their difference."""
     strehl = np.zeros((2, realisations))
@@ -190,8 +190,8 @@ def compared(
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "loop.toml").write_text(configuration.to_text(), encoding="utf-8")
-        configuration_file.save(folder / "faintspot.toml", settings)
-        path = write_engine_files(configuration.replace("control", gain=gain), folder)
+        configuration_file.save(folder / "faintspot.toml", arm.settings)
+        path = write_engine_files(configuration.replace("control", gain=arm.gain), folder, arm.control)
         known = load_control(path)
         assert known is not None
         run = configuration.replace("run", frames=LOOP_FRAMES, settle_frames=SETTLED)
@@ -203,7 +203,7 @@ def compared(
             late = settled[:, _TRUTH_FRAME] - settled[:, _TRUTH_COMMANDS]
             on_time += np.count_nonzero(late == configuration.control.delay_frames)
             frames += len(settled)
-            record = simulate_loop(run, [LoopArm("-", settings, gain=gain)], realisation=number)
+            record = simulate_loop(run, [arm], realisation=number)
             places = settled[:, _TRUTH_FRAME].astype(int)
             strehl[:, number] = settled[:, _TRUTH_STREHL].mean(), record.strehl[places].mean()
     difference = strehl[0] - strehl[1]
@@ -219,14 +219,29 @@ def compared(
 
 def _loop() -> Table:
     configuration = slowed(load_loop("camera_3e").replace("camera", photons_per_subaperture=300.0), RATE_HZ)
-    settings = Settings("brightest", keep_brightest=30)
-    columns = compared(configuration, settings, 0.4)
-    within = abs(columns["difference"]) <= max(3 * columns["its error"], 0.01)
-    row = Row("30 brightest pixels, integrator, gain 0.4", columns, "3 errors, or 0.01", within)
+    flux_e = configuration.photons
+    predicting = Settings("map", flux_e=flux_e, prior_std_px=1.0)  # the filter says how wide
+    arms = [
+        LoopArm("30 brightest pixels, integrator", Settings("brightest", keep_brightest=30), 0.4),
+        LoopArm("fixed window, integrator", Settings("window", flux_e=flux_e), 0.4),
+        LoopArm(
+            "maximum a posteriori, Kalman filter",
+            predicting,
+            0.3,
+            predict_prior=True,
+            correct_gain=False,
+            control="kalman",
+        ),
+    ]
+    rows = []
+    for arm in arms:
+        columns = compared(configuration, arm)
+        within = abs(columns["difference"]) <= max(3 * columns["its error"], 0.01)
+        rows.append(Row(arm.label, columns, "3 errors, or 0.01", within))
     note = (
         f"{REALISATIONS} realisations, frames {SETTLED} to {LOOP_FRAMES}, {RATE_HZ:g} frames/s, 300 photons"
     )
-    return Table("realtime-loop", "Strehl ratio of the loop in real time and simulated", [row], [note])
+    return Table("realtime-loop", "Strehl ratio of the loop in real time and simulated", rows, [note])
 
 
 def run() -> list[Table]:

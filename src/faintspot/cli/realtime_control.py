@@ -126,6 +126,8 @@ def loop_in_words(loop: dict[str, Any]) -> str:
         return "no loop: the engine makes no commands"
     gain = "" if loop["gain"] is None else f", gain {loop['gain']:g}"
     text = f"loop {loop['state']}: {loop['controller']}{gain}"
+    if loop["obstacle"]:
+        return f"{text}; {loop['obstacle']}"
     if loop["opened_because"]:
         return f"{text}; {loop['opened_because']}"
     return f"{text}, slopes of {loop['residual_px']:.2f} px rms"

@@ -59,9 +59,9 @@ def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
         For another action, without a loop, a gain out of range, and for a flat mirror in a closed loop.
     """
     action, loop = one_of("action", fields.get("action"), LOOP_ACTIONS), engine.loop
+    if action == "status":
+        return {"loop": engine.loop_status()}
     if loop is None:
-        if action == "status":
-            return {"loop": engine.status()["loop"]}
         raise InputError("loop: this engine makes no commands; its configuration has no [control]")
     if action == "open":
         loop.open()
@@ -71,4 +71,4 @@ def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
         loop.gain = number_between("gain", fields.get("gain"), 0, 2)
     elif action == "flat":
         loop.flatten()
-    return {"loop": loop.status()}
+    return {"loop": engine.loop_status()}

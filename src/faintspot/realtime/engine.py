@@ -167,9 +167,15 @@ class Engine:
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
-            "loop": {"state": NONE} if self.loop is None else self.loop.status(),
+            "loop": self.loop_status(),
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
+
+    def loop_status(self) -> dict[str, Any]:
+        """Return what there is to say of the loop, as plain values."""
+        if self.loop is None:
+            return {"state": NONE}
+        return {**self.loop.status(), "obstacle": self._streams.commands_obstacle()}
 
     # The engine's thread ----------------------------------------------------------------------------
 

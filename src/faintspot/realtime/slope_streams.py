@@ -107,6 +107,17 @@ class SlopeStreams:
         with self._marks.write_view_locked(frame_id=marks[0]) as row:
             row[:] = marks
 
+    def commands_obstacle(self) -> str | None:
+        """Return why nobody sees the commands, None where they do; by any thread."""
+        assert self._commands is not None
+        name = self._commands.name
+        try:
+            there = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
+        except (OSError, ValueError):
+            return f"{name} was removed; restart the engine"
+        same = there == self._commands.instance_id
+        return None if same else f"{name} was made anew by another program; end it and restart the engine"
+
     def close(self) -> None:
         """Remove all streams."""
         for stream in self._all:
