@@ -39,7 +39,7 @@ from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.private_socket import socket_path
 
 FRAMES, COMMANDS = 2000, 66
-LOOP_FRAMES, SETTLED, REALISATIONS, RATE_HZ = 800, 200, 3, 50.0
+LOOP_FRAMES, SETTLED, REALISATIONS, RATE_HZ = 500, 150, 3, 20.0
 _ELT_SLOPES, _ELT_COMMANDS = 9232, 5000
 _TRUTH_FRAME, _TRUTH_STREHL, _TRUTH_COMMANDS = 0, 1, 6
 _COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
