@@ -107,6 +107,7 @@ def run(
         raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
     processors = parse_subapertures(cpus) if cpus else None
     if control is not None:
+        control.check_fits(len(layout))
         settings = control.settings(settings)
     engine = Engine(
         name,

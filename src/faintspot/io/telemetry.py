@@ -93,8 +93,8 @@ class Telemetry:
     """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
     attributes: dict[str, Any]
     """Plain values: layout (``Layout(**attributes["layout"])``), settings to begin with (TOML text), arms
-    (names of the interleaved settings), dropped_records, dropped_images, dropped_changes, complete,
-    ended_because."""
+    (names of the interleaved settings), reference (slopes that were subtracted, or None), dropped_records,
+    dropped_images, dropped_changes, complete, ended_because."""
 
     def __repr__(self) -> str:
         """Say how much there is."""

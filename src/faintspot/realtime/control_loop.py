@@ -37,6 +37,7 @@ class ControlLoop:
     ----------
     control : Control
     layout : Layout
+        Of as many sub-apertures as the control is for.
     held : (commands,) array, optional
         What the mirror holds at the start. Default: it is flat.
     prior : (1, 2, n) float32 array, optional
@@ -46,11 +47,6 @@ class ControlLoop:
     ----------
     latencies : Latencies
         From a frame's last row to its commands.
-
-    Raises
-    ------
-    InputError
-        When the control is for another number of sub-apertures.
     """
 
     def __init__(
@@ -60,7 +56,6 @@ class ControlLoop:
         held: NDArray[np.floating] | None = None,
         prior: NDArray[np.float32] | None = None,
     ) -> None:
-        control.check_fits(len(layout))
         self.control, self.latencies = control, Latencies()
         self._line = control.line()
         if held is not None:
@@ -115,7 +110,7 @@ class ControlLoop:
             line.hold(np.zeros_like(line.latest))
         if self.closed:
             if self._guarded is not None:
-                self._guarded.prior_std_px = prior_std_px
+                self._guarded.prior_std_px = None if self._prior is None else prior_std_px
             self._update()
         else:
             line.put(line.latest)
