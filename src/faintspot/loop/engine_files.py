@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from faintspot.files import output_errors, write_atomically
 from faintspot.loop.arms import PRIOR, LoopArm
 from faintspot.loop.calibration import flat_psf, make_pipeline, reference_slopes
 from faintspot.loop.camera import camera_calibration
-from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.loop.control import learnt_control
 from faintspot.loop.observatory import prepare
 from faintspot.loop.simulation import measure_gains
@@ -67,7 +68,11 @@ def write_engine_files(
     optics = prepare(configuration)
     path = folder / CONFIGURATION
     psf = flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
-    configuration_file.save(path, optics.sensor.layout)
+    sizes: dict[str, Any] = {
+        "subaperture_m": configuration.subaperture_m,
+        "pixel_scale_arcsec": configuration.pixel_scale_rad / ARCSEC,
+    }
+    configuration_file.save(path, replace(optics.sensor.layout, **sizes))
     configuration_file.save(path, camera_calibration(configuration))
     configuration_file.save(path, psf)
     if not configuration_file.has(path, "settings"):
