@@ -27,6 +27,7 @@ _ORDER = (
     "roofline",
     "breakdown",
     "realtime",
+    "realtime_loop",
     "latency",
     "realtime_sustained",
     "pyrtc",

@@ -15,7 +15,7 @@ from faintspot.files import write_atomically
 from faintspot.options import PerSubaperture
 from faintspot.toml_files import check_keys, checked_table, parse_file
 
-TABLES = ("layout", "calibration", "estimator", "settings", "psf", "score", "promise", "loop")
+TABLES = ("layout", "calibration", "estimator", "settings", "psf", "score", "promise", "loop", "control")
 
 
 def read_tables(path: str | Path) -> dict[str, dict[str, Any]]:

@@ -124,6 +124,20 @@ def test_what_was_appended_is_read(store: TelemetryStore) -> None:
     assert without.raw.shape == (0, *SHAPE)
 
 
+def test_commands_are_read_and_earlier_stores_have_none(store: TelemetryStore) -> None:
+    telemetry = read_telemetry(store.path)
+    assert (telemetry.loop.tolist(), telemetry.commands.shape) == ([0] * 15, (15, 0))
+    kind = np.dtype([*RECORD.descr, ("loop", np.int64), ("commands", np.float32, (5,))])
+    records = np.zeros(4, kind)
+    records["frame"], records["loop"] = np.arange(4), [1, 1, 2, 2]
+    records["commands"] = np.arange(20).reshape(4, 5)
+    with_loop = TelemetryStore(store.path.with_name("loop.zarr"), kind, IMAGE, ATTRIBUTES)
+    with_loop.append(records, images_of(), {})
+    telemetry = read_telemetry(with_loop.path)
+    assert telemetry.loop.tolist() == [1, 1, 2, 2]
+    assert np.array_equal(telemetry.commands, records["commands"])
+
+
 def test_a_wall_clock_that_is_set_back_does_not_matter(tmp_path: Path) -> None:
     records = records_of(0, 4)
     records["clock_offset_ns"][2:] -= 3600 * 10**9

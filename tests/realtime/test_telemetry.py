@@ -49,6 +49,19 @@ def is_stale(reader: TelemetryReader) -> bool:
     return reader.stale
 
 
+def test_commands_and_the_loops_state(name: str) -> None:
+    with TelemetryRing.create(name, LAYOUT, commands=3, reference=np.arange(2.0), records=4) as ring:
+        for frame in range(6):
+            ring.write(frame, 0, 0, 0, 0, slopes_of(frame), frame % 3, np.arange(3.0) + frame)
+        reader = TelemetryReader.attach(name)
+        assert reader.description["reference"] == [0.0, 1.0]
+        records, _, _ = reader.records_since(2)
+        np.testing.assert_array_equal(records["frame"], [3, 4, 5])
+        np.testing.assert_array_equal(records["loop"], records["frame"] % 3)
+        np.testing.assert_array_equal(records["commands"], np.arange(3.0) + records["frame"][:, None])
+        np.testing.assert_array_equal(records["x"][2], slopes_of(5).x)
+
+
 def test_what_is_written_is_read(name: str) -> None:
     before = time.time_ns() - time.monotonic_ns()
     with TelemetryRing.create(

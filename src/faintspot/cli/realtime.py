@@ -5,8 +5,11 @@ from __future__ import annotations
 import click
 
 from faintspot.cli import (
+    realtime_calibrate,
     realtime_camera,
     realtime_control,
+    realtime_learn,
+    realtime_loop,
     realtime_modules,
     realtime_record,
     realtime_run,
@@ -40,6 +43,9 @@ for each in (
     realtime_control.get,
     realtime_control.set_settings,
     realtime_control.stop_engine,
+    realtime_loop.loop,
+    realtime_calibrate.calibrate,
+    realtime_learn.learn,
     realtime_modules.modules,
     realtime_modules.load,
     realtime_modules.swap,

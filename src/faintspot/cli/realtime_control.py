@@ -94,6 +94,8 @@ def _table(name: str) -> Any:
         grid.add_row("arms in turn", ", ".join(reply["arms"]))
     if reply["preparing"]:
         grid.add_row("preparing", _preparing(reply["preparing"]))
+    if reply["loop"]["state"] != "none":
+        grid.add_row("loop", loop_in_words(reply["loop"]).removeprefix("loop "))
     for stage, module in reply["modules"].items():
         grid.add_row(f"{stage} by module", module)
     grid.add_section()
@@ -118,6 +120,19 @@ def _preparing(change: dict[str, Any]) -> str:
     return f"{', '.join(change['changes'])} (for {change['seconds']:.0f} s)"
 
 
+def loop_in_words(loop: dict[str, Any]) -> str:
+    """Say what state a loop is in."""
+    if loop["state"] == "none":
+        return "no loop: the engine makes no commands"
+    gain = "" if loop["gain"] is None else f", gain {loop['gain']:g}"
+    text = f"loop {loop['state']}: {loop['controller']}{gain}"
+    if loop["obstacle"]:
+        return f"{text}; {loop['obstacle']}"
+    if loop["opened_because"]:
+        return f"{text}; {loop['opened_because']}"
+    return f"{text}, slopes of {loop['residual_px']:.2f} px rms"
+
+
 def summary(reply: dict[str, Any]) -> str:
     """Say in a few lines how an engine is doing."""
     counters, latency = reply["counters"], reply["latency"]
@@ -128,6 +143,8 @@ def summary(reply: dict[str, Any]) -> str:
             lines += f"\n  {words.replace('_', ' ')}: {reply[words]}"
     if reply["preparing"]:
         lines += f"\n  preparing: {_preparing(reply['preparing'])}"
+    if reply["loop"]["state"] != "none":
+        lines += f"\n  {loop_in_words(reply['loop'])}"
     if latency["count"]:
         lines += (
             f"\n  from the last row to the slopes: p50 {latency['p50_us']:.0f} us, "

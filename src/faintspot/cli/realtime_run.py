@@ -52,6 +52,14 @@ from faintspot.realtime.private_socket import socket_path
     show_default=True,
     help="Of so many frames, telemetry keeps one's images; 0: of none.",
 )
+@click.option("--close-loop", is_flag=True, help="With the first frame; see loop.")
+@click.option("--no-control", is_flag=True, help="Make no commands, whatever [control] says.")
+@click.option(
+    "--mean-light",
+    type=click.FloatRange(1),
+    metavar="FRAMES",
+    help="Tell estimators the light of every sub-aperture, averaged over so many frames.",
+)
 @click.option("--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="To begin with; see load.")
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
 def run(
@@ -65,6 +73,9 @@ def run(
     every: int,
     deadline: float,
     images_every: int,
+    close_loop: bool,
+    no_control: bool,
+    mean_light: float | None,
     modules: tuple[str, ...],
     frames: int | None,
 ) -> None:
@@ -74,13 +85,15 @@ def run(
     from a pyshmem stream; the engine waits for it, and for its return. Each group of sub-apertures is
     measured as soon as its last row is there. Slopes go out as the pyshmem streams NAME_slopes (all x, then
     all y, px), NAME_details and NAME_marks, each stamped with the frame's number; `faintspot realtime record`
-    keeps them.
+    keeps them. Where the configuration has [control], commands follow from them as NAME_commands.
 
     \b
     On sky, with and without, 50 frames each (NAME_marks says which):
       faintspot realtime run --interleave none,tv --every 50
     """
     from faintspot import configuration
+    from faintspot.control.configuration import load_control
+    from faintspot.errors import InputError
     from faintspot.realtime.commands import LENGTHY, commands_of
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
@@ -89,10 +102,16 @@ def run(
     from faintspot.written_changes import parse_subapertures
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
+    control = None if no_control else load_control(config)
+    if close_loop and control is None:
+        raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
     processors = parse_subapertures(cpus) if cpus else None
+    if control is not None:
+        control.check_fits(len(layout))
+        settings = control.settings(settings)
     engine = Engine(
         name,
-        partial(_pipeline, layout, calibration, psf, score),
+        partial(_pipeline, layout, calibration, psf, score, None if control is None else control.reference),
         settings,
         threads=threads,
         cpus=processors,
@@ -100,7 +119,11 @@ def run(
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
         deadline_s=deadline * 1e-6,
         images_every=images_every,
+        control=control,
+        mean_light=mean_light,
     )
+    if engine.loop is not None and close_loop:
+        engine.loop.close()
     for source in modules:
         engine.modules.load(engine.modules.admit(source))
     server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
@@ -118,11 +141,11 @@ def run(
     click.echo(summary(engine.status()))
 
 
-def _pipeline(layout: Any, calibration: Any, psf: Any, score: Any, settings: Any) -> Any:
+def _pipeline(layout: Any, calibration: Any, psf: Any, score: Any, reference: Any, settings: Any) -> Any:
     """The pipeline of the configuration with other settings; a function that other processes can be given."""
     from faintspot.pipeline import SlopePipeline
 
-    return SlopePipeline(layout, settings, calibration, psf=psf, score=score)
+    return SlopePipeline(layout, settings, calibration, reference, psf=psf, score=score)
 
 
 def _followed(stream: str, name: str) -> Any:

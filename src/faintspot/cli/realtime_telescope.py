@@ -23,6 +23,13 @@ _NAME = click.option("--name", default="faintspot", show_default=True, help="Of 
     "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."
 )
 @click.option(
+    "--control",
+    default="integrator",
+    show_default=True,
+    metavar="KIND",
+    help="That --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
+)
+@click.option(
     "--readout-fraction", type=float, default=0.8, show_default=True, help="Part of the frame time."
 )
 @click.option(
@@ -37,6 +44,7 @@ def telescope(
     name: str,
     rate: float | None,
     write_config: str | None,
+    control: str,
     frames: int | None,
     **options: Any,
 ) -> None:
@@ -64,7 +72,7 @@ def telescope(
     if rate is not None:
         observed = observed.replace("control", frame_rate_hz=rate)
     if write_config is not None:
-        click.echo(f"{name}: {write_engine_files(observed, write_config)} written")
+        click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
     say = partial(click.echo, err=True)
     with SimulatedTelescope(observed, name, say=lambda line: say(f"{name}: {line}"), **options) as simulated:
         optics = simulated.observatory.optics

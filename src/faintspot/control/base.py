@@ -34,5 +34,8 @@ class Controller(Protocol):
     def expected(self) -> Expected:
         """Return what this frame's slopes are expected to be."""
 
+    def begin(self) -> None:
+        """Go on from what the mirror holds, of which the line tells; frames before are forgotten."""
+
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """Take this frame's slopes and send the command that follows from them."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,31 +13,49 @@ Floats = NDArray[np.float64]
 class CommandLine:
     """Commands that act some frames after they were computed; all controllers of a mirror share it.
 
+    Its memory is made once: what `acting` and `latest` return is good until the next command is sent.
+
     Parameters
     ----------
     commands : int
         Number of actuators.
     delay_frames : int
         The command computed from frame k acts first during frame k + delay_frames.
+    largest : float
+        Stroke: no command is sent that is larger. What is cut off is forgotten, so that nothing winds up.
     """
 
-    def __init__(self, commands: int, delay_frames: int) -> None:
-        self.delay_frames = delay_frames
-        self._latest = np.zeros(commands)
-        self._underway = deque([np.zeros(commands)] * delay_frames)
+    def __init__(self, commands: int, delay_frames: int, largest: float = math.inf) -> None:
+        self.delay_frames, self.largest = delay_frames, largest
+        self._rows = [np.zeros(commands) for _ in range(delay_frames + 1)]
+        self._next = 0
+        """Where the next command goes; the oldest of the others acts."""
 
     @property
     def acting(self) -> Floats:
         """What the mirror holds during this frame."""
-        return self._underway[0]
+        return self._rows[(self._next + 1) % len(self._rows)]
 
     @property
     def latest(self) -> Floats:
         """The last command computed, which still may be on its way."""
-        return self._latest
+        return self._rows[self._next - 1]
+
+    @property
+    def spare(self) -> Floats:
+        """Where the next command may be written, for `sent`."""
+        return self._rows[self._next]
 
     def put(self, command: Floats) -> None:
-        """Send a command, which the caller does not change any more, and go on to the next frame."""
-        self._latest = command
-        self._underway.append(command)
-        self._underway.popleft()
+        """Send a command, and go on to the next frame."""
+        np.clip(command, -self.largest, self.largest, out=self.spare)
+        self.sent()
+
+    def sent(self) -> None:
+        """Send what was written into `spare`, which is within the stroke, and go on to the next frame."""
+        self._next = (self._next + 1) % len(self._rows)
+
+    def hold(self, command: Floats) -> None:
+        """Begin anew, with a mirror that holds a command and with no other on its way."""
+        for row in self._rows:
+            np.clip(command, -self.largest, self.largest, out=row)

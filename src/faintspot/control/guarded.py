@@ -59,10 +59,11 @@ class Guarded:
         prefers_plain: bool = False,
     ) -> None:
         self._line, self._interaction, self._reconstruct = line, interaction, reconstruct
-        self._lines = [CommandLine(interaction.shape[1], line.delay_frames) for _ in range(2)]
+        of_both = interaction.shape[1], line.delay_frames, line.largest
+        self._lines = [CommandLine(*of_both) for _ in range(2)]
         makers = (learnt, plain)
         self.controllers = [make(own) for make, own in zip(makers, self._lines, strict=True)]
-        self._prior_std_px, self._noise_factor = prior_std_px, noise_factor
+        self.prior_std_px, self._noise_factor = prior_std_px, noise_factor
         self.chosen = int(prefers_plain)
         """0: the one that has learnt; 1: the plain one."""
         self._difference = np.zeros(2)
@@ -74,10 +75,17 @@ class Guarded:
         other = self._line.acting - self._lines[self.chosen].acting
         return Expected(mean + self._interaction @ other, std)
 
+    def begin(self) -> None:
+        """See `Controller`: both go on from there."""
+        for controller, line in zip(self.controllers, self._lines, strict=True):
+            line.hold(self._line.latest)
+            controller.begin()
+        self._difference[:], self._frames = 0.0, 0
+
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""
         expected = self.expected().mean_px
-        alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self._prior_std_px)
+        alone, variance, trust = without_prior(slopes_px, standard_error_px, expected, self.prior_std_px)
         open_loop = alone - self._interaction @ self._line.acting
         error = np.sqrt(self._noise_factor * variance)
         left = []

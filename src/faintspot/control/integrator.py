@@ -55,6 +55,9 @@ class Integrator:
         commands = line.acting - line.latest if self._sees_mirror else -line.latest
         return Expected(self._interaction @ commands, None)
 
+    def begin(self) -> None:
+        """See `Controller`: all that it knows is on the line."""
+
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""
         if self._weighted:

@@ -50,6 +50,9 @@ class PseudoOpenLoop:
         """See `Controller`."""
         return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
 
+    def begin(self) -> None:
+        """See `Controller`: all that it knows is on the line."""
+
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""
         line, gain = self._line, self._gain
@@ -84,6 +87,10 @@ class Predictive:
         """See `Controller`."""
         mean = self.predictor.mean_px + self._interaction @ self._line.acting
         return Expected(mean, self.predictor.std_px)
+
+    def begin(self) -> None:
+        """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
+        self.predictor.state[:] = np.tile(-(self._interaction @ self._line.latest), 2)
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""

@@ -39,7 +39,13 @@ _DIMENSIONS = {
     "raw": ("image", "row", "column"),
     "denoised": ("image", "subaperture", "window_row", "window_column"),
     "image_frame": ("image",),
+    "commands": ("frame", "command"),
 }
+_NO_LOOP: dict[str, NDArray[Any]] = {
+    "loop": np.zeros((0,), np.int64),
+    "commands": np.zeros((0, 0), np.float32),
+}
+"""Of a frame, in recordings of engines that make no commands."""
 _NOT_STORED = "sequence"  # of the rings, which a store has no use for
 
 
@@ -73,6 +79,10 @@ class Telemetry:
     iterations: NDArray[np.int32]
     flags: NDArray[np.uint8]
     """Bits of `faintspot.SubapertureFlag`."""
+    loop: NDArray[np.int64]
+    """The loop's state: 0 there is none, 1 open, 2 closed."""
+    commands: NDArray[np.float32]
+    """Commands that followed from each frame, in the interaction matrix's unit, (n_frames, commands)."""
     image_frame: NDArray[np.int64]
     """Numbers of the frames whose images were recorded, (n_images,)."""
     raw: NDArray[np.float32]
@@ -83,8 +93,8 @@ class Telemetry:
     """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
     attributes: dict[str, Any]
     """Plain values: layout (``Layout(**attributes["layout"])``), settings to begin with (TOML text), arms
-    (names of the interleaved settings), dropped_records, dropped_images, dropped_changes, complete,
-    ended_because."""
+    (names of the interleaved settings), reference (slopes that were subtracted, or None), dropped_records,
+    dropped_images, dropped_changes, complete, ended_because."""
 
     def __repr__(self) -> str:
         """Say how much there is."""
@@ -219,6 +229,9 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
         finished = {"frame": int(attributes[_FRAMES]), "image": int(attributes[_IMAGES]) if images else 0}
         arrays = {}
         for name in _ARRAYS:
+            if name in _NO_LOOP and name not in group:
+                arrays[name] = np.zeros((finished["frame"], *_NO_LOOP[name].shape[1:]), _NO_LOOP[name].dtype)
+                continue
             array = group[name]
             count = finished[_dimensions(name, array.ndim)[0]]
             if count > array.shape[0]:
@@ -243,7 +256,9 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
             row = values.shape[1:]
             size = int(np.prod(row)) * values.itemsize
             length = (
-                _CHUNK_BYTES // size if name in _DIMENSIONS else _CHUNK_NUMBERS // (size // values.itemsize)
+                _CHUNK_BYTES // size
+                if "image" in _dimensions(name, values.ndim)
+                else _CHUNK_NUMBERS // (size // values.itemsize)
             )
             group.create_array(
                 name,

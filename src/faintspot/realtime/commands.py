@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from faintspot.checks import number_between, one_of
 from faintspot.errors import InputError
 from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
@@ -15,8 +16,11 @@ LENGTHY = ("set", "load", "swap", "unload")
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
+LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
+
+
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, stop, and those for modules."""
+    """Return the commands: status, get, set, stop, loop, and those for modules."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return engine.status()
@@ -39,5 +43,32 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         engine.stop()
         return {}
 
-    own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
+    def loop(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return loop_command(engine, fields)
+
+    own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop, "loop": loop}
     return own | module_commands(engine.modules)
+
+
+def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Open or close the loop, change its gain, have the mirror flat; return its part of the status.
+
+    Raises
+    ------
+    InputError
+        For another action, without a loop, a gain out of range, and for a flat mirror in a closed loop.
+    """
+    action, loop = one_of("action", fields.get("action"), LOOP_ACTIONS), engine.loop
+    if action == "status":
+        return {"loop": engine.loop_status()}
+    if loop is None:
+        raise InputError("loop: this engine makes no commands; its configuration has no [control]")
+    if action == "open":
+        loop.open()
+    elif action == "close":
+        loop.close()
+    elif action == "gain":
+        loop.gain = number_between("gain", fields.get("gain"), 0, 2)
+    elif action == "flat":
+        loop.flatten()
+    return {"loop": engine.loop_status()}

@@ -10,12 +10,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from faintspot.configuration import to_text
+from faintspot.control.configuration import CONTROLLER, NONE, STREAM, Control
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
+from faintspot.realtime.control_loop import STATES, ControlLoop
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import Interleaving
+from faintspot.realtime.light_following import LightFollower
 from faintspot.realtime.live import LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
 from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
@@ -42,7 +46,7 @@ class FrameSource(Protocol):
 
 
 class Engine:
-    """Measures the frames of a pixel ring and publishes their slopes, until it is told to stop.
+    """Measures the frames of a pixel ring and publishes their slopes, and commands that follow from them.
 
     Parameters
     ----------
@@ -65,6 +69,16 @@ class Engine:
         Default: another process writes into the ring.
     images_every : int
         Of so many frames of an arm, telemetry keeps one's images; 0: of none.
+    control : Control, optional
+        Makes commands of slopes; the loop is open at first. Default: there are none. The reference slopes
+        are for the pipelines.
+    mean_light : float, optional
+        Frames over which the light of every sub-aperture is averaged, which estimators that use it are told.
+        Default: they keep `flux_e`.
+
+    Attributes
+    ----------
+    loop : ControlLoop or None
 
     Raises
     ------
@@ -84,6 +98,8 @@ class Engine:
         source: FrameSource | None = None,
         deadline_s: float = DEADLINE_S,
         images_every: int = IMAGES_EVERY,
+        control: Control | None = None,
+        mean_light: float | None = None,
     ) -> None:
         self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
         self.interleaving = Interleaving() if interleaving is None else interleaving
@@ -97,15 +113,33 @@ class Engine:
         self._measured = [0 for _ in self.interleaving.arms]
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
-        self.preparer = SettingsPreparer(make_pipeline, self.interleaving, self._workers, deadline_s)
+        prior = None
+        if control is not None and control.prediction != NONE:
+            prior = np.zeros((1, 2, len(control.interaction) // 2), np.float32)
+        self.preparer = SettingsPreparer(make_pipeline, self.interleaving, self._workers, deadline_s, prior)
         self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
         self.modules = EngineModules(self.live, self.preparer)
+        self._light = None if mean_light is None else LightFollower(self.live, mean_light)
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
-        self._streams = SlopeStreams(name, len(layout))
+        if control is not None:
+            control.check_fits(len(layout))
+        commands = 0 if control is None else control.commands
+        self._streams = SlopeStreams(name, len(layout), commands)
         try:
+            self.loop, self._prediction = None, None
+            if control is not None:
+                own = prior if control.prediction == CONTROLLER else None
+                self.loop = ControlLoop(control, layout, self._streams.held_commands, own)
+                if control.prediction == STREAM and prior is not None:
+                    self._prediction = PredictionStream(name, prior, max(layout.frame_shape))
             self._telemetry = TelemetryRing.create(
-                name, layout, settings=to_text(settings), arms=self.interleaving.labels
+                name,
+                layout,
+                settings=to_text(settings),
+                arms=self.interleaving.labels,
+                commands=commands,
+                reference=None if control is None else control.reference,
             )
         except InputError:
             self._streams.close()
@@ -133,7 +167,15 @@ class Engine:
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
+            "loop": self.loop_status(),
+            "prediction": None if self._prediction is None else self._prediction.status(),
         }
+
+    def loop_status(self) -> dict[str, Any]:
+        """Return what there is to say of the loop, as plain values."""
+        if self.loop is None:
+            return {"state": NONE}
+        return {**self.loop.status(), "obstacle": self._streams.commands_obstacle()}
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -141,6 +183,8 @@ class Engine:
         """Measure frames until `stop`, or so many; wait for the source where there is none."""
         watcher = threading.Thread(target=self._watch, name="faintspot-watcher", daemon=True)
         watcher.start()
+        if self._light is not None:
+            self._light.start()
         try:
             with self._streams.held():
                 while not self._done(n_frames):
@@ -154,6 +198,10 @@ class Engine:
         finally:
             self._stopping.set()
             watcher.join()
+            if self._light is not None:
+                self._light.close()
+            if self._prediction is not None:
+                self._prediction.close()
             if self._workers is not None:
                 self._workers.close()
             if self._source is not None:
@@ -218,6 +266,9 @@ class Engine:
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
         explain = self._images_every > 0 and self._measured[arm] % self._images_every == 0
+        if self._prediction is not None:
+            path.await_start(arrival)
+            self._prediction.fill(self._number + 1)
         whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
         number = ring.number_of(arrival)
         if whole and number >= 0 and number != self._number + 1:  # it lies in another slot than expected
@@ -246,11 +297,20 @@ class Engine:
         self._streams.publish_slopes(slopes, number)
         published = time.monotonic_ns()
         latency = published - moment
+        loop, state, commands = self.loop, 0, None
+        if loop is not None:
+            state = STATES.index(loop.state)
+            commands = loop.follow(slopes, number, path.prior_std_px)
+            self._streams.publish_commands(commands, number)
+            loop.latencies.add(time.monotonic_ns() - moment)
+            loop.look_after()
         self.latencies.add(latency)
         change = self.live.change_number
         self._streams.publish_marks((number, arm, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
-        self._telemetry.write(number, arm, change, moment, published, slopes)
+        self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
+        if self._light is not None:
+            self._light.take(slopes.flux)
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
@@ -295,6 +355,7 @@ class Engine:
         And do all that takes time: tell telemetry what was changed, replace workers, take out modules.
         """
         looks = told = 0
+        loop_told: dict[str, Any] = {}
         while True:
             stopping = self._stopping.wait(_WATCH_S)
             looks += 1
@@ -308,9 +369,21 @@ class Engine:
             if path is not None:
                 self.modules.take_out(path)
             self.live.let_go()
+            if self._prediction is not None:
+                self._prediction.look_after()
+            loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
                 self._telemetry.write_change(*change)
                 told = change[1]
             if stopping and (ring is None or not self._waiting):
                 return
+
+    def _tell_of_loop(self, told: dict[str, Any]) -> dict[str, Any]:
+        """Write into telemetry when the loop was opened, and why, or closed, or its gain changed."""
+        if self.loop is None:
+            return told
+        now = {"loop": self.loop.state, "gain": self.loop.gain, "opened_because": self.loop.opened_because}
+        if now != told:
+            self._telemetry.write_change(self._number, self.live.change_number, now, None)
+        return now

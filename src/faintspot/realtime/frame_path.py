@@ -17,7 +17,7 @@ from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import WIDTHS, lanes_for
-from faintspot.kernels.streaming import Arrival, streamed
+from faintspot.kernels.streaming import Arrival, streamed, wait_for_rows
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.workers import Workers
 from faintspot.slopes import RESULT_TYPES, Slopes
@@ -47,7 +47,7 @@ class _Groups:
 
     Parameters
     ----------
-    pipeline, slots
+    pipeline, slots, prior
         As for `FramePath`.
     groups : (int, int)
         First group, and the one after the last.
@@ -61,10 +61,11 @@ class _Groups:
         slots: Sequence[NDArray[Any]] | NDArray[Any],
         groups: tuple[int, int],
         shares: int,
+        prior: NDArray[np.float32] | None,
     ) -> None:
         self._groups, self._shares = groups, shares
         self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
-        task = pipeline.preparation.task(np.zeros(1, np.int64))
+        task = pipeline.preparation.task(np.zeros(1, np.int64), prior)
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
         self._kernel = Direct(streamed(pipeline.preparation.prepared.kernel))
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
@@ -103,6 +104,8 @@ class FramePath:
     progress : Progress
     workers : Workers, optional
         Who else measures. Default: the caller's thread alone.
+    prior : (1, 2, n) float32 array, optional
+        Predicted slopes, which the caller changes between frames. Default 0.
 
     Raises
     ------
@@ -118,6 +121,7 @@ class FramePath:
         progress: Progress,
         *,
         workers: Workers | None = None,
+        prior: NDArray[np.float32] | None = None,
     ) -> None:
         self.pipeline, self._progress, self._workers = pipeline, progress, workers
         self._check(slots)
@@ -136,12 +140,14 @@ class FramePath:
         # What is left over is measured in a narrower group where that is faster: its rows come last.
         faster = rest > 0 and pipeline.preparation.prepared.fewer_lanes_are_faster
         narrow = [width for width in WIDTHS if rest <= width < wide] if faster else []
-        self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares)
+        self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares, prior)
         self._narrow = None
         if narrow:
             width = min(narrow)
             groups = full * wide // width, full * wide // width + 1
-            self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1)
+            self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1, prior)
+        self.prior_std_px = None if prior is None else _prior_std_px(pipeline)
+        """How wide the prior is that slopes are drawn to, (2 n,); None: they are not."""
         self._plain = results, self._stages[:0]
         self._explaining = results, self._stages
 
@@ -187,6 +193,12 @@ class FramePath:
         whole = self._work(0, frame, self._progress, after)
         return self._workers.wait() and whole
 
+    def await_start(self, number: int) -> None:
+        """Wait for the first row of a frame, or until `stop` is called."""
+        progress = self._progress
+        cells = progress.cells, progress.frame_cell, progress.rows_cell
+        wait_for_rows(*cells, number, 1, self._control, STOP_CELL)
+
     def stop(self) -> None:
         """End all waiting for rows, now and in future; from any thread."""
         self._control[STOP_CELL] = 1
@@ -227,6 +239,15 @@ def check_real_time(pipeline: SlopePipeline) -> None:
             "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
             f'real time {pipeline.settings.estimator.label} and "auto" need it before the frame is there'
         )
+
+
+def _prior_std_px(pipeline: SlopePipeline) -> NDArray[np.float64] | None:
+    """The width of an estimator's prior, (2 n,); None where it has none."""
+    settings, name = pipeline.settings, "prior_std_px"
+    if not settings.estimator.takes_prior or name not in settings.declared():
+        return None
+    each = settings.values(name, len(pipeline.layout), pipeline.layout.pixels).astype(np.float64)
+    return np.tile(each, 2) if np.isfinite(each).all() else None
 
 
 def last_rows_of_groups(pipeline: SlopePipeline, width: int) -> NDArray[np.int64]:

@@ -93,6 +93,15 @@ class ModularPath:
         """Whether waiting for rows has been ended."""
         return bool(self._control[STOP_CELL])
 
+    @property
+    def prior_std_px(self) -> NDArray[np.float64] | None:
+        """How wide the prior is that slopes are drawn to: modules have none."""
+        return None if self.fault is None else self._fallback.prior_std_px
+
+    def await_start(self, number: int) -> None:
+        """Wait for the first row of a frame; see `FramePath.await_start`."""
+        self._fallback.await_start(number)
+
     def warm_up(self) -> None:
         """Measure a frame with typical spots, so that everything is compiled and in the caches."""
         self._fallback.warm_up()

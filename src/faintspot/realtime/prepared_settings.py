@@ -43,6 +43,15 @@ class MeasuringPath(Protocol):
         """Whether `stop` was called."""
         ...
 
+    @property
+    def prior_std_px(self) -> NDArray[np.float64] | None:
+        """How wide the prior is that slopes are drawn to, (2 n,); None: they are not."""
+        ...
+
+    def await_start(self, number: int) -> None:
+        """Wait for the first row of a frame."""
+        ...
+
     def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
         """Measure a frame; see `FramePath.measure`."""
         ...
@@ -70,6 +79,8 @@ class PreparedSettings:
     workers : Workers, optional
     budget_s : float
         For modules, from a frame's last row.
+    prior : (1, 2, n) float32 array, optional
+        Of all frames, see `FramePath`; what modules measure has none.
 
     Raises
     ------
@@ -84,13 +95,14 @@ class PreparedSettings:
         modules: Mapping[str, Module],
         workers: Workers | None,
         budget_s: float,
+        prior: NDArray[np.float32] | None = None,
     ) -> None:
-        self.settings, self.layout = settings, pipelines[0].layout
-        self._pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
-        own = [stages_of(pipeline, modules) for pipeline in self._pipelines]
+        self.settings, self.layout, self._prior = settings, pipelines[0].layout, prior
+        self.pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
+        own = [stages_of(pipeline, modules) for pipeline in self.pipelines]
         self._modular = [
             ModularPipeline(pipeline, stages, budget_s=budget_s) if stages else None
-            for pipeline, stages in zip(self._pipelines, own, strict=True)
+            for pipeline, stages in zip(self.pipelines, own, strict=True)
         ]
         self._ring: PixelRing | None = None
         self._paths: tuple[MeasuringPath, ...] = ()
@@ -98,7 +110,7 @@ class PreparedSettings:
     def paths(self, ring: PixelRing) -> tuple[MeasuringPath, ...]:
         """Return the paths of a ring's frames, one for every arm, complete and warm."""
         if ring is not self._ring:
-            made = zip(self._pipelines, self._modular, strict=True)
+            made = zip(self.pipelines, self._modular, strict=True)
             self._paths = tuple(self._new_path(pipeline, modular, ring) for pipeline, modular in made)
             self._ring = ring
         return self._paths
@@ -110,7 +122,7 @@ class PreparedSettings:
         columns = ring.cells.shape[1]
         # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
         progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
-        built_in = FramePath(pipeline, pixels, progress, workers=self._workers)
+        built_in = FramePath(pipeline, pixels, progress, workers=self._workers, prior=self._prior)
         path: MeasuringPath = built_in
         if modular is not None:
             path = ModularPath(modular, pixels, progress, built_in, budget_s=self._budget_s)
@@ -142,6 +154,8 @@ class SettingsPreparer:
     workers : Workers, optional
     budget_s : float
         For modules, from a frame's last row.
+    prior : (1, 2, n) float32 array, optional
+        Predicted slopes, see `FramePath`.
     """
 
     def __init__(
@@ -150,9 +164,10 @@ class SettingsPreparer:
         interleaving: Interleaving,
         workers: Workers | None,
         budget_s: float,
+        prior: NDArray[np.float32] | None = None,
     ) -> None:
         self.make_pipeline, self._interleaving = make_pipeline, interleaving
-        self._workers, self._budget_s = workers, budget_s
+        self._workers, self._budget_s, self._prior = workers, budget_s, prior
         self.ring: PixelRing | None = None
         """Whose frames are being measured, if any."""
         self.modules: Mapping[str, Module] = {}
@@ -169,7 +184,8 @@ class SettingsPreparer:
         pipelines = [self.make_pipeline(each) for each in self.of_arms(settings)]
         for pipeline in pipelines:
             check_real_time(pipeline)
-        prepared = PreparedSettings(pipelines, settings, self.modules, self._workers, self._budget_s)
+        made_for = self._workers, self._budget_s, self._prior
+        prepared = PreparedSettings(pipelines, settings, self.modules, *made_for)
         ring = self.ring
         if ring is not None:
             prepared.paths(ring)

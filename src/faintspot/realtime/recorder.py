@@ -131,6 +131,7 @@ class Recorder:
             "layout": reader.description["layout"],
             "settings": reader.settings,
             "arms": reader.description["arms"],
+            "reference": reader.description.get("reference"),
             **self._waiting.attributes(),
         }
         self._store = TelemetryStore(path, reader.record_type, reader.image_type, attributes)

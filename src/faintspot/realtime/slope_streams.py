@@ -1,14 +1,15 @@
-"""Slopes out: streams of pyshmem, which pyRTC and, through its bridge, ImageStreamIO read."""
+"""Slopes and commands out: streams of pyshmem, which pyRTC and, through its bridge, ImageStreamIO read."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, ExitStack
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.telemetry_rows import fill_telemetry_rows
-from faintspot.realtime.shared_streams import create_stream, held
+from faintspot.realtime.shared_streams import LOCK_LIMIT_S, create_stream, held, lock_file, pyshmem_module
 from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -18,17 +19,25 @@ MARKS = ("frame", "arm", "settings_change", "last_row_ns", "published_ns")
 
 
 class SlopeStreams:
-    """Three streams, each stamped with the frame's number as `frame_id`.
+    """Three streams, or four with commands, each stamped with the frame's number as `frame_id`.
 
     NAME_slopes holds all x, then all y, float32 px (2 n,): what a reconstructor multiplies. NAME_details
     holds (6, n) float32, rows as `DETAILS`; NAME_marks holds with what and when it was measured, int64, as
-    `MARKS`. The slopes are published first.
+    `MARKS`. The slopes are published first. NAME_commands holds the mirror's commands, float32 (commands,),
+    in the interaction matrix's unit.
 
     Parameters
     ----------
     name : str
     n : int
         Number of sub-apertures.
+    commands : int
+        Number of commands; 0: there is no such stream.
+
+    Attributes
+    ----------
+    held_commands : (commands,) array or None
+        What an engine of that name that died has asked the mirror for last.
 
     Raises
     ------
@@ -38,27 +47,38 @@ class SlopeStreams:
         When a living process publishes under that name, another user has taken it, or shared memory is short.
     """
 
-    def __init__(self, name: str, n: int) -> None:
+    def __init__(self, name: str, n: int, commands: int = 0) -> None:
+        stream = f"{name}_commands"
+        self.held_commands = commands_left_behind(stream, commands) if commands else None
         with ExitStack() as undo:
             self._slopes = create_stream(f"{name}_slopes", (2 * n,))
             undo.callback(self._slopes.unlink)
             self._details = create_stream(f"{name}_details", (len(DETAILS), n))
             undo.callback(self._details.unlink)
             self._marks = create_stream(f"{name}_marks", (len(MARKS),), np.int64)
+            undo.callback(self._marks.unlink)
+            self._commands = create_stream(stream, (commands,)) if commands else None
             undo.pop_all()
+        self._all = [each for each in (self._slopes, self._details, self._marks, self._commands) if each]
         self._n = n
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
 
     def held(self) -> AbstractContextManager[None]:
         """Keep the streams' locks while publishing; see `shared_streams.held`."""
-        return held(self._slopes, self._details, self._marks)
+        return held(*self._all)
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
         """Publish the vector of slopes; by the thread that holds the streams."""
         with self._slopes.write_view_locked(frame_id=frame) as vector:
             vector[: self._n] = slopes.x
             vector[self._n :] = slopes.y
+
+    def publish_commands(self, commands: NDArray[np.float64], frame: int) -> None:
+        """Publish the commands that follow from a frame; by the thread that holds the streams."""
+        assert self._commands is not None
+        with self._commands.write_view_locked(frame_id=frame) as vector:
+            vector[:] = commands
 
     def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int, int]:
         """Publish what else is known of each slope; by the thread that holds the streams.
@@ -87,7 +107,48 @@ class SlopeStreams:
         with self._marks.write_view_locked(frame_id=marks[0]) as row:
             row[:] = marks
 
+    def commands_obstacle(self) -> str | None:
+        """Return why nobody sees the commands, None where they do; by any thread."""
+        assert self._commands is not None
+        name = self._commands.name
+        try:
+            there = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
+        except (OSError, ValueError):
+            return f"{name} was removed; restart the engine"
+        same = there == self._commands.instance_id
+        return None if same else f"{name} was made anew by another program; end it and restart the engine"
+
     def close(self) -> None:
         """Remove all streams."""
-        for stream in (self._slopes, self._details, self._marks):
+        for stream in self._all:
             stream.unlink()
+
+
+def commands_left_behind(stream: str, commands: int) -> NDArray[np.float32] | None:
+    """Return the last commands of a stream whose writer has died; None where there are none that fit.
+
+    Where it died while it wrote, some are those of the frame before, which makes no difference to a mirror.
+
+    Raises
+    ------
+    MissingExtraError
+        Without pyshmem.
+    InputError
+        When the folder of locks is not private.
+    """
+    pyshmem = pyshmem_module("publishing commands in shared memory")
+    lock_file(stream)
+    try:
+        left = pyshmem.open(stream, gpu_device=False)
+    except (OSError, ValueError):  # none, or damaged
+        return None
+    try:
+        if not left.count or tuple(left.shape) != (commands,) or left.dtype.kind != "f":
+            return None
+        with left.locked(timeout=LOCK_LIMIT_S):
+            values = np.array(left.read(safe=False), np.float32)
+    except (TimeoutError, RuntimeError):  # a living process holds it
+        return None
+    finally:
+        left.close()
+    return values if np.isfinite(values).all() else None

@@ -82,6 +82,8 @@ class TelemetryRing:
         self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
         self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
         self._iterations, self._flags = items["iterations"], items["flags"]
+        if description["commands"]:
+            self._loop, self._commands = items["loop"], items["commands"]
 
     @classmethod
     def create(
@@ -91,6 +93,8 @@ class TelemetryRing:
         *,
         settings: str = "",
         arms: Sequence[str] = (),
+        commands: int = 0,
+        reference: ArrayLike | None = None,
         records: int | None = None,
         image_slots: int | None = None,
     ) -> TelemetryRing:
@@ -105,6 +109,10 @@ class TelemetryRing:
             The settings to begin with, for readers: TOML text (`faintspot.configuration.to_text`).
         arms : sequence of str, optional
             Names of the arms of interleaved settings, for readers.
+        commands : int
+            Number of the mirror's commands; 0: the engine makes none.
+        reference : (2 n,) array, optional
+            Reference slopes that are subtracted, px, for readers.
         records : int, optional
             Places for records of about 60 + 25 n bytes: a reader may lag behind by one frame less. Default:
             as many as fit into 32 MiB, up to 4096.
@@ -119,7 +127,7 @@ class TelemetryRing:
         """
         n = len(layout)
         if records is None:
-            records = min(4096, max(2, _RECORD_BYTES // record_type(n).itemsize))
+            records = min(4096, max(2, _RECORD_BYTES // record_type(n, commands).itemsize))
         if image_slots is None:
             size = image_type(layout.frame_shape, n, layout.window).itemsize
             image_slots = min(16, max(2, _IMAGE_BYTES // size))
@@ -127,6 +135,8 @@ class TelemetryRing:
             "layout": layout_values(layout),
             "settings": settings,
             "arms": list(arms),
+            "commands": commands,
+            "reference": None if reference is None else np.asarray(reference).tolist(),
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
             "change_slots": CHANGE_SLOTS,
@@ -135,7 +145,15 @@ class TelemetryRing:
         return cls(name, ring, begin, description)
 
     def write(
-        self, frame: int, arm: int, change: int, last_row_ns: int, published_ns: int, slopes: Slopes
+        self,
+        frame: int,
+        arm: int,
+        change: int,
+        last_row_ns: int,
+        published_ns: int,
+        slopes: Slopes,
+        loop: int = 0,
+        commands: NDArray[np.float64] | None = None,
     ) -> None:
         """Write the record of one frame; a few microseconds, nobody is waited for, nothing is checked.
 
@@ -149,6 +167,10 @@ class TelemetryRing:
             CLOCK_MONOTONIC, ns.
         slopes : Slopes
             Of one frame; copied.
+        loop : int
+            The loop's state, as `record_type` has it.
+        commands : (commands,) array, optional
+            That followed from the slopes; needed where the telemetry has commands.
         """
         written = self._written
         place = written % self._places
@@ -166,6 +188,8 @@ class TelemetryRing:
         self._x[place], self._y[place], self._flux[place] = slopes.x, slopes.y, slopes.flux
         self._error_x[place], self._error_y[place] = slopes.standard_error_x, slopes.standard_error_y
         self._iterations[place], self._flags[place] = slopes.iterations, slopes.flags
+        if commands is not None:
+            self._loop[place], self._commands[place] = loop, commands
         self._written = written = written + 1
         self._rings.records.count(written)
 

@@ -17,19 +17,22 @@ PAGE = 4096
 _CELL_BYTES = 128  # counts are so far apart that no two share a cache line, or the pair fetched with it
 
 
-def record_type(n: int) -> np.dtype[np.void]:
+def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
     """Return the type of a record of n sub-apertures; px and electrons as in `faintspot.Slopes`.
 
     `sequence` counts the records from 0, `frame` is the camera's number, `arm` says which of interleaved
     settings were used, `change` the last change of settings that is in them. Times are of CLOCK_MONOTONIC,
-    ns; `clock_offset_ns`, added to them, gives Unix time by the wall clock at that moment.
+    ns; `clock_offset_ns`, added to them, gives Unix time by the wall clock at that moment. With commands,
+    also those that followed from the frame, in the interaction matrix's unit, and the loop's state `loop`:
+    1 open, 2 closed.
     """
     numbers = ("sequence", "frame", "arm", "change", "last_row_time_ns", "published_time_ns")
     head = [(name, np.int64) for name in (*numbers, "clock_offset_ns")]
     floats = ("x", "y", "flux", "standard_error_x", "standard_error_y")
     body = [(name, np.float32, (n,)) for name in floats]
+    control = [("loop", np.int64), ("commands", np.float32, (commands,))] if commands else []
     return np.dtype(
-        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,))],
+        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,)), *control],
         align=True,
     )
 
@@ -93,7 +96,7 @@ def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], in
     n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
     change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
     return [
-        (record_type(n), description["records"]),
+        (record_type(n, description.get("commands", 0)), description["records"]),
         (image_type(shape, n, window), description["image_slots"]),
         (change, description["change_slots"]),
     ]

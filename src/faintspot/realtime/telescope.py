@@ -191,6 +191,7 @@ class SimulatedTelescope(Readout):
             "conditions": asdict(self._conditions),
             "commands": {
                 "stream": self.commands.stream,
+                "length": self.observatory.optics.mirror.commands,
                 "obstacle": self.commands.state,
                 **asdict(self.commands.counters),
             },

@@ -1,0 +1,272 @@
+"""Frame to command: what do commands add to slopes, and is the loop in real time the simulated one?
+
+Latency: 36 sub-apertures, 66 commands, frames that are there; what the engine's thread needs from the slopes'
+publication to that of the commands. For an extremely large telescope, 4616 sub-apertures and 5000 commands,
+the integrator's product alone: the compiled loop and the BLAS that NumPy has, one core; memory limits it.
+
+Loop: a simulated telescope and an engine as processes of their own, an integrator on brightest pixels,
+compared with `simulate_loop` on the same air, frame by frame. The frame rate is low and the read-out short,
+so that a busy machine holds it and commands act after the delay that is set (how often is said); the winds
+are as much slower, so that the loop is as late as at 250 frames/s. Two processors at least should be free.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+
+from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
+from faintspot import Calibration, Layout, Settings, SlopePipeline
+from faintspot import configuration as configuration_file
+from faintspot.control.compiled import integrate
+from faintspot.control.configuration import Control, ControlOptions, load_control
+from faintspot.control.learnt import CONTROLS, KALMAN, POLC, Model
+from faintspot.control.models import SlopeModel
+from faintspot.kernels.compiling import Direct
+from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.loop.control import slope_turbulence
+from faintspot.loop.engine_files import write_engine_files
+from faintspot.loop.observatory import prepare
+from faintspot.realtime.control import request
+from faintspot.realtime.engine import Engine
+from faintspot.realtime.pixel_ring import PixelRing
+from faintspot.realtime.private_socket import socket_path
+
+FRAMES, COMMANDS = 2000, 66
+LOOP_FRAMES, SETTLED, REALISATIONS, RATE_HZ = 500, 150, 3, 20.0
+_ELT_SLOPES, _ELT_COMMANDS = 9232, 5000
+_TRUTH_FRAME, _TRUTH_STREHL, _TRUTH_COMMANDS = 0, 1, 6
+_COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
+TARGETS_US = 5.0, 20.0
+
+
+def _latency() -> Table:
+    """Return what commands add to slopes, us."""
+    rng = np.random.default_rng(1)
+    layout = Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+    integrator = Control(rng.standard_normal((2 * len(layout), COMMANDS)))
+    rows = [_row("integrator", layout, integrator, TARGETS_US[0])]
+    configuration = load_loop("diffraction_limit")
+    interaction = prepare(configuration).interaction
+    covariances = slope_turbulence(configuration, layout.cells).lagged_px2(
+        1 / configuration.control.frame_rate_hz
+    )
+    model, noise = SlopeModel.of_covariances(covariances), np.full(len(interaction), 0.25)
+    learnt: dict[str, dict[str, Any]] = {
+        POLC: {"now_px2": covariances[0], "ahead_px2": covariances[2], "gain": np.array(0.3)},
+        KALMAN: {
+            "first": model.first,
+            "second": model.second,
+            "driving_px2": model.driving,
+            "variance_px2": noise,
+        },
+    }
+    for kind, arrays in learnt.items():
+        known = Model(kind, arrays, 0.3, 1.0, (1.0, 2.0))
+        control = Control(interaction, None, ControlOptions(controller=kind), known)
+        rows.append(_row(CONTROLS[kind], layout, control, TARGETS_US[1]))
+    return Table("realtime-commands", "From slopes to commands, us", rows)
+
+
+def _row(label: str, layout: Layout, control: Control, target_us: float) -> Row:
+    """Time the engine's thread from the slopes' publication to that of the commands."""
+    name = f"faintspot_benchmark_{uuid4().hex[:8]}"
+    frame = np.random.default_rng(1).poisson(1.0, layout.frame_shape).astype(np.float32)
+    times = np.zeros((2, FRAMES))
+    with PixelRing.create(name, layout.frame_shape, np.float32) as ring:
+        engine = Engine(
+            name,
+            lambda each: SlopePipeline(layout, each, Calibration(dark=0.0, read_noise_e=1.0)),
+            Settings("brightest", keep_brightest=12),
+            images_every=0,
+            control=control,
+        )
+        loop, streams = engine.loop, engine._streams
+        assert loop is not None
+        loop.close()
+        path = engine.live.running.paths(ring)[0]
+        with streams.held():
+            for index in range(FRAMES):
+                ring.publish(frame)
+                path.measure(index + 1, index % ring.slots)
+                streams.publish_slopes(path.slopes, index)
+                start = time.perf_counter_ns()
+                commands = loop.follow(path.slopes, index)
+                middle = time.perf_counter_ns()
+                streams.publish_commands(commands, index)
+                times[:, index] = middle - start, time.perf_counter_ns() - middle
+        streams.close()
+        engine._telemetry.close()
+    work, publishing = times / 1e3
+    both = work + publishing
+    columns = {
+        "computing, p50": float(np.median(work)),
+        "publishing, p50": float(np.median(publishing)),
+        "both, p50": float(np.median(both)),
+        "p99": float(np.percentile(both, 99)),
+    }
+    title = f"{label}, {2 * len(layout)} slopes, {control.commands} commands"
+    return Row(title, columns, f"<= {target_us:g} us", columns["both, p50"] <= target_us)
+
+
+def _large() -> Table:
+    """Time the integrator's product of an extremely large telescope, ms."""
+    rng = np.random.default_rng(1)
+    columns = rng.standard_normal((_ELT_SLOPES, _ELT_COMMANDS))
+    slopes, latest, out = rng.standard_normal(_ELT_SLOPES), np.zeros(_ELT_COMMANDS), np.zeros(_ELT_COMMANDS)
+    single = columns.astype(np.float32)
+    few = slopes.astype(np.float32)
+    candidates: dict[str, Candidate] = {
+        "compiled, float64": partial(Direct(integrate), slopes, columns, 0.4, 0.99, 1e30, latest, out),
+        "BLAS, float64": lambda: slopes @ columns,
+        "BLAS, float32": lambda: few @ single,
+    }
+    with pinned():
+        times = interleaved(candidates, fewest=3)
+    rows = [
+        Row(
+            name,
+            {
+                "ms a frame": best(times, name) * 1e3,
+                "GB/s": (single if "32" in name else columns).nbytes / best(times, name) / 1e9,
+            },
+        )
+        for name in candidates
+    ]
+    return Table("realtime-commands-elt", f"{_ELT_SLOPES} slopes, {_ELT_COMMANDS} commands, one core", rows)
+
+
+def slowed(configuration: LoopConfiguration, rate_hz: float) -> LoopConfiguration:
+    """Return a configuration with another frame rate, and winds that move the air as far in a frame."""
+    part = rate_hz / configuration.control.frame_rate_hz
+    winds = tuple(part * each for each in configuration.atmosphere.wind_speed_m_per_s)
+    return configuration.replace("control", frame_rate_hz=rate_hz).replace(
+        "atmosphere", wind_speed_m_per_s=winds
+    )
+
+
+@contextmanager
+def _processes(name: str, folder: Path, engine: Path, realisation: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Start an engine, and the telescope as soon as it waits for frames; give the telescope."""
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    run = [*_COMMAND, "run", "--config", str(engine), "--name", name, "--close-loop", "--images-every", "0"]
+    started = [subprocess.Popen(run, **quiet)]
+    try:
+        end = time.monotonic() + 120.0
+        while time.monotonic() < end:
+            with suppress(Exception):
+                request(socket_path(name), "status")
+                break
+            time.sleep(0.2)
+        options = [
+            "--name",
+            name,
+            "--frames",
+            str(LOOP_FRAMES),
+            "--readout-fraction",
+            "0.3",
+            "--realisation",
+            str(realisation),
+        ]
+        started.append(
+            subprocess.Popen([*_COMMAND, "telescope", str(folder / "loop.toml"), *options], **quiet)
+        )
+        yield started[-1]
+    finally:
+        for process in started[::-1]:
+            process.terminate()
+            process.wait()
+
+
+def _observed(name: str, telescope: subprocess.Popen[bytes]) -> np.ndarray[Any, Any]:
+    """Return the truth of every frame that could be read, (frames, values), until the telescope ends."""
+    import pyshmem
+
+    stream: Any = None
+    rows: dict[int, Any] = {}
+    while telescope.poll() is None:
+        time.sleep(0.2 / RATE_HZ)
+        with suppress(FileNotFoundError, ValueError, RuntimeError, TimeoutError):
+            stream = stream or pyshmem.open(f"{name}_truth")
+            publication = stream.read_publication(timeout=0.01)
+            if publication.count:
+                rows[publication.frame_id] = np.array(publication.payload)
+    return np.array([rows[number] for number in sorted(rows)])
+
+
+def compared(
+    configuration: LoopConfiguration, arm: LoopArm, realisations: int = REALISATIONS
+) -> dict[str, float]:
+    """Return mean Strehl ratios of the engine's loop and of the simulated one, and their difference."""
+    strehl = np.zeros((2, realisations))
+    on_time, frames = 0.0, 0
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        (folder / "loop.toml").write_text(configuration.to_text(), encoding="utf-8")
+        configuration_file.save(folder / "faintspot.toml", arm.settings)
+        path = write_engine_files(configuration.replace("control", gain=arm.gain), folder, arm.control)
+        known = load_control(path)
+        assert known is not None
+        run = configuration.replace("run", frames=LOOP_FRAMES, settle_frames=SETTLED)
+        for number in range(realisations):
+            name = f"faintspot_benchmark_{uuid4().hex[:8]}"
+            with _processes(name, folder, path, number) as telescope:
+                truth = _observed(name, telescope)
+            settled = truth[truth[:, _TRUTH_FRAME] >= SETTLED]
+            late = settled[:, _TRUTH_FRAME] - settled[:, _TRUTH_COMMANDS]
+            on_time += np.count_nonzero(late == configuration.control.delay_frames)
+            frames += len(settled)
+            record = simulate_loop(run, [arm], realisation=number)
+            places = settled[:, _TRUTH_FRAME].astype(int)
+            strehl[:, number] = settled[:, _TRUTH_STREHL].mean(), record.strehl[places].mean()
+    difference = strehl[0] - strehl[1]
+    return {
+        "in real time": float(strehl[0].mean()),
+        "simulated": float(strehl[1].mean()),
+        "difference": float(difference.mean()),
+        "its error": float(difference.std(ddof=1) / np.sqrt(realisations)),
+        "frames": frames,
+        "acted after the delay that is set": float(on_time / frames),
+    }
+
+
+def _loop() -> Table:
+    configuration = slowed(load_loop("camera_3e").replace("camera", photons_per_subaperture=300.0), RATE_HZ)
+    flux_e = configuration.photons
+    predicting = Settings("map", flux_e=flux_e, prior_std_px=1.0)  # the filter says how wide
+    arms = [
+        LoopArm("30 brightest pixels, integrator", Settings("brightest", keep_brightest=30), 0.4),
+        LoopArm("fixed window, integrator", Settings("window", flux_e=flux_e), 0.4),
+        LoopArm(
+            "maximum a posteriori, Kalman filter",
+            predicting,
+            0.3,
+            predict_prior=True,
+            correct_gain=False,
+            control="kalman",
+        ),
+    ]
+    rows = []
+    for arm in arms:
+        columns = compared(configuration, arm)
+        within = abs(columns["difference"]) <= max(3 * columns["its error"], 0.01)
+        rows.append(Row(arm.label, columns, "3 errors, or 0.01", within))
+    note = (
+        f"{REALISATIONS} realisations, frames {SETTLED} to {LOOP_FRAMES}, {RATE_HZ:g} frames/s, 300 photons"
+    )
+    return Table("realtime-loop", "Strehl ratio of the loop in real time and simulated", rows, [note])
+
+
+def run() -> list[Table]:
+    """Measure latency, the large product, and the loop."""
+    return [_latency(), _large(), _loop()]

@@ -1,0 +1,123 @@
+"""faintspot realtime calibrate: interaction matrix and reference slopes from pokes of the mirror."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from faintspot.cli.needs import needs
+from faintspot.errors import InputError
+
+
+@needs("realtime", "pyshmem")
+@click.command("calibrate", short_help="Measure interaction matrix and reference slopes.")
+@click.option(
+    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Gets [control]."
+)
+@click.option("--name", default="faintspot", show_default=True, help="Of the engine and the streams.")
+@click.option(
+    "--commands", type=click.IntRange(1), metavar="N", help="Of the mirror. Default: as before, or simulated."
+)
+@click.option(
+    "--amplitude", type=float, default=50.0, show_default=True, help="Of a poke, in the mirror's unit."
+)
+@click.option(
+    "--error",
+    type=click.FloatRange(0, 1, min_open=True),
+    default=0.05,
+    show_default=True,
+    help="Of an actuator's slopes, as a part of them, that half of the actuators must reach.",
+)
+@click.option("--rounds", type=click.IntRange(4), default=100, show_default=True, help="At most.")
+@click.option(
+    "--settle-frames", type=click.IntRange(1), default=3, show_default=True, help="Until a command acts."
+)
+@click.option(
+    "--frames", type=click.IntRange(2), default=2, show_default=True, help="Averaged for each poke."
+)
+@click.option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
+def calibrate(
+    config: str,
+    name: str,
+    commands: int | None,
+    amplitude: float,
+    error: float,
+    rounds: int,
+    settle_frames: int,
+    frames: int,
+    keep_reference: bool,
+) -> None:
+    """Poke the mirror up and down and measure what the slopes do, for [control] of the configuration.
+
+    Pokes go out as the pyshmem stream NAME_commands, which the mirror must follow; a running engine without
+    control (`run --no-control`) measures. Every actuator is poked in every round, until the errors, from the
+    scatter between rounds, are small enough. A mirror that does not answer, and pokes that saturate, are
+    refused. Writes TOML's name with .control.npz and .control.png, and [control] into it. Best with light
+    that does not pass through moving air.
+
+    \b
+    Example:
+      faintspot realtime run --no-control
+      faintspot realtime calibrate --amplitude 50 --error 0.03
+    """
+    import numpy as np
+
+    from faintspot.cli.progress import progress_bar
+    from faintspot.control.calibration_files import save_calibration, save_picture
+    from faintspot.control.configuration import load_control
+    from faintspot.control.mirror_calibration import calibrate_mirror, centroid_gain
+    from faintspot.realtime.poking import StreamedMirror
+    from faintspot.sensor.layout import Layout
+
+    layout, former = Layout.load(config), load_control(config)
+    if keep_reference and (former is None or former.reference is None):
+        raise InputError(f"--keep-reference: expected reference_slopes in [control] of {config}")
+    number = commands or _known_commands(former, name)
+    with (
+        StreamedMirror(name, number, settle_frames=settle_frames, frames=frames) as mirror,
+        progress_bar("rounds") as advance,
+    ):
+        total: Any = None
+        found = calibrate_mirror(mirror, amplitude, error, rounds, lambda done, _: advance(done, total))
+    reference = former.reference if keep_reference and former else mirror.reference + found.reference
+    if len(reference) != len(found.reference):
+        raise InputError(f"{config}: {len(reference) // 2} sub-apertures, the engine's has another number")
+    store = save_calibration(config, found, np.asarray(reference))
+    save_picture(store.with_suffix(".png"), found, np.asarray(reference), layout)
+    for line in _in_words(found):
+        click.echo(line)
+    if former is not None and former.interaction.shape == found.interaction.shape:
+        gain, gain_error = centroid_gain(found, former.interaction)
+        click.echo(f"slopes are {gain:.3f} +- {gain_error:.3f} times those of the former matrix")
+    click.echo(f"{store}, {store.with_suffix('.png').name} and [control] of {config} written")
+
+
+def _known_commands(former: Any, name: str) -> int:
+    """Return the number of commands of the former calibration, or of a simulated telescope."""
+    from faintspot.realtime.control import request
+    from faintspot.realtime.private_socket import TELESCOPE, socket_path
+
+    if former is not None:
+        return int(former.commands)
+    try:
+        return int(request(socket_path(name, TELESCOPE), "status")["commands"]["length"])
+    except InputError:
+        raise InputError("--commands: expected the number of the mirror's commands, got none") from None
+
+
+def _in_words(found: Any) -> list[str]:
+    """Say what was found."""
+    import numpy as np
+
+    slopes, commands = found.interaction.shape
+    lines = [
+        f"{commands} commands, {slopes} slopes, {found.rounds} rounds of +-{found.amplitude:g}; relative "
+        f"error {np.median(found.relative_error):.3f}; pokes of half as much: {found.linearity:.3f} of what "
+        "is in proportion"
+    ]
+    silent = np.flatnonzero(~found.answers)
+    if len(silent):
+        shown = ", ".join(map(str, silent[:20])) + (", ..." if len(silent) > 20 else "")
+        lines.append(f"{len(silent)} commands without an answer, not used: {shown}")
+    return lines

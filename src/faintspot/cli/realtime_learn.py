@@ -1,0 +1,66 @@
+"""faintspot realtime learn: control that learns from a recording of the closed loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from faintspot.cli.needs import needs
+from faintspot.errors import InputError
+
+
+@needs("realtime", "zarr")
+@click.command("learn", short_help="Have a controller learn from a recording of the closed loop.")
+@click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
+@click.option(
+    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Its [control]."
+)
+@click.option(
+    "--control",
+    "kind",
+    type=click.Choice(["modal", "polc", "kalman"]),
+    default="kalman",
+    show_default=True,
+    help="What learns.",
+)
+@click.option(
+    "--wind-speeds", default="5,10,20", show_default=True, metavar="LIST", help="Of the theory's layers, m/s."
+)
+def learn(store: Path, config: str, kind: str, wind_speeds: str) -> None:
+    """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
+
+    STORE is what `faintspot realtime record` wrote while the engine ran with TOML, at least 200 frames
+    without a gap and with an estimator that was told no prediction; 2000 are better. The layout must know
+    subaperture_m or diameter_m. Takes up to some minutes; writes TOML's name with .model.npz, and
+    controller and model of [control].
+
+    \b
+    Example:
+      faintspot realtime record night.zarr --seconds 10
+      faintspot realtime learn night.zarr --control kalman
+    """
+    from faintspot.control.configuration import load_control, save_control
+    from faintspot.control.learning import learn as learnt_by
+    from faintspot.control.recording import telemetry_of_recording, theories_of
+    from faintspot.io import read_telemetry
+    from faintspot.sensor.layout import Layout
+
+    control = load_control(config)
+    if control is None:
+        raise InputError(f"{config}: expected a table [control], which calibrate writes")
+    try:
+        speeds = [float(each) for each in wind_speeds.split(",")]
+    except ValueError:
+        raise InputError(f"--wind-speeds {wind_speeds!r}: expected numbers such as 5,10,20") from None
+    telemetry, rate_hz = telemetry_of_recording(read_telemetry(store, images=False), control)
+    learnt = learnt_by(kind, control.plant, telemetry, theories_of(Layout.load(config), rate_hz, speeds))
+    path = Path(config).with_suffix(".model.npz")
+    learnt.model.save(path)
+    save_control(config, controller=kind, model=path.name)
+    left = learnt.model.left
+    click.echo(
+        f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
+        f"mean square that the integrator with gain {learnt.model.plain_gain:g} leaves"
+    )
+    click.echo(f"{learnt.model.description}; {path} and [control] of {config} written")

@@ -1,0 +1,120 @@
+"""Compiled control: from a frame's slopes to a command, in memory that was made beforehand."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.base import Expected
+from faintspot.control.commands import CommandLine
+from faintspot.flags import INVALID
+from faintspot.kernels.compiling import Direct, compiled_with
+
+Floats = NDArray[np.float64]
+
+_INVALID = int(INVALID)
+_compiled = partial(compiled_with, source=__file__)
+
+INVALID_PART, MEAN_SQUARE = range(2)
+"""What `true_slopes` says of a frame: part of the sub-apertures that are not valid; of the others, the mean
+square of a slope along one axis, px^2."""
+
+
+@_compiled
+def true_slopes(
+    x: Any, y: Any, flags: Any, error_x: Any, error_y: Any, gain: Any, slopes: Any, errors: Any, said: Any
+) -> None:
+    """Write slopes in true pixels, all x, then all y, and their errors; what is not valid is 0, infinite.
+
+    Parameters
+    ----------
+    x, y, flags, error_x, error_y : (n,) arrays
+        As in `faintspot.Slopes`.
+    gain : float
+        Centroid gain.
+    slopes, errors : (2 n,) float64 arrays
+    said : (2,) float64 array
+        `INVALID_PART`, `MEAN_SQUARE`.
+    """
+    n = x.shape[0]
+    invalid, square = 0, 0.0
+    for s in range(n):
+        along, across = x[s] / gain, y[s] / gain
+        if flags[s] & _INVALID == 0 and np.isfinite(along) and np.isfinite(across):
+            slopes[s], slopes[n + s] = along, across
+            errors[s], errors[n + s] = error_x[s] / gain, error_y[s] / gain
+            square += along * along + across * across
+        else:
+            slopes[s] = slopes[n + s] = 0.0
+            errors[s] = errors[n + s] = np.inf
+            invalid += 1
+    said[INVALID_PART] = invalid / n
+    said[MEAN_SQUARE] = square / (2 * max(n - invalid, 1))
+
+
+@_compiled
+def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, latest: Any, out: Any) -> None:
+    """Write the next command: `keep` of the latest, less `gain` times the wavefront, within the stroke.
+
+    Parameters
+    ----------
+    slopes : (m,) float64 array
+        Finite.
+    columns : (m, commands) float64 array, contiguous
+        The reconstructor, transposed, so that the commands are what the processor works on side by side.
+    gain, keep, largest : float
+    latest, out : (commands,) float64 array
+    """
+    for c in range(out.shape[0]):
+        out[c] = 0.0
+    for s in range(slopes.shape[0]):
+        slope = slopes[s]
+        for c in range(out.shape[0]):
+            out[c] += columns[s, c] * slope
+    for c in range(out.shape[0]):
+        out[c] = min(max(keep * latest[c] - gain * out[c], -largest), largest)
+
+
+class CompiledIntegrator:
+    """`control.integrator.Integrator` in compiled code, for all slopes counting alike.
+
+    Parameters
+    ----------
+    line : CommandLine
+    interaction : (m, commands) array
+        Slopes in px that a unit of each command adds.
+    reconstruct : (commands, m) array
+        The wavefront from slopes, as commands that cause it; with a gain for each mode where there is one.
+    gain : float
+        May be changed between two frames.
+    leak : float
+        Part of the command that is forgotten in every frame.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self, line: CommandLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
+    ) -> None:
+        self._line, self._interaction = line, interaction
+        self._columns = np.ascontiguousarray(reconstruct.T, np.float64)
+        self.gain, self._keep = float(gain), 1.0 - leak
+        self._integrate = Direct(integrate)
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
+
+    def begin(self) -> None:
+        """See `Controller`: all that it knows is on the line."""
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`; slopes that were not measured are 0."""
+        line = self._line
+        self._integrate(
+            slopes_px, self._columns, self.gain, self._keep, line.largest, line.latest, line.spare
+        )
+        line.sent()

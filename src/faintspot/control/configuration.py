@@ -1,0 +1,288 @@
+"""From slopes to commands, as [control] of faintspot.toml says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import finite_array
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
+from faintspot.control.compiled import CompiledIntegrator
+from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, Learnt, Model, Plant
+from faintspot.control.reconstructor import Reconstructor, make_reconstructor
+from faintspot.errors import InputError
+from faintspot.io.frames import read_array
+from faintspot.options import Options, option
+from faintspot.settings import Settings
+from faintspot.tables import errors_of_table, read_tables, save_tables
+from faintspot.toml_files import check_keys
+
+Floats = NDArray[np.float64]
+
+TABLE = "control"
+INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
+MODEL = "model"
+FILES = (INTERACTION, REFERENCE, MODEL)
+NONE, CONTROLLER, STREAM = "none", "controller", "stream"
+"""Where predictions come from."""
+PRIOR = "prior_std_px"
+_LARGEST_SLOPE_PX = 1e4
+_BEYOND_ALL = 1e30  # of commands without a limit: finite in float32, too
+_setting = partial(option, per_subaperture=False)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlOptions(Options):
+    """Numbers of [control]."""
+
+    controller: str = _setting(
+        INTEGRATOR,
+        "What makes commands of slopes; all but the integrator need a `model`.",
+        choices=tuple(CONTROLS),
+    )
+    gain: float = _setting(0.4, "Loop gain of the integrator.", low=0, high=2)
+    leak: float = _setting(0.01, "Part of the command that is forgotten in every frame.", low=0, high=1)
+    delay_frames: int = _setting(
+        2,
+        "The command computed from frame k acts first during the exposure of frame k + `delay_frames`.",
+        low=1,
+        high=100,
+        whole=True,
+    )
+    largest_command: float | None = _setting(
+        None,
+        "Stroke, in the interaction matrix's unit: no command is larger, and what is cut off is forgotten. "
+        "Default: no limit.",
+        low=0,
+        low_open=True,
+    )
+    largest_condition: float = _setting(
+        30.0,
+        "Combinations of actuators that move the slopes so many times less than the best one are not driven.",
+        low=1,
+        high=1e6,
+    )
+    centroid_gain: float = _setting(
+        1.0,
+        "What the estimator shows of a slope of 1 px of the interaction matrix; slopes are divided by it. 1 "
+        "for a matrix that was measured with the same estimator and as much light.",
+        low=0.01,
+        high=100,
+    )
+    prediction: str | None = _setting(
+        None,
+        'Where the slopes come from that estimators with a prior expect: "controller", this one; "stream", '
+        "another program, by NAME_prediction. Default: the controller if it is a Kalman filter, else none.",
+        choices=(NONE, CONTROLLER, STREAM),
+    )
+    guard_frames: int = _setting(
+        50,
+        "The guard looks at means over so many frames.",
+        low=1,
+        high=1_000_000,
+        whole=True,
+    )
+    most_invalid: float = _setting(
+        0.5,
+        "It opens the loop when a larger part of the slopes is not valid; 1: never.",
+        low=0,
+        high=1,
+    )
+    largest_residual_px: float | None = _setting(
+        None,
+        "It opens the loop when the rms of the slopes is larger. Default: 1.25 times what it was in the open "
+        "loop, which must have been open for `guard_frames` before; else a quarter of a window's side.",
+        unit="px",
+        low=0,
+        low_open=True,
+    )
+    most_at_limit: float = _setting(
+        0.5,
+        "It opens the loop when a larger part of the commands is at `largest_command`; 1: never.",
+        low=0,
+        high=1,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """What an engine needs to make commands of slopes; checked when it is made.
+
+    Parameters
+    ----------
+    interaction : (2 n, commands) array
+        Slopes, px, all x, then all y, that a unit of each command adds.
+    reference : (2 n,) or (n, 2) array, optional
+        Reference slopes, px from each sub-aperture's centre. Default: 0.
+    options : ControlOptions
+    model : path, optional
+        What the controller has learnt, a file of `Model.save`; not for the plain integrator.
+
+    Raises
+    ------
+    InputError
+        For a model that does not fit, numbers that are not finite, shapes that do not fit, and a mirror that
+        slopes cannot control.
+    """
+
+    interaction: Any
+    reference: Any = None
+    options: ControlOptions = field(default_factory=ControlOptions)
+    model: Any = None
+
+    def __post_init__(self) -> None:
+        matrix = finite_array(INTERACTION, self.interaction).astype(np.float64)
+        if matrix.ndim != 2 or len(matrix) % 2:
+            raise InputError(f"{INTERACTION}: expected shape (2 n, commands), got {matrix.shape}")
+        if matrix.shape[1] > len(matrix):
+            raise InputError(
+                f"{INTERACTION}: expected (2 n, commands), no more commands than slopes, got {matrix.shape}"
+            )
+        reference = self.reference
+        if reference is not None:
+            reference = finite_array(REFERENCE, reference).astype(np.float64)
+            if reference.shape == (len(matrix) // 2, 2):
+                reference = reference.T.reshape(-1)
+            if reference.shape != (len(matrix),):
+                raise InputError(f"{REFERENCE}: expected shape ({len(matrix)},), got {reference.shape}")
+            if np.abs(reference).max() > _LARGEST_SLOPE_PX:
+                raise InputError(f"{REFERENCE}: expected positions up to {_LARGEST_SLOPE_PX:g} px")
+        object.__setattr__(self, "interaction", matrix)
+        object.__setattr__(self, "reference", reference)
+        assert self.reconstructor  # which refuses what is no interaction matrix
+        object.__setattr__(self, "model", self._checked_model())
+
+    def _checked_model(self) -> Model | None:
+        kind = self.options.controller
+        if kind == KALMAN and self.options.prediction == STREAM:
+            raise InputError(
+                'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
+            )
+        if kind == INTEGRATOR:
+            return None
+        if self.model is None:
+            raise InputError(f"{MODEL}: expected a file with what {CONTROLS[kind]} has learnt, got none")
+        model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
+        if model.kind != kind:
+            raise InputError(f"{MODEL}: expected what {kind!r} has learnt, got that of {model.kind!r}")
+        return model
+
+    @cached_property
+    def reconstructor(self) -> Reconstructor:
+        """From slopes to the commands that cause them."""
+        return make_reconstructor(self.interaction, self.options.largest_condition)
+
+    @property
+    def plant(self) -> Plant:
+        """What controllers know of the loop."""
+        options = self.options
+        return Plant(self.interaction, self.reconstructor, options.delay_frames, options.leak)
+
+    @property
+    def prediction(self) -> str:
+        """Where predictions come from: NONE, CONTROLLER or STREAM."""
+        usual = CONTROLLER if self.options.controller == KALMAN else NONE
+        return self.options.prediction or usual
+
+    def settings(self, settings: Settings) -> Settings:
+        """Return settings whose prior is as wide as the controller is sure, where both know of one."""
+        std = None if self.model is None else self.model.expected_std_px
+        if std is None or PRIOR not in settings.declared() or self.prediction != CONTROLLER:
+            return settings
+        changes: dict[str, Any] = {PRIOR: np.sqrt(np.square(std).reshape(2, -1).mean(axis=0))}
+        return settings.replace(**changes)
+
+    @property
+    def commands(self) -> int:
+        """Number of commands."""
+        return int(self.interaction.shape[1])
+
+    def check_fits(self, n: int) -> None:
+        """Refuse another number of sub-apertures than the matrix has.
+
+        Raises
+        ------
+        InputError
+            Where it differs.
+        """
+        slopes = len(self.interaction)
+        if slopes != 2 * n:
+            raise InputError(
+                f"{TABLE}.{INTERACTION}: expected {2 * n} rows for {n} sub-apertures (all x, then all y), "
+                f"got {slopes}"
+            )
+
+    def line(self) -> CommandLine:
+        """Return the way of commands to a mirror that is flat."""
+        options = self.options
+        return CommandLine(self.commands, options.delay_frames, options.largest_command or _BEYOND_ALL)
+
+    def controller(self, line: CommandLine) -> Controller:
+        """Return the controller, which sends its commands along `line`."""
+        options, matrix = self.options, self.reconstructor.matrix
+        if options.controller == INTEGRATOR:
+            return CompiledIntegrator(line, self.interaction, matrix, options.gain, options.leak)
+        if options.controller == MODAL:
+            modes = self.reconstructor.modes
+            matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
+            return CompiledIntegrator(line, self.interaction, matrix, 1.0, options.leak)
+        return Learnt(self.plant, self.model).controller(line)
+
+
+def load_control(path: str | Path) -> Control | None:
+    """Read [control] of a configuration file, and the files that it names; None where there is none.
+
+    Raises
+    ------
+    InputError
+        When something cannot be read, is unknown or does not fit.
+    """
+    path = Path(path)
+    document = read_tables(path)
+    if TABLE not in document:
+        return None
+    with errors_of_table(path, TABLE):
+        return _of_table(path, document[TABLE])
+
+
+def _of_table(path: Path, values: Mapping[str, Any]) -> Control:
+    declared = ControlOptions.declared()
+    check_keys(f"{TABLE}.", values, [*FILES, *declared], required=[INTERACTION])
+    arrays = {name: _read(path, name, values[name]) for name in FILES[:2] if name in values}
+    model = values.get(MODEL)
+    if model is not None and not isinstance(model, str):
+        raise InputError(f"{MODEL}: expected the name of a file, found {model!r:.80}")
+    options = ControlOptions(**{name: value for name, value in values.items() if name in declared})
+    return Control(
+        arrays[INTERACTION], arrays.get(REFERENCE), options, None if model is None else path.parent / model
+    )
+
+
+def _read(path: Path, name: str, location: Any) -> NDArray[Any]:
+    """Read an array from the file that the table names, relative to the configuration."""
+    if not isinstance(location, str):
+        raise InputError(f"{name}: expected the name of a file, found {location!r:.80}")
+    try:
+        return read_array(f"{path.parent / location}")
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def save_control(path: str | Path, **values: Any) -> None:
+    """Write values into [control] of a configuration file; its others, other tables and comments stay.
+
+    Raises
+    ------
+    InputError
+        When the file exists and cannot be understood, or cannot be written.
+    """
+    path = Path(path)
+    before = read_tables(path).get(TABLE, {}) if path.exists() else {}
+    save_tables(path, {TABLE: {**before, **values}})

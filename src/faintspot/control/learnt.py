@@ -1,0 +1,174 @@
+"""What a controller has learnt, as numbers that can be kept in a file, and the controller made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import finite_array, one_of
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
+from faintspot.control.guarded import Guarded
+from faintspot.control.integrator import Integrator
+from faintspot.control.kalman import SlopePredictor
+from faintspot.control.models import SlopeModel
+from faintspot.control.predictive import Predictive, PseudoOpenLoop
+from faintspot.control.reconstructor import Reconstructor
+from faintspot.control.telemetry import Telemetry, replayed
+from faintspot.errors import InputError
+from faintspot.files import read_arrays, save_arrays
+
+Floats = NDArray[np.float64]
+Make = Callable[[CommandLine], Controller]
+
+INTEGRATOR, MODAL, POLC, KALMAN = "integrator", "modal", "polc", "kalman"
+CONTROLS = {
+    INTEGRATOR: "integrator with one gain",
+    MODAL: "integrator with a gain for each mode",
+    POLC: "pseudo-open-loop control",
+    KALMAN: "predictive Kalman filter",
+}
+"""Kinds of control, and what reports call them."""
+
+SETTLE_FRAMES = 50
+_OF_KIND = {
+    MODAL: ("gains",),
+    POLC: ("now_px2", "ahead_px2", "gain"),
+    KALMAN: ("first", "second", "driving_px2", "variance_px2"),
+}
+_SQUARE = {"now_px2", "ahead_px2", "first", "second", "driving_px2"}
+_OF_ALL = ("plain_gain", "noise_factor", "left")
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """What a controller must know of its loop."""
+
+    interaction: Floats
+    """(m, commands): slopes in px that a unit of each command adds."""
+    reconstructor: Reconstructor
+    delay_frames: int
+    leak: float
+
+    def integrator(self, gain: float | Floats, line: CommandLine) -> Controller:
+        """Return an integrator of this loop."""
+        return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
+
+    def left(self, make: Make, telemetry: Telemetry) -> float:
+        """Return how much a controller would have left, see `replayed`."""
+        matrix = self.reconstructor.matrix
+        return replayed(make, telemetry, self.interaction, matrix, self.delay_frames, SETTLE_FRAMES)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What a kind of control has learnt of its air."""
+
+    kind: str
+    arrays: Mapping[str, Floats]
+    """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
+    (m, m), variance_px2 (m,) of the slopes' noise."""
+    plain_gain: float
+    """Of the integrator that is fallen back to."""
+    noise_factor: float
+    """What to multiply the variances of standard errors by."""
+    left: tuple[float, float]
+    """Mean square of what the learnt and the plain one leave in telemetry; of the Kalman filter in frames
+    that it has not learnt from."""
+    description: str = ""
+
+    def controller(self, plant: Plant, line: CommandLine) -> Controller:
+        """Return the controller that has learnt."""
+        arrays = self.arrays
+        if self.kind == MODAL:
+            return plant.integrator(arrays["gains"], line)
+        clean = plant.reconstructor.clean
+        if self.kind == POLC:
+            covariances = arrays["now_px2"], arrays["ahead_px2"]
+            return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
+        return Predictive(line, plant.interaction, self._predictor(), clean)
+
+    @property
+    def expected_std_px(self) -> Floats | None:
+        """(m,): how sure it is of the slopes that it expects; None: it does not know."""
+        return self._predictor().std_px if self.kind == KALMAN else None
+
+    def _predictor(self) -> SlopePredictor:
+        model = SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
+        return SlopePredictor(model, self.arrays["variance_px2"])
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a NumPy file (.npz).
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        numbers = {name: np.asarray(getattr(self, name), np.float64) for name in _OF_ALL}
+        save_arrays(path, {"kind": np.array(self.kind), **numbers, **self.arrays})
+
+    @classmethod
+    def load(cls, path: str | Path, plant: Plant) -> Model:
+        """Read it, for a loop.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, is not finite, or is for another loop.
+        """
+        what = "what control has learnt"
+        kind = one_of("kind", str(read_arrays(path, what, ("kind",))["kind"]), list(_OF_KIND))
+        found = read_arrays(path, what, (*_OF_ALL, *_OF_KIND[kind]))
+        numbers = {name: finite_array(name, array).astype(np.float64) for name, array in found.items()}
+        slopes, modes = len(plant.interaction), plant.reconstructor.modes.shape[1]
+        shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
+        shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
+        for name, array in numbers.items():
+            if array.shape != shapes.get(name, ()):
+                raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
+        learnt, plain = numbers["left"]
+        return cls(
+            kind,
+            {name: numbers[name] for name in _OF_KIND[kind]},
+            float(numbers["plain_gain"]),
+            float(numbers["noise_factor"]),
+            (float(learnt), float(plain)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """A controller that has learnt, ready to be made for its loop."""
+
+    plant: Plant
+    model: Model
+
+    @property
+    def noise_factor(self) -> float:
+        """What to multiply the variances of standard errors by."""
+        return self.model.noise_factor
+
+    @property
+    def expected_std_px(self) -> Floats | None:
+        """(m,): how sure it is of the slopes that it expects; None: it does not know."""
+        return self.model.expected_std_px
+
+    def controller(self, line: CommandLine, prior_std_px: Floats | None = None) -> Guarded:
+        """Return the controller; with the estimator's prior where it has one."""
+        plant, model = self.plant, self.model
+        return Guarded(
+            line,
+            plant.interaction,
+            plant.reconstructor.matrix,
+            partial(model.controller, plant),
+            partial(plant.integrator, model.plain_gain),
+            prior_std_px=prior_std_px,
+            noise_factor=model.noise_factor,
+            prefers_plain=model.left[1] < model.left[0],
+        )

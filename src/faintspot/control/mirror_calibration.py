@@ -1,0 +1,292 @@
+"""Interaction matrix and reference slopes from pokes of the mirror, with their standard errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.flags import INVALID, SubapertureFlag
+
+Floats = NDArray[np.float64]
+
+FEWEST_ROUNDS = 4
+"""From whose scatter errors are told."""
+_ANSWERS = 1 / 3  # largest relative error of an actuator that is said to answer
+_HOPELESS_ROUNDS = 8  # after which half of the actuators must have shown something
+_CHECKED = 8  # actuators that are poked by half as much, too
+_NOT_LINEAR = 0.1
+_NOT_SETTLED = 0.05
+_MEAN = 0
+_FEWEST_MEASURED = 2
+_MOST_INVALID, _MOST_AT_LIMIT = 0.2, 0.02
+
+
+class PokedMirror(Protocol):
+    """A mirror with a sensor behind it."""
+
+    commands: int
+
+    def slopes(self, command: Floats) -> tuple[Floats, NDArray[np.uint8]]:
+        """Return slopes (frames, 2 n), px, and flags (frames, n) of two or more frames, in their order.
+
+        The command is to act in all of them.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorCalibration:
+    """What pokes have shown."""
+
+    interaction: Floats
+    """(2 n, commands): px for a unit of each command; 0 where an actuator does not answer."""
+    interaction_error: Floats
+    """(2 n, commands): standard errors."""
+    reference: Floats
+    """(2 n,): slopes of the flat mirror, px, as the sensor told them."""
+    reference_error: Floats
+    amplitude: float
+    rounds: int
+    relative_error: Floats
+    """(commands,): error of each actuator's slopes, as a part of them."""
+    linearity: float
+    """How far pokes of half the amplitude move the slopes, as a part of what would be in proportion."""
+
+    @property
+    def answers(self) -> NDArray[np.bool_]:
+        """(commands,): whether each actuator moves slopes beyond their noise."""
+        return self.relative_error < _ANSWERS
+
+
+def calibrate_mirror(
+    mirror: PokedMirror,
+    amplitude: float,
+    relative_error: float = 0.05,
+    most_rounds: int = 100,
+    progress: Callable[[int, float], None] | None = None,
+) -> MirrorCalibration:
+    """Poke every actuator up and down, again and again, until the errors are small enough.
+
+    Errors are those of the mean of rounds, from their scatter, whatever it comes from: noise, or air that
+    moves. In every other round down comes first, so that what drifts is averaged out.
+
+    Parameters
+    ----------
+    mirror : PokedMirror
+    amplitude : float
+        Of a poke, in the mirror's unit.
+    relative_error : float
+        That half of the actuators must reach.
+    most_rounds : int
+        After which it is given up.
+    progress : callable, optional
+        Called after every round with its number and the relative error.
+
+    Raises
+    ------
+    InputError
+        For numbers out of range; when the mirror does not answer, the error is not reached, too many slopes
+        are not valid, and when pokes saturate.
+    """
+    amplitude = number_between("amplitude", amplitude, 0, low_open=True)
+    wanted = number_between("relative_error", relative_error, 0, 1, low_open=True)
+    most = int(number_between("most_rounds", most_rounds, FEWEST_ROUNDS, 100_000, integer=True))
+    everyone = np.arange(mirror.commands)
+    pokes = _Pokes(mirror, everyone, amplitude)
+    while True:
+        pokes.round()
+        error = np.inf
+        if pokes.rounds >= FEWEST_ROUNDS:
+            error = float(np.median(pokes.relative_error))
+        if progress is not None:
+            progress(pokes.rounds, error)
+        if error <= wanted:
+            break
+        pokes.refuse_hopeless(error, last=pokes.rounds >= most)
+        if pokes.rounds >= most:
+            raise InputError(
+                f"relative_error = {wanted:g}: after {most} rounds it is still {error:.2g}; poke more, give "
+                "more light, or allow more rounds"
+            )
+    pokes.refuse_saturated()
+    pokes.refuse_unsettled()
+    interaction, interaction_error = pokes.columns
+    found = pokes.relative_error
+    linearity = _linearity(mirror, pokes, interaction, found)
+    reference, reference_error = pokes.middle
+    interaction[:, found >= _ANSWERS] = 0.0
+    return MirrorCalibration(
+        interaction,
+        interaction_error,
+        reference,
+        reference_error,
+        amplitude,
+        pokes.rounds,
+        found,
+        linearity,
+    )
+
+
+def centroid_gain(found: MirrorCalibration, former: Floats) -> tuple[float, float]:
+    """Return by how much slopes are larger than those of a former interaction matrix, and its error.
+
+    Of a matrix in true pixels it is the estimator's centroid gain.
+
+    Parameters
+    ----------
+    found : MirrorCalibration
+    former : (2 n, commands) array
+    """
+    power = np.square(former).sum(axis=0) * found.answers
+    each = (found.interaction * former).sum(axis=0)
+    gain = each.sum() / power.sum()
+    scatter = np.square(each - gain * power).sum() / power.sum() ** 2
+    return float(gain), float(np.sqrt(scatter))
+
+
+def _linearity(mirror: PokedMirror, pokes: _Pokes, interaction: Floats, found: Floats) -> float:
+    """Poke those that move slopes most by half as much; refuse what is not in proportion."""
+    strongest = np.argsort(np.abs(interaction).max(axis=0))[::-1][:_CHECKED]
+    half = _Pokes(mirror, strongest, 0.5 * pokes.amplitude)
+    for _ in range(max(FEWEST_ROUNDS, pokes.rounds)):
+        half.round()
+    whole, (columns, errors) = interaction[:, strongest], half.columns
+    power = np.square(whole).sum()
+    share = float((columns * whole).sum() / power)
+    # Of the whole pokes, and of the half ones.
+    error = np.hypot(
+        np.sqrt(np.square(np.where(whole, errors * whole, 0.0)).sum()) / power,
+        float(found[strongest].mean()) / np.sqrt(_CHECKED),
+    )
+    if abs(share - 1) > _NOT_LINEAR + 3 * error:
+        raise InputError(
+            f"amplitude = {pokes.amplitude:g}: pokes of half as much move the slopes {0.5 * share:.2f} times "
+            "as far, 0.50 expected: mirror or sensor saturate; choose a smaller one"
+        )
+    return share
+
+
+class _Pokes:
+    """Pokes of some actuators and what they did, round by round."""
+
+    def __init__(self, mirror: PokedMirror, actuators: NDArray[np.int64], amplitude: float) -> None:
+        self._mirror, self._actuators, self.amplitude = mirror, actuators, amplitude
+        self._differences: list[Floats] = []
+        self._means: list[Floats] = []
+        self._ends: Floats | float = 0.0
+        """Sum of what differences would be of the first and of the last frame of each poke."""
+        self._counts = np.zeros(3)
+        """Slopes in all, those that are not valid, and those at the end of their search range."""
+
+    @property
+    def rounds(self) -> int:
+        """How many were made."""
+        return len(self._differences)
+
+    def round(self) -> None:
+        """Poke all of them up and down, or down and up."""
+        signs = (1.0, -1.0) if self.rounds % 2 == 0 else (-1.0, 1.0)
+        differences, means = [], []
+        for actuator in self._actuators:
+            seen = {sign: self._poked(actuator, sign * self.amplitude) for sign in signs}
+            differences.append((seen[1.0] - seen[-1.0]) / (2 * self.amplitude))
+            means.append(0.5 * (seen[1.0] + seen[-1.0])[_MEAN])
+        of_all = np.stack(differences, axis=-1)
+        self._differences.append(of_all[_MEAN])
+        ends = of_all[_MEAN + 1 :]
+        self._ends += np.where(np.isfinite(ends).all(axis=0), ends, 0.0)
+        self._means.append(_mean(means)[0])
+
+    @property
+    def columns(self) -> tuple[Floats, Floats]:
+        """Slopes for a unit of each command, (2 n, actuators), and their standard errors."""
+        return _mean(self._differences)
+
+    @property
+    def middle(self) -> tuple[Floats, Floats]:
+        """Slopes of the mirror between up and down, (2 n,), and their standard errors."""
+        return _mean(self._means)
+
+    @property
+    def relative_error(self) -> Floats:
+        """(actuators,): root of the sum of squares of errors, as a part of that of the slopes."""
+        columns, errors = self.columns
+        noise = np.square(np.where(np.isfinite(errors), errors, 0.0)).sum(axis=0)
+        signal = np.square(columns).sum(axis=0) - noise  # noise has added its square, too
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(signal > 0, np.sqrt(noise / signal), np.inf)
+
+    def refuse_hopeless(self, error: float, *, last: bool) -> None:
+        """Raise InputError where half of the actuators show nothing, or many slopes are not valid."""
+        if self.rounds < _HOPELESS_ROUNDS and not last:
+            return
+        total, invalid, _ = self._counts
+        if invalid > _MOST_INVALID * total:
+            raise InputError(
+                f"{100 * invalid / total:.0f} % of the slopes are not valid, expected at most "
+                f"{100 * _MOST_INVALID:g} %: the sensor needs more light"
+            )
+        if error > 1:
+            noise = float(np.median(self.columns[1])) * self.amplitude
+            raise InputError(
+                f"the mirror does not answer: pokes of {self.amplitude:g} move slopes by no more than their "
+                f"error of {noise:.2g} px; does it follow the commands, and are they large enough?"
+            )
+
+    def refuse_saturated(self) -> None:
+        """Raise InputError where pokes moved spots to the end of their search range."""
+        total, _, at_limit = self._counts
+        if at_limit > _MOST_AT_LIMIT * total:
+            raise InputError(
+                f"amplitude = {self.amplitude:g}: pokes move {100 * at_limit / total:.0f} % of the spots to "
+                "the end of their search range; choose a smaller one"
+            )
+
+    def refuse_unsettled(self) -> None:
+        """Raise InputError where a poke does not act in the first frame as it does in the last one."""
+        columns, errors = self.columns
+        first, last = np.asarray(self._ends) / self.rounds
+        signal = (last * columns).sum()
+        noise = 2 * np.sqrt(np.square(np.where(columns, errors * columns, 0.0)).sum())
+        share = (first * columns).sum() / signal
+        if abs(share - 1) > _NOT_SETTLED + 3 * noise / signal:
+            raise InputError(
+                f"pokes act {share:.2f} times as much in the first of the frames that are averaged as in the "
+                "last one: allow more frames until they act (settle_frames)"
+            )
+
+    def _poked(self, actuator: int, amount: float) -> Floats:
+        """Return mean slopes with one actuator poked, those of the first and of the last frame, (3, 2 n).
+
+        What was not measured is NaN.
+        """
+        command = np.zeros(self._mirror.commands)
+        command[actuator] = amount
+        slopes, flags = self._mirror.slopes(command)
+        valid = (flags & np.uint8(INVALID)) == 0
+        at_limit = (flags & np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)) != 0
+        self._counts += valid.size, valid.size - np.count_nonzero(valid), np.count_nonzero(at_limit)
+        weight = np.tile(valid, 2)
+        with np.errstate(invalid="ignore"):
+            mean = (weight * slopes).sum(axis=0) / weight.sum(axis=0)
+        return np.stack([mean, *np.where(weight, slopes, np.nan)[[0, -1]]])
+
+
+def _mean(rounds: list[Floats]) -> tuple[Floats, Floats]:
+    """Return the mean over rounds, and its standard error from their scatter; NaN: not measured.
+
+    What was not measured twice is 0 with an infinite error.
+    """
+    stack = np.stack(rounds)
+    there = np.isfinite(stack)
+    count = there.sum(axis=0)
+    mean = np.where(there, stack, 0.0).sum(axis=0) / np.maximum(count, 1)
+    squares = np.square(np.where(there, stack - mean, 0.0)).sum(axis=0)
+    error = np.sqrt(squares / np.maximum(count * (count - 1), 1))
+    known = count >= _FEWEST_MEASURED
+    return np.where(known, mean, 0.0), np.where(known, error, np.inf)

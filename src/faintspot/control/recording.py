@@ -1,0 +1,114 @@
+"""Learning from what a running engine has recorded, without knowing the air."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import numbers_between
+from faintspot.control.configuration import Control
+from faintspot.control.telemetry import Telemetry, make_telemetry
+from faintspot.control.turbulence import SlopeTurbulence
+from faintspot.errors import InputError
+from faintspot.sensor.layout import Layout
+
+if TYPE_CHECKING:
+    from faintspot.io.telemetry import Telemetry as Recording
+
+Floats = NDArray[np.float64]
+
+FEWEST_FRAMES = 200
+OUTER_SCALE_M = 25.0
+WIND_SPEEDS_M_PER_S = (5.0, 10.0, 20.0)
+_ARCSEC = math.pi / 180 / 3600
+_CLOSED = 2
+
+
+def telemetry_of_recording(recording: Recording, control: Control) -> tuple[Telemetry, float]:
+    """Return open-loop slopes of the longest stretch of a recording without a gap, and its frame rate.
+
+    The loop must have been closed, with this control and an estimator that was told no prediction.
+
+    Parameters
+    ----------
+    recording : faintspot.io.Telemetry
+    control : Control
+        Whose matrix, delay and centroid gain count.
+
+    Returns
+    -------
+    Telemetry, float
+        The latter in frames a second.
+
+    Raises
+    ------
+    InputError
+        When there are no commands, as many as the control has, or no stretch that is long enough.
+    """
+    commands = recording.commands
+    if commands.shape[1] != control.commands:
+        raise InputError(
+            f"recording: expected {control.commands} commands, as the interaction matrix has, got "
+            f"{commands.shape[1]}"
+        )
+    start, stop = _longest(np.asarray(recording.frame), np.asarray(recording.loop) == _CLOSED)
+    delay, gain = control.options.delay_frames, control.options.centroid_gain
+    if stop - start < FEWEST_FRAMES + delay:
+        raise InputError(
+            f"recording: expected {FEWEST_FRAMES + delay} frames in a row with a closed loop, got "
+            f"{stop - start}"
+        )
+    part = slice(start + delay, stop)
+    invalid = ~np.tile(recording.valid[part], 2)
+    error = np.hstack([recording.standard_error_x[part], recording.standard_error_y[part]]).astype(np.float64)
+    error[invalid] = np.inf
+    if not np.isfinite(error).any():
+        raise InputError("recording: expected standard errors of slopes; give the calibration a read noise")
+    slopes = recording.slopes[part].astype(np.float64) / gain
+    held = commands[start : stop - delay].astype(np.float64) @ control.interaction.T
+    times = recording.last_row_time_ns[start:stop]
+    rate = (stop - start - 1) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
+    return make_telemetry(slopes, error / gain, held, np.zeros_like(slopes), None), rate
+
+
+def theories_of(
+    layout: Layout, frame_rate_hz: float, wind_speeds_m_per_s: Sequence[float] = WIND_SPEEDS_M_PER_S
+) -> Mapping[str, Floats]:
+    """Return what theory says of slopes without r0 and winds: as if these came from all directions alike.
+
+    Covariances for lags of 0, 1 and 2 frames, as `learn` takes them; their strength means nothing.
+
+    Raises
+    ------
+    InputError
+        When the layout does not know the size of a sub-aperture, or a speed is out of range.
+    """
+    across = int(np.ptp(layout.cells, axis=0).max()) + 1
+    side = layout.subaperture_m
+    if side is None and layout.diameter_m is not None:
+        side = layout.diameter_m / across
+    if side is None:
+        raise InputError(
+            "layout: expected subaperture_m or diameter_m, which say how fast the wind crosses a sub-aperture"
+        )
+    speeds = np.atleast_1d(numbers_between("wind_speeds_m_per_s", wind_speeds_m_per_s, 0, 200))
+    positions = layout.cells[:, ::-1].astype(np.float64) * side
+    winds = np.column_stack([speeds, np.zeros_like(speeds)])
+    scale = (layout.pixel_scale_arcsec or 1.0) * _ARCSEC
+    turbulence = SlopeTurbulence(positions, side, scale, 0.15, OUTER_SCALE_M, np.ones(len(speeds)), winds)
+    return {"winds from anywhere": turbulence.from_anywhere().lagged_px2(1 / frame_rate_hz)}
+
+
+def _longest(frame: NDArray[np.int64], closed: NDArray[np.bool_]) -> tuple[int, int]:
+    """Return first frame, and the one after the last, of the longest run of consecutive closed ones."""
+    if not len(frame):
+        return 0, 0
+    ends = np.flatnonzero((np.diff(frame) != 1) | (np.diff(closed.astype(np.int8)) != 0)) + 1
+    edges = np.concatenate([[0], ends, [len(frame)]])
+    lengths = np.diff(edges) * closed[edges[:-1]]
+    longest = int(np.argmax(lengths))
+    return int(edges[longest]), int(edges[longest]) + int(lengths[longest])

@@ -1,0 +1,94 @@
+"""The light of every sub-aperture as a running mean over an engine's frames, for estimators that use it."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.kernels.compiling import Direct, compiled_with
+from faintspot.light import MeanLight
+from faintspot.realtime.live import LiveSettings
+from faintspot.realtime.prepared_settings import PreparedSettings
+
+TIME_CONSTANT_FRAMES = 1000.0
+_FEWEST_FRAMES = 100  # before the first change
+_BETWEEN_S = 0.1
+
+
+@partial(compiled_with, source=__file__)
+def add_light(flux: NDArray[np.float32], mean: NDArray[np.float64], frames: float) -> None:
+    """Take one frame's light (n,) into the mean over so many frames; what is not finite counts nothing."""
+    for s in range(flux.shape[0]):
+        if np.isfinite(flux[s]):
+            mean[s] += (flux[s] - mean[s]) / frames
+
+
+class LightFollower:
+    """Measures the mean light, as `MeanLight` does, and sets `flux_e` when it has changed.
+
+    New tables are made in a thread of its own, as for any change of settings. Where the estimator that runs
+    does not use the light, nothing is changed.
+
+    Parameters
+    ----------
+    live : LiveSettings
+    time_constant_frames : float
+
+    Raises
+    ------
+    InputError
+        For a time constant below 1.
+    """
+
+    def __init__(
+        self, live: LiveSettings[PreparedSettings], time_constant_frames: float = TIME_CONSTANT_FRAMES
+    ) -> None:
+        self._live = live
+        self._longest = number_between("mean_light", time_constant_frames, 1)
+        self._mean = np.zeros(len(live.running.layout))
+        self._frames = 0.0
+        self._add = Direct(add_light)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="faintspot-light", daemon=True)
+        self.take(np.zeros(len(self._mean), np.float32))  # compiled now
+        self._frames = 0.0
+
+    def start(self) -> None:
+        """Follow the light from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def take(self, flux_e: NDArray[np.float32]) -> None:
+        """Take one frame's light; by the engine's thread."""
+        self._frames = min(self._frames + 1.0, self._longest)
+        self._add(flux_e, self._mean, self._frames)
+
+    def step(self) -> bool:
+        """Set the light where it has changed by more than tables distinguish; return whether it has."""
+        if self._frames < min(_FEWEST_FRAMES, self._longest):
+            return False
+        pipeline = self._live.running.pipelines[0]
+        if not pipeline.settings.estimator.uses_light:
+            return False
+        lit = pipeline.with_light(MeanLight(self._mean.copy(), self._longest))
+        if lit is pipeline:
+            return False
+        self._live.wait(self._live.propose({"flux_e": lit.settings.flux_e}))
+        return True
+
+    def _follow(self) -> None:
+        while not self._stopping.wait(_BETWEEN_S):
+            try:
+                self.step()
+            except InputError:  # settings that somebody changes at this moment: again
+                continue

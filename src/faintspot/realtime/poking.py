@@ -1,0 +1,116 @@
+"""Poking a mirror through its command stream while an engine measures."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import number_between
+from faintspot.errors import InputError
+from faintspot.realtime.shared_streams import create_stream
+from faintspot.realtime.telemetry import TelemetryReader
+
+Floats = NDArray[np.float64]
+
+_POLL_S = 5e-4
+_NO_FRAMES_S = 5.0
+_NOTICED_S = 0.5  # after which whoever drives the mirror has found a stream that is new
+
+
+class StreamedMirror:
+    """A mirror that follows NAME_commands, and an engine NAME without control that sees it.
+
+    As a context manager it leaves the mirror flat and the stream removed. It is a `PokedMirror`.
+
+    Parameters
+    ----------
+    name : str
+        The engine's.
+    commands : int
+        Of the mirror.
+    settle_frames : int
+        Frames after a command is sent that are not looked at: it acts later, and from then on.
+    frames : int
+        That are averaged then.
+
+    Raises
+    ------
+    InputError
+        When no engine of that name runs, it makes commands itself, or another process sends commands.
+    """
+
+    def __init__(self, name: str, commands: int, *, settle_frames: int = 3, frames: int = 2) -> None:
+        self.commands = int(number_between("commands", commands, 1, 100_000, integer=True))
+        self._settle = int(number_between("settle_frames", settle_frames, 1, 10_000, integer=True))
+        self._frames = int(number_between("frames", frames, 2, 100_000, integer=True))
+        self._name, self._reader = name, TelemetryReader.attach(name)
+        if self._reader.stale:
+            raise InputError(f"the engine {name} has ended; faintspot realtime run starts one")
+        if self._reader.description.get("commands"):
+            raise InputError(
+                f"the engine {name} makes commands itself; start it with faintspot realtime run --no-control"
+            )
+        reference = self._reader.description.get("reference")
+        self.reference: Floats = np.zeros(2 * len(self._reader.layout)) if reference is None else reference
+        """What the engine subtracts already, (2 n,), px."""
+        self._stream = create_stream(f"{name}_commands", (self.commands,))
+        self._send(np.zeros(self.commands))
+        time.sleep(_NOTICED_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the mirror flat, and remove the stream when it has had time to see that."""
+        self._send(np.zeros(self.commands))
+        newest = self._reader.newest
+        end = time.monotonic() + 1.0
+        while self._reader.newest < newest + 2 and time.monotonic() < end:
+            time.sleep(_POLL_S)
+        self._stream.unlink()
+        self._reader.close()
+
+    def slopes(self, command: Floats) -> tuple[Floats, NDArray[np.uint8]]:
+        """See `PokedMirror`.
+
+        Raises
+        ------
+        InputError
+            When no frames come, or the engine ends.
+        """
+        self._send(command)
+        cursor = self._reader.newest
+        after = None
+        found: list[NDArray[np.void]] = []
+        count, end = 0, time.monotonic() + _NO_FRAMES_S
+        while count < self._frames:
+            records, cursor, _ = self._reader.records_since(cursor)
+            if not len(records):
+                self._wait(end)
+                continue
+            end = time.monotonic() + _NO_FRAMES_S
+            after = int(records["frame"][0]) + self._settle if after is None else after
+            settled = records[records["frame"] >= after][: self._frames - count]
+            found.append(settled)
+            count += len(settled)
+        seen = np.concatenate(found)
+        return np.concatenate([seen["x"], seen["y"]], axis=1).astype(np.float64), seen["flags"]
+
+    def _send(self, command: Floats) -> None:
+        self._stream.write(command.astype(np.float32), frame_id=max(self._reader.newest - 1, 0))
+
+    def _wait(self, end: float) -> None:
+        if self._reader.stale:
+            raise InputError(f"the engine {self._name} has ended")
+        if time.monotonic() > end:
+            raise InputError(f"the engine {self._name} has measured no frame for {_NO_FRAMES_S:g} s")
+        time.sleep(_POLL_S)

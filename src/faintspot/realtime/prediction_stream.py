@@ -1,0 +1,121 @@
+"""Predicted slopes from another program, by a pyshmem stream: the prior of estimators that take one."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.realtime.shared_streams import lock_file, pyshmem_module
+
+_READ_S = 2e-4  # for a writer that is writing at this moment
+
+
+@dataclass(slots=True)
+class PredictionCounters:
+    """What has come; plain numbers, changed in place."""
+
+    taken: int = 0
+    """Frames that were measured around what was predicted for them."""
+    late: int = 0
+    """Frames whose prediction was not there when their first row came: their prior was 0."""
+    refused: int = 0
+    """Predictions with a mean that was not finite, or larger than any frame; the prior was 0."""
+    restarts: int = 0
+    """How often the stream was removed or made anew."""
+
+
+class PredictionStream:
+    """The stream NAME_prediction, floats: 2 n slopes, px, their 2 n variances, the number of the frame.
+
+    Slopes are all x, then all y, as the engine publishes them. Variances are for others: how wide an
+    estimator's prior is, its settings say (`prior_std_px`).
+
+    Parameters
+    ----------
+    name : str
+        The engine's.
+    prior : (1, 2, n) float32 array
+        Where to put them.
+    largest_px : float
+        Beyond which no slope is.
+
+    Raises
+    ------
+    MissingExtraError
+        Without pyshmem.
+    """
+
+    def __init__(self, name: str, prior: NDArray[np.float32], largest_px: float) -> None:
+        self._pyshmem: Any = pyshmem_module("reading predictions in shared memory")
+        self.stream, self._prior, self._largest_px = f"{name}_prediction", prior.reshape(-1), largest_px
+        self._length = 2 * self._prior.size + 1
+        self._source: Any = None
+        self.counters, self.obstacle = PredictionCounters(), "is not there"
+        self.look_after()
+
+    def fill(self, number: int) -> None:
+        """Put in the prediction for a frame, 0 where there is none; by the engine's thread."""
+        self._prior[:] = 0.0
+        source, counters = self._source, self.counters
+        if source is None or not source.count:
+            counters.late += 1
+            return
+        try:
+            values = source.read(timeout=_READ_S)
+        except Exception:  # a writer that died in the middle, a stream that was closed meanwhile
+            counters.late += 1
+            return
+        if values[-1] != number:
+            counters.late += 1
+            return
+        mean = values[: self._prior.size]
+        if not np.abs(mean).max() <= self._largest_px:
+            counters.refused += 1
+            return
+        counters.taken += 1
+        self._prior[:] = mean
+
+    def look_after(self) -> None:
+        """See whether the stream is the same, and look for one where there is none; by any other thread."""
+        source = self._source
+        try:
+            there = self._pyshmem.stat(self.stream)["instance_id"]
+        except (OSError, ValueError):
+            there = None
+        if source is not None:
+            if there == source.instance_id:
+                return
+            self.counters.restarts += 1
+            self.close()
+        if there is None:
+            self.obstacle = "is not there"
+        else:
+            self._open()
+
+    def status(self) -> dict[str, Any]:
+        """Return what there is to say, as plain values."""
+        return {"stream": self.stream, "obstacle": self.obstacle, **asdict(self.counters)}
+
+    def close(self) -> None:
+        """Let go of the stream."""
+        source, self._source = self._source, None
+        if source is not None:
+            with contextlib.suppress(Exception):
+                source.close()
+
+    def _open(self) -> None:
+        lock_file(self.stream)  # refuses a place that is not private
+        try:
+            source = self._pyshmem.open(self.stream, gpu_device=False)
+        except (OSError, ValueError) as error:
+            self.obstacle = f"cannot be opened ({' '.join(str(error).split())})"
+            return
+        if tuple(source.shape) != (self._length,) or source.dtype.kind != "f":
+            self.obstacle = f"holds {tuple(source.shape)} {source.dtype}, expected ({self._length},) floats"
+            source.close()
+            return
+        self._source, self.obstacle = source, ""

@@ -1,0 +1,105 @@
+"""What was learnt is the same after it was in a file, and goes on from any mirror without a jump."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
+
+from faintspot.control.commands import CommandLine
+from faintspot.control.configuration import Control, ControlOptions
+from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
+from faintspot.control.learnt import Learnt, Model
+from faintspot.errors import InputError
+from faintspot.settings import Settings
+
+KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
+FRAMES = telemetry(600, 0.3)
+
+
+@pytest.fixture(scope="module")
+def learnt() -> dict[str, Learnt]:
+    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES}) for kind in KINDS}
+
+
+def commands(controller: Any, line: CommandLine, frames: int = 60) -> np.ndarray:
+    sent = []
+    for slopes in FRAMES.open_loop_px[:frames]:
+        controller.update(slopes + INTERACTION @ line.acting, np.full(18, 0.3))
+        sent.append(line.latest.copy())
+    return np.array(sent)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    learnt[kind].model.save(path)
+    lines = [CommandLine(12, 2) for _ in range(2)]
+    again = Learnt(PLANT, Model.load(path, PLANT))
+    sent = [
+        commands(each.controller(line), line) for each, line in zip((learnt[kind], again), lines, strict=True)
+    ]
+    np.testing.assert_array_equal(sent[0], sent[1])
+    assert np.abs(sent[0]).max() > 0.1
+    options = ControlOptions(controller=kind, leak=PLANT.leak, gain=1.0)
+    control = Control(INTERACTION, None, options, path)
+    line = control.line()
+    engines = commands(control.controller(line), line)
+    expected = sent[0]
+    if kind == "modal":  # not guarded: the gains are in the compiled integrator's matrix
+        other = CommandLine(12, 2)
+        expected = commands(learnt[kind].model.controller(PLANT, other), other)
+    np.testing.assert_allclose(engines, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Learnt]) -> None:
+    """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
+    line = CommandLine(12, 2)
+    controller = learnt[kind].controller(line)
+    commands(controller, line)
+    held = -PLANT.reconstructor.clean @ COVARIANCES[0] @ np.random.default_rng(2).standard_normal(18)
+    line.hold(held)
+    controller.begin()
+    controller.update(np.zeros(18), np.full(18, 0.3))
+    assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
+
+
+def test_the_prior_is_as_wide_as_the_filter_is_sure(learnt: dict[str, Learnt]) -> None:
+    model = learnt["kalman"].model
+    control = Control(INTERACTION, None, ControlOptions(controller="kalman"), model)
+    assert control.prediction == "controller"
+    std = model.expected_std_px
+    assert std is not None
+    found = control.settings(Settings("map")).prior_std_px
+    np.testing.assert_allclose(found, np.sqrt((std[:9] ** 2 + std[9:] ** 2) / 2))
+    assert control.settings(Settings("brightest")) == Settings("brightest")
+    assert Control(INTERACTION).settings(Settings("map")) == Settings("map")
+
+
+def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    model = learnt["kalman"].model
+
+    def refused(message: str, options: ControlOptions, file: Any = path) -> None:
+        with pytest.raises(InputError) as caught:
+            Control(INTERACTION, None, options, file)
+        assert message in str(caught.value)
+
+    kalman = ControlOptions(controller="kalman")
+    refused("model: expected a file with what predictive Kalman filter has learnt, got none", kalman, None)
+    model.save(path)
+    refused("expected what 'polc' has learnt, got that of 'kalman'", ControlOptions(controller="polc"))
+    refused('prediction = "stream"', ControlOptions(controller="kalman", prediction="stream"))
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "first": arrays["first"][:4]})
+    refused("first: expected shape (18, 18), got (4, 18)", kalman)
+    np.savez(path, **{**arrays, "variance_px2": np.full(18, np.nan)})
+    refused("variance_px2: expected finite numbers", kalman)
+    np.savez(path, **{**arrays, "kind": "pid"})
+    refused("kind = 'pid': expected one of", kalman)
+    np.savez(path, kind="kalman")
+    refused("model.npz", kalman)

@@ -1,0 +1,120 @@
+"""Learning from a recording: its open-loop slopes are those that the loop had, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests.control.control_cases import CELLS, FRAME_S, INTERACTION, telemetry
+
+from faintspot import configuration as configuration_file
+from faintspot.cli import realtime_learn
+from faintspot.control.compiled import CompiledIntegrator
+from faintspot.control.configuration import Control, ControlOptions, load_control, save_control
+from faintspot.control.recording import telemetry_of_recording, theories_of
+from faintspot.errors import InputError
+from faintspot.sensor.layout import Layout
+
+GAIN = 0.8
+OPTIONS = ControlOptions(gain=0.3, centroid_gain=GAIN)
+CONTROL = Control(INTERACTION, None, OPTIONS)
+LAYOUT = Layout.grid((3, 3), pixels=8)
+OPEN_LOOP = telemetry(700, 0.3).open_loop_px
+
+
+def recording(frames: int = 700) -> Any:
+    """A closed loop on known open-loop slopes; frame 100 is lost, until frame 40 the loop is open."""
+    line = CONTROL.line()
+    integrator = CONTROL.controller(line)
+    assert isinstance(integrator, CompiledIntegrator)
+    slopes, sent = [], []
+    for frame, open_loop in enumerate(OPEN_LOOP[:frames]):
+        seen = open_loop + INTERACTION @ line.acting
+        slopes.append(GAIN * seen)
+        if frame < 40:
+            line.put(line.latest)
+        else:
+            integrator.update(seen, np.ones(18))
+        sent.append(line.latest.copy())
+    kept = np.delete(np.arange(frames), 100)
+    slopes_px = np.array(slopes, np.float32)[kept]
+    error = np.full((len(kept), 9), 0.3 * GAIN, np.float32)
+    return SimpleNamespace(
+        frame=kept,
+        loop=np.where(kept < 40, 1, 2),
+        commands=np.array(sent, np.float32)[kept],
+        slopes=slopes_px,
+        valid=np.ones((len(kept), 9), bool),
+        standard_error_x=error,
+        standard_error_y=error,
+        last_row_time_ns=(kept * FRAME_S * 1e9).astype(np.int64),
+    )
+
+
+def test_open_loop_slopes_of_the_longest_stretch() -> None:
+    night = recording()
+    night.valid[300, 4] = False
+    found, rate = telemetry_of_recording(night, CONTROL)
+    assert rate == pytest.approx(1 / FRAME_S, rel=1e-3)
+    first = 101 + 2  # after the gap, and the delay
+    np.testing.assert_allclose(found.open_loop_px, OPEN_LOOP[first:], atol=1e-4)
+    lost = np.zeros((597, 18), bool)
+    lost[301 - first, [4, 13]] = True
+    np.testing.assert_array_equal(np.isinf(found.variance_px2), lost)
+    np.testing.assert_allclose(found.variance_px2[~lost], 0.09, rtol=1e-5)
+    np.testing.assert_array_equal(found.trust, ~lost)
+
+
+def test_what_is_refused() -> None:
+    for changes, message in (
+        ({"commands": np.zeros((699, 0))}, "expected 12 commands, as the interaction matrix has, got 0"),
+        ({"loop": np.ones(699)}, "expected 202 frames in a row with a closed loop, got 0"),
+        (
+            {"standard_error_x": np.full((699, 9), np.inf), "standard_error_y": np.full((699, 9), np.inf)},
+            "read noise",
+        ),
+    ):
+        night = recording()
+        vars(night).update(changes)
+        with pytest.raises(InputError, match=message):
+            telemetry_of_recording(night, CONTROL)
+    with pytest.raises(InputError, match="expected subaperture_m or diameter_m"):
+        theories_of(LAYOUT, 250.0)
+
+
+def test_theory_of_a_layout() -> None:
+    by_side, by_diameter = (
+        theories_of(Layout.grid((3, 3), pixels=8, **size), 250.0)["winds from anywhere"]
+        for size in ({"subaperture_m": 0.6}, {"diameter_m": 1.8})
+    )
+    np.testing.assert_allclose(by_side, by_diameter)
+    assert by_side.shape == (3, 18, 18)
+    assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0
+    assert len(CELLS) == 9
+
+
+def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "faintspot.toml"
+    configuration_file.save(path, Layout.grid((3, 3), pixels=8, subaperture_m=0.6))
+    np.save(tmp_path / "m.npy", INTERACTION)
+
+    def learn(*options: str) -> Any:
+        arguments = ["night.zarr", "--config", str(path), *options]
+        return CliRunner().invoke(realtime_learn.learn, arguments, standalone_mode=False)
+
+    assert "expected a table [control]" in str(learn().exception)
+    save_control(path, interaction_matrix="m.npy", centroid_gain=GAIN)
+    assert "expected numbers such as 5,10,20" in str(learn("--wind-speeds", "fast").exception)
+    pytest.importorskip("zarr")
+    monkeypatch.setattr("faintspot.io.read_telemetry", lambda *_, **__: recording())
+    result = learn("--control", "kalman", "--wind-speeds", "12,20")
+    assert result.exception is None, result.exception
+    assert "597 frames at 250 a second: kalman leaves 0." in result.output
+    control = load_control(path)
+    assert control is not None
+    assert (control.options.controller, control.prediction) == ("kalman", "controller")
+    assert control.model.kind == "kalman"

@@ -1,0 +1,154 @@
+"""What estimators are told: a prior, from the engine's controller or from outside, and the mean light."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+import faintspot as fs
+from faintspot import configuration as configuration_file
+from faintspot.control.configuration import Control, ControlOptions, load_control
+from faintspot.loop import LoopArm, simulate_loop
+from faintspot.loop.control import learnt_control
+from faintspot.loop.engine_files import write_engine_files
+from faintspot.realtime.prediction_stream import PredictionStream
+
+pytest.importorskip("hcipy")
+pyshmem = pytest.importorskip("pyshmem")
+
+from tests.realtime.closed_loop import CONFIGURATION, Sky, make_engine  # noqa: E402
+
+FRAMES = 40
+SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)
+
+
+@pytest.fixture
+def sky() -> Iterator[Sky]:
+    made = Sky(f"fs_test_{uuid4().hex[:12]}")
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
+    folder = tmp_path_factory.mktemp("bench")
+    configuration_file.save(folder / "faintspot.toml", SETTINGS)
+    path = write_engine_files(CONFIGURATION, folder)
+    control = load_control(path)
+    assert control is not None
+    return path, control
+
+
+def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, files: tuple[Path, Control]) -> None:
+    """Maximum a posteriori around what it predicts, as wide as it is sure; frame by frame."""
+    path, known = files
+    arm = LoopArm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
+    run = CONFIGURATION.replace("control", telemetry_frames=300).replace(
+        "run", frames=FRAMES, settle_frames=10
+    )
+    told, learnt = learnt_control(run, arm, run.run.seed)
+    assert learnt is not None
+    record = simulate_loop(run, [arm])
+    options = ControlOptions(controller="kalman", leak=known.options.leak)
+    control = Control(known.interaction, known.reference, options, learnt.model)
+    settings = control.settings(SETTINGS)
+    np.testing.assert_allclose(settings.prior_std_px, told.settings.prior_std_px)
+    sky.start(make_engine(sky.name, path, control, settings=settings))
+    sky.loop.close()
+    strehl = sky.frames(FRAMES)
+    records = sky.records
+    np.testing.assert_allclose(np.hstack([records["x"], records["y"]]), record.slopes_px, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(records["commands"][: FRAMES - 2], record.commands[2:], rtol=0, atol=0.5)
+    np.testing.assert_allclose(strehl, record.strehl, rtol=0, atol=1e-3)
+    assert strehl[20:].mean() > 0.3
+
+
+def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> None:
+    """Slopes are those of the pipeline with that prior; late, missing, impossible ones are counted, as 0."""
+    path, known = files
+    control = replace(known, options=known.options.replaced({"prediction": "stream"}))
+    engine = make_engine(sky.name, path, control)
+    sky.start(engine)
+    prediction = engine._prediction
+    assert prediction is not None
+    seen = [sky.frame()]
+    assert engine.status()["prediction"]["obstacle"] == "is not there"
+    n = 36
+    wrong = pyshmem.create(f"{sky.name}_prediction", shape=(3,), dtype=np.float64)
+    sky.until(lambda: "holds (3,) float64, expected (145,)" in prediction.obstacle)
+    wrong.unlink()
+    sky.until(lambda: prediction.obstacle == "is not there")
+    stream = pyshmem.create(f"{sky.name}_prediction", shape=(4 * n + 1,), dtype=np.float64)
+    sky.until(lambda: not prediction.obstacle)
+    rng = np.random.default_rng(3)
+    priors, frames = [np.zeros(2 * n)], [sky.pixels]
+    for number, value in ((1, 0.0), (2, 0.0), (4, 0.0), (4, 1e9), (5, np.nan)):
+        mean = rng.standard_normal(2 * n)
+        mean[3] += value
+        stream.write(np.concatenate([mean, np.ones(2 * n), [number]]), frame_id=number)
+        seen.append(sky.frame())
+        frames.append(sky.pixels)
+        priors.append(mean if number == len(seen) - 1 and value == 0 else np.zeros(2 * n))
+    layout, settings, calibration, psf, _ = configuration_file.load_all(path)
+    pipeline = fs.SlopePipeline(layout, settings, calibration, control.reference, psf=psf)
+    for record, frame, prior in zip(sky.records, frames, priors, strict=True):
+        expected = pipeline(frame, prior.astype(np.float32))
+        np.testing.assert_array_equal(np.concatenate([record["x"], record["y"]]), expected.vector)
+    counters = engine.status()["prediction"]
+    assert (counters["taken"], counters["late"], counters["refused"]) == (2, 2, 2)
+    stream.unlink()
+
+
+def test_a_prediction_s_writer_may_die() -> None:
+    """It looks for the stream again, and never raises."""
+    name = f"fs_test_{uuid4().hex[:12]}"
+    prior = np.ones((1, 2, 2), np.float32)
+    reader = PredictionStream(name, prior, 10.0)
+    reader.fill(0)
+    assert not prior.any()
+    for _ in range(2):
+        stream = pyshmem.create(f"{name}_prediction", shape=(9,), dtype=np.float32)
+        reader.look_after()
+        reader.fill(0)  # nothing was written yet
+        stream.write(np.arange(9.0, dtype=np.float32), frame_id=8)
+        reader.fill(8)
+        np.testing.assert_array_equal(prior.reshape(-1), [0.0, 1.0, 2.0, 3.0])
+        stream.unlink()
+        reader.look_after()
+        reader.fill(8)
+        assert not prior.any()
+    assert reader.counters.restarts == 2
+    reader.close()
+
+
+def test_the_mean_light_is_told(sky: Sky, files: tuple[Path, Control]) -> None:
+    """The star fades by three quarters: the settings follow."""
+    path, control = files
+    sky.start(make_engine(sky.name, path, control, mean_light=20.0))
+    engine = sky.running.engine
+    sky.frames(25)
+    sky.until(lambda: engine.live.change_number > 0 or sky.frame() is None)
+    told = np.mean(engine.live.settings.flux_e)
+    assert 60 < told < 250  # of 200 where a window has them all; speckled spots have less in theirs
+    sky.telescope.order({"photons": 50.0})
+    sky.frames(60)
+    sky.until(lambda: np.mean(engine.live.settings.flux_e) < 0.4 * told or sky.frame() is None)
+
+
+def test_estimators_that_do_not_use_the_light_are_left_alone(
+    sky: Sky, files: tuple[Path, Control], tmp_path: Path
+) -> None:
+    path = tmp_path / "faintspot.toml"
+    path.write_text(files[0].read_text())
+    (tmp_path / "faintspot.psf.npz").write_bytes((files[0].parent / "faintspot.psf.npz").read_bytes())
+    engine = make_engine(sky.name, path, None, settings=fs.Settings("brightest"), mean_light=5.0)
+    sky.start(engine)
+    sky.frames(10)
+    time.sleep(0.3)
+    assert engine.live.change_number == 0
