@@ -28,7 +28,7 @@ class Board:
         self._messages.pop(kind, None)
 
     async def newer(self, seen: int) -> list[tuple[int, bytes]]:
-        """Wait for messages that were posted after number `seen`; return them with their numbers, in order."""
+        """Wait for messages posted after number `seen`; return them with their numbers, in order."""
         while not (messages := sorted(item for item in self._messages.values() if item[0] > seen)):
             await self._changed.wait()
         return messages

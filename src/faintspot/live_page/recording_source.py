@@ -72,9 +72,7 @@ class RecordingSource:
             now, moved = time.monotonic(), self._moved
             self._moved = False
             if self._playing:
-                self._position_s = min(
-                    self._position_s + self._speed * (now - self._looked_s), self.length_s
-                )
+                self._position_s = min(self._position_s + self._speed * (now - self._looked_s), self.length_s)
                 self._playing = self._position_s < self.length_s
             self._looked_s = now
             end = int(np.searchsorted(self._times_s, self._position_s, side="right"))
@@ -82,7 +80,10 @@ class RecordingSource:
                 self._next, self._shown_picture = max(0, end - 1), -1
             first, self._next = max(self._next, end - _MOST_RECORDS), end
         return Batch(
-            self._records(first, end), picture=self._picture(end), changes=self._changes(end, moved), anew=moved
+            self._records(first, end),
+            picture=self._picture(end),
+            changes=self._changes(end, moved),
+            anew=moved,
         )
 
     def place(self) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class LiveServer:
             raise InputError(
                 f"{address}:{port}: cannot listen there ({error.strerror}); choose another --port"
             ) from None
-        self._address, self.port = address, int( sockets[0].getsockname()[1])
+        self._address, self.port = address, int(sockets[0].getsockname()[1])
         self._http = HTTPServer(
             Application(
                 [
@@ -275,4 +275,3 @@ def _parsed(message: str | bytes) -> dict[str, Any]:
     if not isinstance(request, dict) or not isinstance(request.get("do"), str):
         raise InputError('expected a JSON object with "do"')
     return request
-

@@ -56,7 +56,9 @@ def serve_engine(
         server = LiveServer(source, wishes, Access(address), address, port)
 
         def told(kind: str, values: dict[str, Any]) -> None:
-            server.tell(kind, {**values, "recording": wishes.recording.status()} if kind == "status" else values)
+            server.tell(
+                kind, {**values, "recording": wishes.recording.status()} if kind == "status" else values
+            )
 
         poller = StatusPoller(name, told)
         try:

@@ -100,5 +100,7 @@ def _as_text(value: Any) -> str:
     if len(value) <= _FEW:
         return ",".join(_as_text(item) for item in value)
     numbers = [item for item in value if isinstance(item, int | float)]
-    ends = f"{_as_text(min(numbers))} to {_as_text(max(numbers))}" if numbers else f"{len(distinct)} different"
+    ends = (
+        f"{_as_text(min(numbers))} to {_as_text(max(numbers))}" if numbers else f"{len(distinct)} different"
+    )
     return f"({len(value)} values, {ends})"

@@ -76,7 +76,9 @@ class EngineWishes:
         if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
             raise InputError("changes: expected a list of NAME=VALUE")
         if len(texts) > _MOST_CHANGES or not isinstance(where, str):
-            raise InputError(f"changes: expected at most {_MOST_CHANGES}, and sub-apertures such as 4,5,10-20")
+            raise InputError(
+                f"changes: expected at most {_MOST_CHANGES}, and sub-apertures such as 4,5,10-20"
+            )
         changes = parse_changes(texts)
         places = parse_subapertures(where) if where.strip() else None
         reply = self._ask("set", changes=changes, where=places)

@@ -3,6 +3,7 @@
 import { cleared, ink, ticks } from "./drawing.js";
 import { inWords } from "./message.js";
 
+const SHORT = new Intl.NumberFormat("en", { notation: "compact" });
 const LEFT = 46, BOTTOM = 20, TOP = 6, RIGHT = 8;
 
 /** Axes with a grid; return functions from values to places. */
@@ -29,7 +30,7 @@ function axes(canvas, low, high, yTicks) {
 function yTicksOf(low, high, logarithmic) {
   if (!logarithmic) return ticks(low, high, 3).map((value) => [value, inWords(Number(value.toPrecision(6)))]);
   const values = [];
-  for (let power = Math.ceil(low - 1e-9); power <= high; power++) values.push([power, inWords(10 ** power)]);
+  for (let power = Math.ceil(low - 1e-9); power <= high; power++) values.push([power, SHORT.format(10 ** power)]);
   return values;
 }
 
@@ -102,7 +103,7 @@ export function drawHistogram(canvas, { from_us: edges, counts }, marks) {
   for (let power = Math.ceil(low); power <= high; power++) {
     for (const factor of high - low < 1.6 ? [1, 2, 5] : [1]) {
       const value = factor * 10 ** power;
-      if (Math.log10(value) <= high) context.fillText(`${inWords(value)} µs`, x(value), height - 5);
+      if (Math.log10(value) <= high) context.fillText(`${SHORT.format(value)} µs`, x(value), height - 5);
     }
   }
   context.strokeStyle = ink.second;

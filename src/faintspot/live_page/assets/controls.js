@@ -22,6 +22,8 @@ export class Controls {
     byId("settings-form").addEventListener("submit", (event) => this.set(event));
     byId("settings-form").addEventListener("reset", () => setTimeout(() => this.settingsEdited()));
     byId("settings").addEventListener("input", () => this.settingsEdited());
+    byId("explain").addEventListener("change", (event) =>
+      byId("settings").classList.toggle("explained", event.currentTarget.checked));
     this.onSubmit("interleave-form", "interleave-answer", "interleave", () => ({
       arms: byId("arms-text").value.trim(), every: Number(byId("every").value) }));
     this.onSubmit("record-form", "record-answer", "record", () => ({ file: byId("file").value.trim() }));
@@ -83,8 +85,9 @@ export class Controls {
     Object.assign(input, { id, name, value });
     input.dataset.now = value;
     input.setAttribute("aria-describedby", `${id}-help ${id}-error`);
-    const help = element("p", { className: "soft", id: `${id}-help`, textContent: meaning });
-    if (allowed) help.append(` ${allowed}.`);
+    const help = element("p", { className: "soft", id: `${id}-help` }, [
+      element("span", { className: "meaning", textContent: `${meaning.replaceAll("`", "")} ` }),
+      choices.length ? "" : allowed]);
     const error = element("p", { className: "error", id: `${id}-error` });
     error.setAttribute("role", "alert");
     return element("div", {}, [element("label", { htmlFor: id, textContent: name }), input, error, help]);

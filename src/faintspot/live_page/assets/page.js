@@ -154,10 +154,10 @@ function showSlopes(values, arrays, where) {
     [x, y] = [x.map((value) => value - tip), y.map((value) => value - tilt)];
   }
   const lengths = Array.from(x, (value, i) => Math.hypot(value, y[i])).filter((_, i) => used[i]).sort((a, b) => a - b);
-  const wanted = roundUp(lengths[Math.floor(0.95 * lengths.length)] || reach);
-  if (wanted > reach || wanted < reach / 2.5) reach = wanted;
+  const wanted = roundUp(lengths[Math.floor(0.9 * lengths.length)] || reach);
+  if (wanted > 1.5 * reach || wanted < reach / 2.1) reach = wanted;
   drawArrows(byId("slopes"), where, x, y, flags, invalid, reach);
-  say("slopes-caption", `${values.frame}: half a window is ${inWords(reach)} px`);
+  say("slopes-caption", `${values.frame}: half a window is ${inWords(reach, 2)} px`);
 
   const light = arrays.flux.data, lit = Array.from(light).filter((_, i) => used[i]);
   const low = Math.min(0, ...lit), high = Math.max(...lit, 1);
@@ -175,7 +175,7 @@ function showSlopes(values, arrays, where) {
 
 function roundUp(value) {
   const power = 10 ** Math.floor(Math.log10(Math.max(value, 1e-4)));
-  return [1, 2, 5, 10].find((factor) => factor * power >= value) * power;
+  return [1, 1.5, 2, 3, 5, 7, 10].find((factor) => factor * power >= value) * power;
 }
 
 function colourBar(id, [low, high], unit) {
