@@ -1,8 +1,8 @@
 """What the page is sent: values as JSON and arrays behind them, in one binary message.
 
-4 bytes   length of the JSON text, little-endian
-text      {"kind": ..., "values": {...}, "arrays": {name: [type, shape, offset]}}, padded to 8 bytes
-arrays    one after the other, each padded to 8 bytes; offsets count from here
+Four bytes with the length of the JSON text, little-endian; the text, padded to eight bytes:
+{"kind": ..., "values": {...}, "arrays": {name: [type, shape, offset]}}; the arrays, each padded to eight
+bytes; offsets count from the first.
 """
 
 from __future__ import annotations

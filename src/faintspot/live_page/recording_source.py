@@ -79,12 +79,8 @@ class RecordingSource:
             if moved:
                 self._next, self._shown_picture = max(0, end - 1), -1
             first, self._next = max(self._next, end - _MOST_RECORDS), end
-        return Batch(
-            self._records(first, end),
-            picture=self._picture(end),
-            changes=self._changes(end, moved),
-            anew=moved,
-        )
+        picture, changes = self._picture(end), self._changes(end, moved)
+        return Batch(self._records(first, end), picture=picture, changes=changes, anew=moved)
 
     def place(self) -> dict[str, Any]:
         """Say which moment is shown."""
@@ -103,7 +99,7 @@ class RecordingSource:
     def close(self) -> None:
         """Nothing is held."""
 
-    # What clients may ask for --------------------------------------------------------------------------------
+    # What clients may ask for -------------------------------------------------------------------------------
 
     def known(self) -> Mapping[str, Wish]:
         """Return the functions."""
@@ -129,7 +125,7 @@ class RecordingSource:
                 self._playing = playing
         return {}
 
-    # Reading -------------------------------------------------------------------------------------------------
+    # Reading ------------------------------------------------------------------------------------------------
 
     def _records(self, first: int, end: int) -> NDArray[Any]:
         """Return the records of frames `first` to `end`, in order of the store."""

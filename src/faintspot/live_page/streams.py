@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ class NewestOfStream:
     def __init__(self, name: str) -> None:
         self.name = name
         self._pyshmem = pyshmem_module("reading streams in shared memory")
-        self._stream = None
+        self._stream: Any = None
         self._next_look_s = 0.0
         self._seen = 0
 
