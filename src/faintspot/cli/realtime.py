@@ -39,6 +39,7 @@ for each in (
     realtime_control.top,
     realtime_control.get,
     realtime_control.set_settings,
+    realtime_control.interleave,
     realtime_control.stop_engine,
     realtime_modules.modules,
     realtime_modules.load,

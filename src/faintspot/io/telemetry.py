@@ -181,82 +181,6 @@ class TelemetryStore:
         self.frames, self.images = frames, images_there
 
 
-class StoredTelemetry:
-    """A store of telemetry that is read in parts, also while it is still written.
-
-    Parameters
-    ----------
-    path : path
-        The Zarr store.
-
-    Attributes
-    ----------
-    path : Path
-    attributes : dict
-        As `Telemetry.attributes`.
-    changes : list of dict
-        As `Telemetry.changes`.
-    frames, images : int
-        That are whole in the store.
-
-    Raises
-    ------
-    InputError
-        When it is not a store of telemetry, or damaged.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self.path = store = Path(path)
-        if not store.exists():
-            raise InputError(f"{store}: no such file or directory")
-        try:
-            attributes: dict[str, Any] = json.loads((store / "zarr.json").read_text(encoding="utf-8"))[
-                "attributes"
-            ]
-            known = attributes["format"] == FORMAT and attributes["version"] == 1
-        except (OSError, ValueError, KeyError, TypeError):
-            known = False
-        if not (known and is_store(store)):
-            raise InputError(
-                f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
-            )
-        try:
-            group: Any = zarr.open_group(str(store), mode="r")
-            self._arrays: dict[str, Any] = {name: group[name] for name in _ARRAYS}
-            self.frames, self.images = int(attributes[_FRAMES]), int(attributes[_IMAGES])
-            self.changes: list[dict[str, Any]] = attributes.pop("changes")
-            self.attributes = attributes
-            for name, array in self._arrays.items():
-                count = self.images if self._is_of_images(name) else self.frames
-                if count > array.shape[0]:
-                    raise ValueError(f"{name}: expected {count}, found {array.shape[0]}")
-        except Exception as error:  # a broken store makes zarr raise many things
-            raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
-
-    def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Return items `start` to `stop` of an array, by its name in `Telemetry`.
-
-        Raises
-        ------
-        InputError
-            When the store is damaged there.
-        """
-        return read_items(self.path, self._arrays[name], start, stop, whole=False)
-
-    def frames_together(self) -> int:
-        """Return how many frames lie in one chunk of slopes, which is read as a whole."""
-        return int(self._arrays["x"].chunks[0])
-
-    def _is_of_images(self, name: str) -> bool:
-        return _dimensions(name, self._arrays[name].ndim)[0] == "image"
-
-    def all(self, images: bool = True) -> Telemetry:
-        """Return everything; without images there are none."""
-        ends = {True: self.images if images else 0, False: self.frames}
-        arrays = {name: self.read(name, 0, ends[self._is_of_images(name)]) for name in _ARRAYS}
-        return Telemetry(**arrays, changes=self.changes, attributes=self.attributes)
-
-
 def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     """Read what `faintspot realtime record` has written, also while it is still writing.
 
@@ -276,7 +200,53 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     InputError
         When it is not a store of telemetry, or damaged.
     """
-    return StoredTelemetry(path).all(images)
+    store = Path(path)
+    attributes = attributes_of(store)
+    try:
+        group: Any = zarr.open_group(str(store), mode="r")
+        finished = {"frame": int(attributes[_FRAMES]), "image": int(attributes[_IMAGES]) if images else 0}
+        arrays = {}
+        for name in _ARRAYS:
+            array = group[name]
+            count = finished[_dimensions(name, array.ndim)[0]]
+            if count > array.shape[0]:
+                raise ValueError(f"{name}: expected {count}, found {array.shape[0]}")
+            arrays[name] = read_items(store, array, 0, count, whole=False)
+        changes = attributes.pop("changes")
+    except InputError:
+        raise
+    except Exception as error:  # a broken store makes zarr raise many things
+        raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
+    return Telemetry(**arrays, changes=changes, attributes=attributes)
+
+
+def attributes_of(store: Path) -> dict[str, Any]:
+    """Return what a store of telemetry says of itself.
+
+    Raises
+    ------
+    InputError
+        When it is none.
+    """
+    if not store.exists():
+        raise InputError(f"{store}: no such file or directory")
+    try:
+        attributes: dict[str, Any] = json.loads((store / "zarr.json").read_text(encoding="utf-8"))[
+            "attributes"
+        ]
+        known = attributes["format"] == FORMAT and attributes["version"] == 1
+    except (OSError, ValueError, KeyError, TypeError):
+        known = False
+    if not (known and is_store(store)):
+        raise InputError(
+            f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
+        )
+    return attributes
+
+
+def finished_of(attributes: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many frames and images are whole in a store with these attributes."""
+    return int(attributes[_FRAMES]), int(attributes[_IMAGES])
 
 
 def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, Any]) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.live_page.batch import Batch, Floats
+from faintspot.realtime.interleaving import FIRST_ARM, arms_after
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
 
 STRIP_S = 30.0
@@ -18,6 +19,7 @@ STRIP_S = 30.0
 FRAMES_S = 60.0
 """What percentiles, the histogram and the arms' figures are of."""
 _MOST_FRAMES = 1 << 17  # also of cameras that are very fast
+_MOST_CHANGES = 20  # that are kept to be shown
 _MEAN_FRAMES = 500  # over which a sub-aperture's mean slope is taken, about which the rms is
 _STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
 """A row of the strip charts: what one look at the telemetry gave."""
@@ -43,7 +45,7 @@ class Gathered:
     """
 
     def __init__(self, arms: list[str]) -> None:
-        self.arms = arms
+        self.arms = list(arms)
         self.newest: NDArray[Any] | None = None
         """Record of the newest frame."""
         self.changes: list[dict[str, Any]] = []
@@ -52,13 +54,17 @@ class Gathered:
         self.commands: Floats | None = None
         self._strip: deque[tuple[float, ...]] = deque()
         self._frames: deque[Floats] = deque()
+        self._first_arm = 0  # of the interleaving that runs
         self._means: dict[int, Floats] = {}
         self._truth = (np.nan, np.nan)
         self._last: NDArray[Any] | None = None  # records of the look before
 
     def add(self, batch: Batch) -> None:
         """Take in what came."""
-        self.changes = (self.changes + batch.changes)[-20:]
+        self.changes = (self.changes + batch.changes)[-_MOST_CHANGES:]
+        self.arms = arms_after(self.arms, batch.changes)
+        for change in batch.changes:
+            self._first_arm = change["changes"].get(FIRST_ARM, self._first_arm)
         self.missed += batch.missed
         if batch.commands is not None:
             self.commands = batch.commands
@@ -131,7 +137,8 @@ class Gathered:
         }
 
     def arms_compared(self, frames: Floats) -> list[dict[str, Any]]:
-        """Return the figures of each arm that had a turn, with errors; empty where there is only one."""
+        """Return the figures of the arms in turn now, with errors; empty where there is only one."""
+        frames = frames[frames[:, _FRAME.index("arm")] >= self._first_arm]
         arm = frames[:, _FRAME.index("arm")].astype(np.int64)
         present = np.unique(arm)
         if len(present) < 2:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
-from faintspot.io.telemetry import StoredTelemetry
+from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page.batch import Batch, Picture
 from faintspot.live_page.wishes import Wish
 from faintspot.realtime.telemetry_segment import record_type
@@ -129,7 +129,7 @@ class RecordingSource:
 
     def _records(self, first: int, end: int) -> NDArray[Any]:
         """Return the records of frames `first` to `end`, in order of the store."""
-        together = self._store.frames_together()
+        together = self._store.frames_together
         parts = [np.empty(0, self._type)]
         for number in range(first // together, -(-end // together)):
             begin = number * together

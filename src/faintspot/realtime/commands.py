@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.module_commands import module_commands
 
-LENGTHY = ("set", "load", "swap", "unload")
+LENGTHY = ("set", "interleave", "load", "swap", "unload")
 """Commands that make something anew, which may compile: other commands are answered meanwhile."""
+_USUAL_TURN = 50  # frames
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, stop, and those for modules."""
+    """Return the commands: status, get, set, interleave, stop, and those for modules."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return engine.status()
@@ -35,9 +37,17 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
             raise
         return {"frame": engine.live.wait(proposed, _EFFECT_TIMEOUT_S)}
 
+    def interleave(fields: dict[str, Any]) -> Mapping[str, Any]:
+        arms, every = fields.get("arms"), fields.get("every", _USUAL_TURN)
+        if not isinstance(arms, str) or not arms:
+            raise InputError(f"arms = {arms!r:.80}: expected a text such as none,tv")
+        change = engine.interleave(arms, int(number_between("every", every, 1, integer=True)))
+        return {"frame": engine.live.wait(change, _EFFECT_TIMEOUT_S)}
+
     def stop(fields: dict[str, Any]) -> Mapping[str, Any]:
         engine.stop()
         return {}
 
     own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
+    own["interleave"] = interleave
     return own | module_commands(engine.modules)

@@ -65,6 +65,8 @@ class PreparedSettings:
         One for every arm.
     settings : Settings
         Those that the arms' own changes are added to.
+    interleaving : Interleaving
+        Whose arms they are.
     modules : mapping of str to Module
         In place of built-in stages, by stage.
     workers : Workers, optional
@@ -81,11 +83,12 @@ class PreparedSettings:
         self,
         pipelines: Sequence[SlopePipeline],
         settings: Settings,
+        interleaving: Interleaving,
         modules: Mapping[str, Module],
         workers: Workers | None,
         budget_s: float,
     ) -> None:
-        self.settings, self.layout = settings, pipelines[0].layout
+        self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
         self._pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
         own = [stages_of(pipeline, modules) for pipeline in self._pipelines]
         self._modular = [
@@ -151,7 +154,9 @@ class SettingsPreparer:
         workers: Workers | None,
         budget_s: float,
     ) -> None:
-        self.make_pipeline, self._interleaving = make_pipeline, interleaving
+        self.make_pipeline = make_pipeline
+        self.interleaving = interleaving
+        """In all that is prepared from now on."""
         self._workers, self._budget_s = workers, budget_s
         self.ring: PixelRing | None = None
         """Whose frames are being measured, if any."""
@@ -169,7 +174,9 @@ class SettingsPreparer:
         pipelines = [self.make_pipeline(each) for each in self.of_arms(settings)]
         for pipeline in pipelines:
             check_real_time(pipeline)
-        prepared = PreparedSettings(pipelines, settings, self.modules, self._workers, self._budget_s)
+        prepared = PreparedSettings(
+            pipelines, settings, self.interleaving, self.modules, self._workers, self._budget_s
+        )
         ring = self.ring
         if ring is not None:
             prepared.paths(ring)
@@ -177,7 +184,7 @@ class SettingsPreparer:
 
     def of_arms(self, settings: Settings) -> list[Settings]:
         """Return the settings of every arm."""
-        return [arm.of(settings) for arm in self._interleaving.arms]
+        return [arm.of(settings) for arm in self.interleaving.arms]
 
 
 class _WritableMemory:

@@ -4,6 +4,7 @@ import { cleared, ink, ticks } from "./drawing.js";
 import { inWords } from "./message.js";
 
 const SHORT = new Intl.NumberFormat("en", { notation: "compact" });
+const inTime = (us) => us < 1e3 ? `${inWords(us)} µs` : us < 1e6 ? `${inWords(us / 1e3)} ms` : `${inWords(us / 1e6)} s`;
 const LEFT = 46, BOTTOM = 20, TOP = 6, RIGHT = 8;
 
 /** Axes with a grid; return functions from values to places. */
@@ -27,10 +28,10 @@ function axes(canvas, low, high, yTicks) {
   return { context, width, height, y };
 }
 
-function yTicksOf(low, high, logarithmic) {
+function yTicksOf(low, high, logarithmic, inWordsOf = SHORT.format) {
   if (!logarithmic) return ticks(low, high, 3).map((value) => [value, inWords(Number(value.toPrecision(6)))]);
   const values = [];
-  for (let power = Math.ceil(low - 1e-9); power <= high; power++) values.push([power, SHORT.format(10 ** power)]);
+  for (let power = Math.ceil(low - 1e-9); power <= high; power++) values.push([power, inWordsOf(10 ** power)]);
   return values;
 }
 
@@ -47,7 +48,7 @@ export function drawStrip(canvas, times, seconds, lines, { from, to, logarithmic
   const rise = high - low || Math.abs(high) || 1;
   if (to === undefined && !logarithmic) high += 0.08 * rise;
   if (!(high > low)) high = low + 1;
-  const { context, width, height, y } = axes(canvas, low, high, yTicksOf(low, high, logarithmic));
+  const { context, width, height, y } = axes(canvas, low, high, yTicksOf(low, high, logarithmic, inTime));
   const x = (time) => width - RIGHT + time / seconds * (width - LEFT - RIGHT);
   context.fillStyle = ink.soft;
   for (const time of ticks(-seconds, 0, width < 420 ? 3 : 6)) {
@@ -103,7 +104,7 @@ export function drawHistogram(canvas, { from_us: edges, counts }, marks) {
   for (let power = Math.ceil(low); power <= high; power++) {
     for (const factor of high - low < 1.6 ? [1, 2, 5] : [1]) {
       const value = factor * 10 ** power;
-      if (Math.log10(value) <= high) context.fillText(`${SHORT.format(value)} µs`, x(value), height - 5);
+      if (Math.log10(value) <= high) context.fillText(inTime(value), x(value), height - 5);
     }
   }
   context.strokeStyle = ink.second;

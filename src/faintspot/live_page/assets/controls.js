@@ -28,6 +28,8 @@ export class Controls {
       arms: byId("arms-text").value.trim(), every: Number(byId("every").value) }));
     this.onSubmit("record-form", "record-answer", "record", () => ({ file: byId("file").value.trim() }));
     this.onSubmit("loop-form", "loop-answer", "loop", () => ({ action: "gain", gain: Number(byId("gain").value) }));
+    byId("interleave-form").addEventListener("input", () => { this.armsEdited = true; });
+    byId("loop-form").addEventListener("input", () => { this.gainEdited = true; });
     this.onClick("stop-recording", "record-answer", "stop_recording", {});
     this.onClick("loop-open", "loop-answer", "loop", { action: "open" });
     this.onClick("loop-close", "loop-answer", "loop", { action: "close" });
@@ -36,7 +38,10 @@ export class Controls {
   onSubmit(form, place, what, fields) {
     byId(form).addEventListener("submit", async (event) => {
       event.preventDefault();
-      answer(place, await this.connection.ask(what, fields()));
+      answer(place, { ok: true, text: "…" });
+      const reply = await this.connection.ask(what, fields());
+      answer(place, reply);
+      if (reply.ok) this.armsEdited = this.gainEdited = false;
     });
   }
 
@@ -144,12 +149,17 @@ export class Controls {
   // What the engine says ---------------------------------------------------------------------------------
 
   status(status) {
-    const { loop, recording } = status;
-    byId("loop-form").hidden = !loop;
-    if (loop) {
+    const { loop, recording, arms } = status;
+    const there = Boolean(loop) && loop.state !== "none";
+    byId("loop-form").hidden = !there;
+    if (there) {
       byId("loop-state").textContent = loop.state + (loop.opened_because ? `: ${loop.opened_because}` : "");
       const gain = byId("gain");
-      if (document.activeElement !== gain && loop.gain !== undefined) gain.value = loop.gain;
+      if (document.activeElement !== gain && !this.gainEdited) gain.value = loop.gain ?? "";
+    }
+    if (arms && !this.armsEdited) {
+      byId("arms-text").value = arms.join();
+      if (arms.length > 1) byId("every").value = status.every;
     }
     if (recording) {
       byId("stop-recording").disabled = !recording.running;
