@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
@@ -21,7 +22,6 @@ from faintspot.realtime.camera import StopEvent
 
 try:
     from tornado.httpserver import HTTPServer
-    from tornado.netutil import bind_sockets
     from tornado.web import Application, HTTPError, RequestHandler
     from tornado.websocket import WebSocketClosedError, WebSocketHandler
 except ImportError:
@@ -77,12 +77,14 @@ class LiveServer:
         self._looking = ThreadPoolExecutor(1, "faintspot-page")
         self._answering = ThreadPoolExecutor(4, "faintspot-wish")
         try:
-            sockets = bind_sockets(port, address)
+            family = socket.AF_INET6 if ":" in address else socket.AF_INET
+            listening = socket.create_server((address, port), family=family)
         except OSError as error:
             raise InputError(
                 f"{address}:{port}: cannot listen there ({error.strerror}); choose another --port"
             ) from None
-        self._address, self.port = address, int(sockets[0].getsockname()[1])
+        listening.setblocking(False)
+        self._address, self.port = address, int(listening.getsockname()[1])
         self._http = HTTPServer(
             Application(
                 [
@@ -97,7 +99,7 @@ class LiveServer:
             max_body_size=LARGEST_REQUEST,
             idle_connection_timeout=_SLOW_S,
         )
-        self._http.add_sockets(sockets)
+        self._http.add_sockets([listening])
 
     @property
     def url(self) -> str:
