@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("tornado")
 pytest.importorskip("zarr")
 
+from tests.live_page.cases import LAYOUT, Client, Noted, Played, Refused, asked, connected, next_of, served
 from tornado.httpclient import AsyncHTTPClient
 
 from faintspot.errors import InputError
@@ -18,7 +19,6 @@ from faintspot.live_page import server as server_module
 from faintspot.live_page.access import Access
 from faintspot.live_page.server import LARGEST_REQUEST, MOST_CLIENTS, LiveServer
 from faintspot.sensor.layout import Layout
-from tests.live_page.cases import LAYOUT, Client, Noted, Played, Refused, asked, connected, next_of, served
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +82,9 @@ def test_forged_host_is_refused(host: str) -> None:
     served(check)
 
 
-@pytest.mark.parametrize("origin", ["http://example.org", "http://127.0.0.1:1", "null", "", "https://127.0.0.1"])
+@pytest.mark.parametrize(
+    "origin", ["http://example.org", "http://127.0.0.1:1", "null", "", "https://127.0.0.1"]
+)
 def test_forged_origin_is_refused(origin: str) -> None:
     async def check(server: LiveServer) -> None:
         assert await refused_with(server, Origin=origin) == 403
