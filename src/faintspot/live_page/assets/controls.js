@@ -20,7 +20,7 @@ export class Controls {
     this.names = "";
     byId("token-form").addEventListener("submit", (event) => this.unlock(event));
     byId("settings-form").addEventListener("submit", (event) => this.set(event));
-    byId("settings-form").addEventListener("reset", () => setTimeout(() => this.settingsEdited()));
+    byId("undo").addEventListener("click", () => this.undo());
     byId("settings").addEventListener("input", () => this.settingsEdited());
     byId("explain").addEventListener("change", (event) =>
       byId("settings").classList.toggle("explained", event.currentTarget.checked));
@@ -125,6 +125,13 @@ export class Controls {
     this.settingsEdited();
     if (reply.ok) answer("settings-answer", reply);
     else this.showError(reply, changed);
+  }
+
+  undo() {
+    for (const input of this.inputs()) input.value = input.dataset.now;
+    byId("subapertures").value = "";
+    this.clearErrors();
+    this.settingsEdited();
   }
 
   clearErrors() {

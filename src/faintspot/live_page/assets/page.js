@@ -29,6 +29,7 @@ const controls = new Controls(connection);
 
 function draw() {
   const fresh = stale;
+  document.documentElement.dataset.frames = ++drawnFrames;
   stale = new Set();
   if (fresh.has("sensor")) sensorCame();
   if (fresh.has("place") || fresh.has("status")) showState();
@@ -38,7 +39,6 @@ function draw() {
   if (!known.sensor) return;
   if (fresh.has("pictures")) showPictures();
   if (fresh.has("now")) showNow();
-  document.documentElement.dataset.frames = ++drawnFrames;
 }
 
 function redraw() {
