@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from faintspot.cli.needs import needs
+from faintspot.extras import require
 
 if TYPE_CHECKING:
     from faintspot.live_page.server import LiveServer
@@ -53,6 +58,18 @@ def command(recording: Path | None, name: str, bind: str, port: int, folder: Pat
             serve_recording(recording, stop, _say, address=bind, port=port)
         else:
             serve_engine(name, stop, _say, address=bind, port=port, folder=folder)
+
+
+@contextmanager
+def page_beside(name: str) -> Iterator[None]:
+    """Serve the page of an engine in a process of its own, which ends with this one's work."""
+    require("live", "tornado", purpose="--live")
+    process = subprocess.Popen([sys.executable, "-m", "faintspot", "live", "--name", name])
+    try:
+        yield
+    finally:
+        process.terminate()  # harmless where Ctrl-C has ended it already
+        process.wait()
 
 
 def _say(server: LiveServer) -> None:
