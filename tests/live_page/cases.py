@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.live_page.access import Access
-from faintspot.live_page.batch import Batch, Picture
+from faintspot.live_page.batch import Batch, Picture, Source
 from faintspot.live_page.server import LiveServer
 from faintspot.live_page.wishes import Wish
 from faintspot.realtime.telemetry_segment import record_type
@@ -21,7 +21,6 @@ from faintspot.sensor.layout import Layout
 LAYOUT = Layout.grid((3, 3), pixels=8, inner_radius=0.5)
 N = len(LAYOUT)
 PATIENCE_S = 20.0
-_opened: list[Client] = []
 _opened: list[Client] = []
 
 
@@ -41,10 +40,11 @@ class Played:
     """Gives a frame, with its picture, each time it is asked."""
 
     def __init__(self, layout: Layout = LAYOUT) -> None:
-        self.name, self.layout, self.arms = "played", layout, ["set"]
-        self.frames = 0
+        self.name, self.arms, self.frames = "played", ["set"], 0
+        self.layout: Layout | None = layout
 
     def read(self) -> Batch | None:
+        assert self.layout is not None
         if self.layout is not LAYOUT:
             raw = np.random.default_rng(self.frames).normal(size=self.layout.frame_shape).astype(np.float32)
         else:
@@ -86,7 +86,7 @@ class Stop:
 
 
 def served(
-    check: Callable[[LiveServer], Awaitable[None]], source: Any = None, address: str = "127.0.0.1"
+    check: Callable[[LiveServer], Awaitable[None]], source: Source | None = None, address: str = "127.0.0.1"
 ) -> LiveServer:
     """Serve a source while the check runs; return the server with what it noted."""
 

@@ -13,11 +13,12 @@ from typing import Any
 
 import pytest
 
-playwright = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 pytest.importorskip("tornado")
 pytest.importorskip("pyshmem")
 pytest.importorskip("zarr")
 
+from playwright.sync_api import sync_playwright
 from tests.realtime.bench import Bench, simulated
 
 from faintspot.io.telemetry import read_telemetry
@@ -80,7 +81,7 @@ def served(serve: Callable[..., None], *arguments: Any, **options: Any) -> Itera
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
+    with sync_playwright() as driver:
         # Tests may run as root, in a container: Chromium's own sandbox is not there then.
         browser = driver.chromium.launch(executable_path=CHROMIUM, chromium_sandbox=os.geteuid() != 0)
         yield browser
@@ -119,7 +120,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
             page.on("console", lambda message: faults.append(f"{message.type}: {message.text}"))
             page.on("pageerror", lambda error: faults.append(str(error)))
             home = url.partition("#")[0]
-            page.on("request", lambda made: made.url.startswith(home) or faults.append(made.url))
+            page.on("request", lambda made: faults.extend([] if made.url.startswith(home) else [made.url]))
             page.goto(url)
             until(page, "document.documentElement.dataset.frames > 0")
             return page
@@ -141,8 +142,8 @@ def drawn(page: Any, canvas: str) -> int:
     return int(
         page.evaluate(
             """(id) => { const c = document.getElementById(id);
-            const data = new Uint32Array(c.getContext("2d").getImageData(0, 0, c.width, c.height).data.buffer);
-            return new Set(data).size; }""",
+            const { data } = c.getContext("2d").getImageData(0, 0, c.width, c.height);
+            return new Set(new Uint32Array(data.buffer)).size; }""",
             canvas,
         )
     )

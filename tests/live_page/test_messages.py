@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from tests.live_page.cases import unpacked
 
 from faintspot.live_page.messages import packed, plain
 
 
 def test_message_holds_values_and_arrays_as_they_were() -> None:
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "odd": np.arange(5, dtype=np.uint8),
         "none": np.zeros((0, 3), np.float32),
         "table": np.arange(6.0).reshape(2, 3),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from tests.estimate.image_cases import refused
@@ -60,7 +62,7 @@ def test_every() -> None:
 
 
 def test_arms_of_later_interleavings_have_numbers_of_their_own() -> None:
-    changes = [
+    changes: list[dict[str, Any]] = [
         {"changes": {"noise_std": 2.0}},
         {"changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 5}},
         {"changes": {"modules": {}}},

@@ -31,13 +31,14 @@ _NICENESS = 5  # the engine comes first
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8642, show_default=True, help="0: any that is free."
 )
+@click.option("--private", is_flag=True, help="Watching needs the token also on this machine.")
 @click.option(
     "--folder",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     default=".",
     help="For recordings that the page begins. Default: this one.",
 )
-def command(recording: Path | None, name: str, bind: str, port: int, folder: Path) -> None:
+def command(recording: Path | None, name: str, bind: str, port: int, private: bool, folder: Path) -> None:
     """Serve a web page of the running engine NAME until Ctrl-C.
 
     It shows frames, slopes, flux, validity, latencies and arms in turn, as they are. Whoever has the address
@@ -55,9 +56,9 @@ def command(recording: Path | None, name: str, bind: str, port: int, folder: Pat
     os.nice(_NICENESS)
     with stop_on_signal() as stop:
         if recording is not None:
-            serve_recording(recording, stop, _say, address=bind, port=port)
+            serve_recording(recording, stop, _say, address=bind, port=port, private=private)
         else:
-            serve_engine(name, stop, _say, address=bind, port=port, folder=folder)
+            serve_engine(name, stop, _say, address=bind, port=port, private=private, folder=folder)
 
 
 @contextmanager

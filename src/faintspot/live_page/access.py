@@ -26,6 +26,8 @@ class Access:
     ----------
     address : str
         To which the server is bound.
+    private : bool
+        Whether reading needs the token also on this machine, which others may use.
 
     Raises
     ------
@@ -33,13 +35,13 @@ class Access:
         When it is not an IP address.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, private: bool = False) -> None:
         try:
             parsed = ipaddress.ip_address(address)
         except ValueError:
             raise InputError(f"bind = {address!r:.80}: expected an IP address, such as 127.0.0.1") from None
         self.token = secrets.token_urlsafe(24)
-        self.reading_needs_token = not parsed.is_loopback
+        self.reading_needs_token = private or not parsed.is_loopback
 
     def permits_host(self, host: str | None) -> bool:
         """Whether a request's Host header names this machine."""

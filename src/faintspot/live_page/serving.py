@@ -25,6 +25,7 @@ def serve_engine(
     *,
     address: str = "127.0.0.1",
     port: int = PORT,
+    private: bool = False,
     folder: str | Path = ".",
 ) -> None:
     """Serve the page of a running engine until `stop` is set.
@@ -40,6 +41,8 @@ def serve_engine(
         To bind to; with another one than this machine's own (127.0.0.1), reading needs the token, too.
     port : int
         0: any free one.
+    private : bool
+        Whether watching needs the token also on this machine.
     folder : path
         For recordings that the page begins.
 
@@ -53,7 +56,7 @@ def serve_engine(
 
     async def work() -> None:
         source, wishes = EngineSource(name), EngineWishes(name, folder)
-        server = LiveServer(source, wishes, Access(address), address, port)
+        server = LiveServer(source, wishes, Access(address, private), address, port)
 
         def told(kind: str, values: dict[str, Any]) -> None:
             server.tell(
@@ -79,6 +82,7 @@ def serve_recording(
     *,
     address: str = "127.0.0.1",
     port: int = PORT,
+    private: bool = False,
 ) -> None:
     """Serve the page of a recording until `stop` is set; see `serve_engine`.
 
@@ -90,7 +94,7 @@ def serve_recording(
 
     async def work() -> None:
         source = RecordingSource(path)
-        server = LiveServer(source, source, Access(address), address, port)
+        server = LiveServer(source, source, Access(address, private), address, port)
         ready(server)
         await server.run(stop)
 

@@ -5,7 +5,7 @@ import { inWords } from "./message.js";
 
 const SHORT = new Intl.NumberFormat("en", { notation: "compact" });
 const inTime = (us) => us < 1e3 ? `${inWords(us)} µs` : us < 1e6 ? `${inWords(us / 1e3)} ms` : `${inWords(us / 1e6)} s`;
-const LEFT = 46, BOTTOM = 20, TOP = 6, RIGHT = 8;
+const LEFT = 52, BOTTOM = 20, TOP = 6, RIGHT = 8;
 
 /** Axes with a grid; return functions from values to places. */
 function axes(canvas, low, high, yTicks) {
