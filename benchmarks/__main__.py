@@ -27,6 +27,7 @@ _ORDER = (
     "roofline",
     "breakdown",
     "realtime",
+    "live_page",
     "latency",
     "realtime_sustained",
     "pyrtc",
