@@ -21,6 +21,7 @@ pytest.importorskip("zarr")
 from playwright.sync_api import sync_playwright
 from tests.realtime.bench import Bench, simulated
 
+from faintspot.checks import number_between
 from faintspot.io.telemetry import read_telemetry
 from faintspot.live_page.server import LiveServer
 from faintspot.live_page.serving import serve_engine, serve_recording
@@ -40,10 +41,26 @@ class Running(Bench):
 
     def __init__(self) -> None:
         super().__init__(images_every=5)
-        self.control = ControlServer(socket_path(self.name), commands_of(self.engine), lengthy=LENGTHY)
+        self.loop: dict[str, Any] = {"state": "open", "gain": 0.5, "opened_because": "diverged"}
+        handlers = commands_of(self.engine) | {"loop": self._loop, "status": self._status}
+        self.control = ControlServer(socket_path(self.name), handlers, lengthy=LENGTHY)
         self._stopping = threading.Event()
         self._camera = threading.Thread(target=self._expose, daemon=True)
         self._camera.start()
+
+    def _status(self, fields: dict[str, Any]) -> dict[str, Any]:
+        return {**self.engine.status(), "loop": self.loop}
+
+    def _loop(self, fields: dict[str, Any]) -> dict[str, Any]:
+        """Stands for the engine's loop."""
+        if fields["action"] == "gain":
+            self.loop["gain"] = number_between("gain", fields["gain"], 0, 2)
+        else:
+            self.loop |= {
+                "state": {"open": "open", "close": "closed"}[fields["action"]],
+                "opened_because": None,
+            }
+        return {"loop": self.loop}
 
     def _expose(self) -> None:
         frames = simulated(20)
@@ -196,6 +213,20 @@ def test_settings_are_changed_and_errors_stand_beside_their_field(
     page.locator("#subapertures-answer").filter(has_text="sub-aperture 99 does not exist").wait_for()
     page.locator("#undo").click()
     until(page, "document.getElementById('apply').disabled")
+
+
+def test_loop_is_closed_and_its_gain_set(open_page: Any, server: LiveServer, engine: Running) -> None:
+    page = open_page(server.url)
+    page.locator("#loop-state").filter(has_text="open: diverged").wait_for()
+    page.locator("#gain").fill("3")
+    page.locator("#gain").press("Enter")
+    page.locator("#loop-answer[data-ok=false]").filter(has_text="gain = 3: expected").wait_for()
+    page.locator("#gain").fill("0.3")
+    page.locator("#gain").press("Enter")
+    page.locator("#loop-answer").filter(has_text="open, gain 0.3").wait_for()
+    page.locator("#loop-close").click()
+    page.locator("#loop-state").filter(has_text="closed").wait_for()
+    assert engine.loop == {"state": "closed", "gain": 0.3, "opened_because": None}
 
 
 def test_arms_take_turns_and_are_compared(open_page: Any, server: LiveServer, engine: Running) -> None:

@@ -56,7 +56,7 @@ def test_figures_are_those_of_numpy() -> None:
     assert figures["rate_hz"] == pytest.approx(100.0)
     assert figures["longest_us"] == pytest.approx(latency_us.max())
     assert figures["histogram"]["counts"].sum() == 1000
-    assert figures["arms"] == []
+    assert gathered.arms_compared() == []
 
 
 def test_arms_in_turn_are_compared_with_the_first() -> None:
@@ -66,7 +66,7 @@ def test_arms_in_turn_are_compared_with_the_first() -> None:
         made = records(50 * turn, 50, arm=turn % 2)
         made["flux"] += 10.0 * (turn % 2)
         gathered.add(Batch(made))
-    none, tv = gathered.figures()["arms"]
+    none, tv = gathered.arms_compared()
     assert (none["arm"], tv["arm"], none["frames"]) == ("none", "tv", 1000)
     flux = tv["figures"]["flux (e-)"]
     assert flux["mean"] == pytest.approx(110.0)
@@ -84,7 +84,7 @@ def test_arms_of_an_earlier_interleaving_are_not_compared() -> None:
     for turn in range(6, 12):
         made = records(50 * turn, 50, arm=2 + turn % 2)
         gathered.add(Batch(made, changes=[change] if turn == 6 else []))
-    assert [row["arm"] for row in gathered.figures()["arms"]] == ["ml", "set"]
+    assert [row["arm"] for row in gathered.arms_compared()] == ["ml", "set"]
 
 
 def test_only_the_last_minute_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from faintspot.live_page.pictures import FrameDrawing
 
 UPDATE_S = 0.08
 """Between two updates of the page."""
-_FIGURES_S = 0.5
+_FIGURES_S, _ARMS_S = 0.5, 2.0
 
 
 class Page:
@@ -31,7 +31,8 @@ class Page:
         self.source, self._tell = source, tell
         self.gathered = Gathered([])
         self._drawing: FrameDrawing | None = None
-        self._figures_s = 0.0
+        self._figures_s = self._arms_s = 0.0
+        self._arms: list[dict[str, Any]] = []
         self._place: dict[str, Any] | None = None
 
     def step(self) -> None:
@@ -69,4 +70,7 @@ class Page:
         moment = time.monotonic()
         if now or moment - self._figures_s >= _FIGURES_S:
             self._figures_s = moment
-            self._tell("figures", packed("figures", {**self.gathered.figures(), "flags": flag_names()}))
+            if now or moment - self._arms_s >= _ARMS_S:
+                self._arms_s, self._arms = moment, self.gathered.arms_compared()
+            values = {**self.gathered.figures(), "arms": self._arms, "flags": flag_names()}
+            self._tell("figures", packed("figures", values))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.io.telemetry_parts import StoredTelemetry
-from faintspot.live_page.batch import Batch, Picture
+from faintspot.live_page.batch import Batch, Floats, Picture
 from faintspot.live_page.wishes import Wish
 from faintspot.realtime.telemetry_segment import record_type
 from faintspot.sensor.layout import Layout
@@ -79,8 +79,13 @@ class RecordingSource:
             if moved:
                 self._next, self._shown_picture = max(0, end - 1), -1
             first, self._next = max(self._next, end - _MOST_RECORDS), end
-        picture, changes = self._picture(end), self._changes(end, moved)
-        return Batch(self._records(first, end), picture=picture, changes=changes, anew=moved)
+        return Batch(
+            self._records(first, end),
+            picture=self._picture(end),
+            commands=self._commands(end) if end > first else None,
+            changes=self._changes(end, moved),
+            anew=moved,
+        )
 
     def place(self) -> dict[str, Any]:
         """Say which moment is shown."""
@@ -158,6 +163,12 @@ class RecordingSource:
             store.read(name, newest, newest + 1)[0] for name in ("image_frame", "raw", "denoised")
         )
         return Picture(int(frame), raw, denoised)
+
+    def _commands(self, end: int) -> Floats | None:
+        """Return the commands of the newest frame, where they were recorded."""
+        if "commands" not in self._store:
+            return None
+        return np.asarray(self._store.read("commands", end - 1, end)[0], np.float64)
 
     def _changes(self, end: int, anew: bool) -> list[dict[str, Any]]:
         """Return the changes of settings up to this moment that have not been told yet."""

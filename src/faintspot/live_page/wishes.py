@@ -90,9 +90,11 @@ class EngineWishes:
         return {"text": _since(reply.get("frame"))}
 
     def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:
-        """As `faintspot realtime loop`: "action" open, close or gain, with "gain"."""
+        """As `faintspot realtime loop`: "action" open, close, flat or gain, with "gain"."""
         fields = {name: asked[name] for name in ("action", "gain") if asked.get(name) is not None}
-        return {"text": "done", "loop": self._ask("loop", **fields)}
+        loop = self._ask("loop", **fields)["loop"]
+        gain = "" if loop.get("gain") is None else f", gain {loop['gain']:g}"
+        return {"text": f"{loop['state']}{gain}"}
 
     def _ask(self, command: str, **fields: Any) -> dict[str, Any]:
         return request(self._path, command, timeout_s=LENGTHY_TIMEOUT_S, **fields)

@@ -32,6 +32,7 @@ export class Controls {
     byId("loop-form").addEventListener("input", () => { this.gainEdited = true; });
     this.onClick("stop-recording", "record-answer", "stop_recording", {});
     this.onClick("loop-open", "loop-answer", "loop", { action: "open" });
+    this.onClick("loop-flat", "loop-answer", "loop", { action: "flat" });
     this.onClick("loop-close", "loop-answer", "loop", { action: "close" });
   }
 
