@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,6 +21,7 @@ FRAMES_S = 60.0
 _MOST_FRAMES = 1 << 17  # also of cameras that are very fast
 _MOST_CHANGES = 20  # that are kept to be shown
 _MEAN_FRAMES = 500  # over which a sub-aperture's mean slope is taken, about which the rms is
+_FEWEST_FRAMES = 10  # of which a mean is one
 _STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
 """A row of the strip charts: what one look at the telemetry gave."""
 _FRAME = ("time_s", "arm", "latency_us", "rms_px", "flux_e", "valid", "strehl")
@@ -55,7 +56,8 @@ class Gathered:
         self._strip: deque[tuple[float, ...]] = deque()
         self._frames: deque[Floats] = deque()
         self._first_arm = 0  # of the interleaving that runs
-        self._means: dict[int, Floats] = {}
+        self._means: dict[int, Floats] = {}  # of the slopes, by arm, and of how many frames
+        self._seen_of: defaultdict[int, int] = defaultdict(int)
         self._truth = (np.nan, np.nan)
         self._last: NDArray[Any] | None = None  # records of the look before
 
@@ -180,15 +182,18 @@ class Gathered:
 
     def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
         """Return the rms of each frame's slopes about the sub-apertures' running means in their arm."""
-        squares = np.zeros(len(records))
+        squares = np.full(len(records), np.nan)
         for arm in np.unique(records["arm"]):
             own = records["arm"] == arm
+            self._seen_of[int(arm)] += own.sum()
             used = valid[own]
             slopes = np.stack([records["x"][own], records["y"][own]]).astype(np.float64)
             mean = np.where(used, slopes, 0.0).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
             before = self._means.get(int(arm), mean)
             weight = min(1.0, own.sum() / _MEAN_FRAMES)
             self._means[int(arm)] = before + weight * (mean - before)
+            if self._seen_of[int(arm)] < _FEWEST_FRAMES:
+                continue
             deviation = np.where(used, slopes - self._means[int(arm)][:, None], 0.0)
             squares[own] = np.sum(deviation**2, axis=(0, 2))
         return np.asarray(np.sqrt(squares / (2 * some)))

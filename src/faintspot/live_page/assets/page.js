@@ -75,7 +75,7 @@ function showState() {
   const there = connected && place?.there;
   state.dataset.state = there && !held ? "live" : "waiting";
   state.textContent = !connected ? "connecting" : held ? "held" : !place ? "waiting"
-    : place.kind === "recording" ? (place.playing ? "recording, playing" : "recording, paused")
+    : place.kind === "recording" ? (place.playing ? "playing" : "paused")
       : place.there ? "live" : `waiting for the engine ${place.name}`;
   if (!place) return;
   say("name", place.name);
@@ -88,6 +88,7 @@ function showState() {
   byId("player").hidden = !recorded;
   for (const id of ["interleave-form", "record-form", "settings-form"]) byId(id).hidden = recorded;
   byId("change-section").hidden = recorded && !byId("controls").hidden;
+  say("counters-title", recorded ? "Settings" : "Counters");
   byId("configuration-section").hidden = !place.settings;
   say("configuration", place.settings || "");
   if (recorded) showPlayer(place);
@@ -157,7 +158,7 @@ function showSlopes(values, arrays, where) {
   const wanted = roundUp(lengths[Math.floor(0.9 * lengths.length)] || reach);
   if (wanted > 1.5 * reach || wanted < reach / 2.1) reach = wanted;
   drawArrows(byId("slopes"), where, x, y, flags, invalid, reach);
-  say("slopes-caption", `${values.frame}: half a window is ${inWords(reach, 2)} px`);
+  say("slopes-caption", `half a window: ${inWords(reach, 2)} px`);
 
   const light = arrays.flux.data, lit = Array.from(light).filter((_, i) => used[i]);
   const low = Math.min(0, ...lit), high = Math.max(...lit, 1);
