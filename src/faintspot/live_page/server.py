@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import socket
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -85,6 +86,8 @@ class LiveServer:
             ) from None
         listening.setblocking(False)
         self._address, self.port = address, int(listening.getsockname()[1])
+        for name in ("tornado.access", "tornado.general"):  # what strangers send does not fill the terminal
+            logging.getLogger(name).addHandler(logging.NullHandler())
         self._http = HTTPServer(
             Application(
                 [
