@@ -35,6 +35,17 @@ def test_newest_frame_and_strip_charts() -> None:
     np.testing.assert_allclose(strip["rms_px"], 0.5 / np.sqrt(2), rtol=1e-6)
 
 
+def test_truth_that_comes_before_its_frame_counts_for_it() -> None:
+    gathered = Gathered(["none", "tv"])
+    for turn in range(40):
+        first = 10 * turn
+        truth = (first + 10, 0.2 + 0.4 * ((turn + 1) % 2), 100.0)  # of the next turn's first frame
+        gathered.add(Batch(records(first, 10, arm=turn % 2), truth=truth))
+    none, tv = gathered.arms_compared()
+    assert none["figures"]["Strehl ratio"]["mean"] == pytest.approx(0.2)
+    assert tv["figures"]["Strehl ratio"]["mean"] == pytest.approx(0.6)
+
+
 def test_lost_frames_are_counted_once_and_a_camera_that_begins_anew_loses_none() -> None:
     gathered = Gathered([])
     gathered.add(Batch(records(0, 5)))

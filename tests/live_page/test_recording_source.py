@@ -159,6 +159,17 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, night: Path) -> None:
         RecordingSource(empty)
 
 
+def test_recording_of_another_sensor_than_it_says_is_refused(tmp_path: Path) -> None:
+    made = records(0, 5)
+    images = image_type((4, 4), N, LAYOUT.window)
+    attributes = {"layout": layout_values(LAYOUT), "arms": []}
+    TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes).append(
+        made, np.zeros(1, images), {"changes": []}
+    )
+    with pytest.raises(InputError, match=r"damaged \(raw: expected items of"):
+        RecordingSource(tmp_path / "night.zarr")
+
+
 def test_parts_of_a_store_are_those_of_the_whole(night: Path) -> None:
     store = StoredTelemetry(night)
     assert (store.frames, store.images) == (FRAMES, 100)

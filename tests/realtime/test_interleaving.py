@@ -68,10 +68,13 @@ def test_arms_of_later_interleavings_have_numbers_of_their_own() -> None:
         {"changes": {"modules": {}}},
         {"changes": {"arms": ["set"], "first_arm": 4, "every": 5}},
     ]
-    assert arms_after(["none", "tv"], changes[:1]) == ["none", "tv"]
-    assert arms_after(["none", "tv"], changes) == ["none", "tv", "ml", "set", "set"]
+    assert arms_after(["none", "tv"], changes[:1]) == (["none", "tv"], 0)
+    assert arms_after(["none", "tv"], changes) == (["none", "tv", "ml", "set", "set"], 4)
     # Of a recording, whose arms are all of them already.
-    assert arms_after(["a", "b", "c", "d", "e"], changes[:2]) == ["a", "b", "ml", "set", "e"]
+    assert arms_after(["a", "b", "c", "d", "e"], changes[:2]) == (["a", "b", "ml", "set", "e"], 2)
+    garbage: list[dict[str, Any]] = [{}, {"changes": {"arms": "x", "first_arm": 0}}]
+    garbage += [{"changes": {"arms": ["x"], "first_arm": number}} for number in (-1, 9, "0", None)]
+    assert arms_after(["none", "tv"], garbage) == (["none", "tv"], 0)
 
 
 def test_arms_change_while_the_engine_runs(bench: Bench) -> None:

@@ -40,7 +40,7 @@ _DIMENSIONS = {
     "denoised": ("image", "subaperture", "window_row", "window_column"),
     "image_frame": ("image",),
 }
-_NOT_STORED = "sequence"  # of the rings, which a store has no use for
+NOT_STORED = "sequence"  # of the rings, which a store has no use for
 
 
 @dataclass(frozen=True, repr=False)
@@ -277,7 +277,7 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
 def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
     """The fields of a structured array that are stored, by name."""
     names = items.dtype.names or ()
-    return [(name, items[name]) for name in names if name != _NOT_STORED]
+    return [(name, items[name]) for name in names if name != NOT_STORED]
 
 
 def _dimensions(name: str, count: int) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,8 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.telemetry import attributes_of, finished_of
+from faintspot.io.telemetry import NOT_STORED, attributes_of, finished_of
 from faintspot.io.zarr_store import read_items
-
-_PER_IMAGE = ("image_frame", "raw", "denoised")
 
 
 class StoredTelemetry:
@@ -57,6 +56,22 @@ class StoredTelemetry:
         """Whether there is such an array."""
         return name in self._group
 
+    def check_shapes(self, kinds: Sequence[np.dtype[np.void]]) -> None:
+        """Refuse a store whose arrays are not those of such records and images.
+
+        Raises
+        ------
+        InputError
+            When one is missing, or its items have another shape.
+        """
+        for kind in kinds:
+            for name in kind.names or ():
+                wanted = kind[name].shape
+                if name != NOT_STORED and self._array(name).shape[1:] != wanted:
+                    raise InputError(
+                        f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
+                    )
+
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Return items `start` to `stop` of an array, by its name in `Telemetry`.
 
@@ -65,10 +80,13 @@ class StoredTelemetry:
         InputError
             When the store is damaged there.
         """
-        try:
-            array = self._group[name]
-        except Exception as error:  # as above
-            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None
+        array = self._array(name)
         if stop > array.shape[0]:
             raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")
         return np.asarray(read_items(self.path, array, start, stop, whole=False))
+
+    def _array(self, name: str) -> Any:
+        try:
+            return self._group[name]
+        except Exception as error:  # as above
+            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None

@@ -49,6 +49,7 @@ class EngineSource:
         reader = self._reader
         if reader is None:
             return None
+        truth = self._newest_truth()
         # Images first: the record of each was written before it, so that it is among these or older ones.
         images, self._cursors[1], _ = reader.images_since(max(self._cursors[1], reader.newest_image - 1))
         records, self._cursors[0], missed = reader.records_since(self._cursors[0])
@@ -64,7 +65,7 @@ class EngineSource:
             records,
             missed,
             picture,
-            truth=self._newest_truth(),
+            truth=truth,
             commands=None if commands is None else commands[1],
             changes=changes,
             anew=anew,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.live_page.batch import Batch, Floats
-from faintspot.realtime.interleaving import FIRST_ARM, arms_after
+from faintspot.realtime.interleaving import arms_after
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
 
 STRIP_S = 30.0
@@ -58,26 +58,25 @@ class Gathered:
         self._first_arm = 0  # of the interleaving that runs
         self._means: dict[int, Floats] = {}  # of the slopes, by arm, and of how many frames
         self._seen_of: defaultdict[int, int] = defaultdict(int)
-        self._truth = (np.nan, np.nan)
+        # The last ones: a frame's truth may be known before its record.
+        self._truths: deque[tuple[int, float, float]] = deque(maxlen=4)
         self._last: NDArray[Any] | None = None  # records of the look before
 
     def add(self, batch: Batch) -> None:
         """Take in what came."""
         self.changes = (self.changes + batch.changes)[-_MOST_CHANGES:]
-        self.arms = arms_after(self.arms, batch.changes)
-        for change in batch.changes:
-            self._first_arm = change["changes"].get(FIRST_ARM, self._first_arm)
+        self.arms, self._first_arm = arms_after(self.arms, batch.changes, self._first_arm)
         self.missed += batch.missed
         if batch.commands is not None:
             self.commands = batch.commands
         if batch.truth is not None:
-            self._truth = batch.truth[1:]
+            self._truths.append(batch.truth)
         records = batch.records
         if not len(records):
             return
         rows = self._rows(records)
-        if batch.truth is not None:  # known of that frame alone: its arm had its turn then
-            rows[records["frame"] == batch.truth[0], _FRAME.index("strehl")] = batch.truth[1]
+        for frame, strehl, _ in self._truths:  # known of a few frames alone
+            rows[records["frame"] == frame, _FRAME.index("strehl")] = strehl
         lost = self._lost_in(records)
         self.seen, self.lost = self.seen + len(records), self.lost + lost
         self.newest, self._last = records[-1].copy(), records
@@ -215,7 +214,7 @@ class Gathered:
             _mean(rms),
             _mean(flux),
             float(lost + batch.missed),
-            *self._truth,
+            *(self._truths[-1][1:] if self._truths else (np.nan, np.nan)),
         )
 
     def _forget(self, now_s: float) -> None:

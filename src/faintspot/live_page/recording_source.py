@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
+from faintspot.io.telemetry import NOT_STORED
 from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page.batch import Batch, Floats, Picture
 from faintspot.live_page.wishes import Wish
-from faintspot.realtime.telemetry_segment import record_type
+from faintspot.realtime.telemetry_segment import image_type, record_type
 from faintspot.sensor.layout import Layout
 
 _MOST_RECORDS = 4096  # in one look: of what is played faster than that, the newest
 _FASTEST = 100.0
-_NOT_STORED = ("sequence",)
 
 
 class RecordingSource:
@@ -49,6 +49,9 @@ class RecordingSource:
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: the store is damaged ({type(error).__name__}: {error})") from None
         self._type = record_type(len(self.layout))
+        store.check_shapes(
+            [self._type, image_type(self.layout.frame_shape, len(self.layout), self.layout.window)]
+        )
         times = store.read("last_row_time_ns", 0, store.frames)
         self._times_s = np.maximum.accumulate((times - times[0]) / 1e9)
         frames = store.read("frame", 0, store.frames)
@@ -147,7 +150,7 @@ class RecordingSource:
             start, stop = number * together, min((number + 1) * together, self._store.frames)
             records = np.zeros(stop - start, self._type)
             for name in self._type.names or ():
-                if name not in _NOT_STORED:
+                if name != NOT_STORED:
                     records[name] = self._store.read(name, start, stop)
             self._block = number, records
         return self._block[1]

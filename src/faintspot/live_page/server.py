@@ -9,6 +9,7 @@ import logging
 import socket
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -20,6 +21,7 @@ from faintspot.live_page.messages import packed, plain
 from faintspot.live_page.page import UPDATE_S, Page
 from faintspot.live_page.wishes import Wishes, answered
 from faintspot.realtime.camera import StopEvent
+from faintspot.realtime.control import in_thread
 
 try:
     from tornado.httpserver import HTTPServer
@@ -76,7 +78,7 @@ class LiveServer:
         self._loop = asyncio.get_running_loop()
         self._page = Page(source, self._tell)
         self._looking = ThreadPoolExecutor(1, "faintspot-page")
-        self._answering = ThreadPoolExecutor(4, "faintspot-wish")
+        self.assets = _assets()
         try:
             family = socket.AF_INET6 if ":" in address else socket.AF_INET
             listening = socket.create_server((address, port), family=family)
@@ -92,7 +94,7 @@ class LiveServer:
             Application(
                 [
                     (r"/stream", Client, {"server": self}),
-                    (r"/([a-z_.]*)", Asset, {"server": self, "contents": _assets()}),
+                    (r"/([a-z_.]*)", Asset, {"server": self}),
                 ],
                 log_function=lambda handler: None,
                 websocket_max_message_size=LARGEST_REQUEST,
@@ -123,7 +125,6 @@ class LiveServer:
                 client.close()
             await self._http.close_all_connections()
             self._looking.shutdown()
-            self._answering.shutdown(wait=False, cancel_futures=True)
 
     def tell(self, kind: str, values: Mapping[str, Any]) -> None:
         """Put a message on the board, from any thread."""
@@ -135,10 +136,6 @@ class LiveServer:
                 self._loop.call_soon_threadsafe(self.board.forget, kind)
             else:
                 self._loop.call_soon_threadsafe(self.board.post, kind, message)
-
-    async def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Carry out what a client asks for; in a thread, since the engine may take its time."""
-        return await self._loop.run_in_executor(self._answering, answered, self.wishes, request)
 
 
 def _assets() -> dict[str, tuple[str, bytes]]:
@@ -154,7 +151,7 @@ def _assets() -> dict[str, tuple[str, bytes]]:
 class _Guarded(RequestHandler):
     """Refuses requests whose Host is another's."""
 
-    def initialize(self, server: LiveServer, **_: Any) -> None:
+    def initialize(self, server: LiveServer) -> None:
         """Tornado's own beginning."""
         self.server = server
 
@@ -178,15 +175,11 @@ class _Guarded(RequestHandler):
 class Asset(_Guarded):
     """One of the page's files."""
 
-    def initialize(self, server: LiveServer, contents: dict[str, tuple[str, bytes]]) -> None:  # type: ignore[override]
-        """Tornado's own beginning."""
-        self.server, self._contents = server, contents
-
     def get(self, name: str) -> None:
         """Send it."""
-        if name not in self._contents:
+        if name not in self.server.assets:
             raise HTTPError(404)
-        kind, content = self._contents[name]
+        kind, content = self.server.assets[name]
         self.set_header("Content-Type", f"{kind}; charset=utf-8")
         self.finish(content)
 
@@ -234,7 +227,8 @@ class Client(_Guarded, WebSocketHandler):
         elif not self._may_change:
             reply = {"ok": False, "error": "watching only: changes need the token printed at the start"}
         else:
-            reply = await self.server.answer(request)
+            # In a thread, since the engine may take its time.
+            reply = await in_thread(partial(answered, self.server.wishes, request))
         with contextlib.suppress(WebSocketClosedError):
             await self.write_message(json.dumps({"id": number, **plain(reply)}, allow_nan=False))
         if self._feeding is None:

@@ -86,23 +86,28 @@ class Interleaving:
         return cls(tuple(_parsed_arm(part.strip()) for part in text.split(",")), every, first)
 
 
-def arms_after(arms: Sequence[str], changes: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the names of all arms by their number in telemetry, those of later interleavings included.
+def arms_after(
+    arms: Sequence[str], changes: Iterable[Mapping[str, Any]], first: int = 0
+) -> tuple[list[str], int]:
+    """Return the names of all arms by their number in telemetry, and the number of the first that runs.
 
     Parameters
     ----------
     arms : sequence of str
         At the start.
     changes : iterable of mapping
-        Changes as telemetry has them.
+        Changes as telemetry has them; those of something else count for nothing.
+    first : int
+        Number of the first that ran before the changes.
     """
     names = list(arms)
     for change in changes:
         values = change.get("changes", {})
-        if ARMS in values and FIRST_ARM in values:
-            first, new = values[FIRST_ARM], values[ARMS]
-            names[first : first + len(new)] = new
-    return names
+        number, new = values.get(FIRST_ARM), values.get(ARMS)
+        if isinstance(number, int) and 0 <= number <= len(names) and isinstance(new, list):
+            names[number : number + len(new)] = map(str, new)
+            first = number
+    return names, first
 
 
 def _parsed_arm(text: str) -> Arm:

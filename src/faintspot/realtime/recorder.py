@@ -101,7 +101,7 @@ class _Waiting:
     def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
         """What a store's attributes say of it."""
         return {
-            "arms": arms_after(reader.description["arms"], self.changes),
+            "arms": arms_after(reader.description["arms"], self.changes)[0],
             "changes": self.changes,
             "dropped_records": self.dropped,
             "dropped_images": self.dropped_images,
