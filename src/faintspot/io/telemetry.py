@@ -40,7 +40,7 @@ _DIMENSIONS = {
     "denoised": ("image", "subaperture", "window_row", "window_column"),
     "image_frame": ("image",),
 }
-NOT_STORED = "sequence"  # of the rings, which a store has no use for
+_NOT_STORED = "sequence"  # of the rings, which a store has no use for
 
 
 @dataclass(frozen=True, repr=False)
@@ -276,8 +276,12 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
 
 def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
     """The fields of a structured array that are stored, by name."""
-    names = items.dtype.names or ()
-    return [(name, items[name]) for name in names if name != NOT_STORED]
+    return [(name, items[name]) for name in stored_names(items.dtype)]
+
+
+def stored_names(kind: np.dtype[np.void]) -> list[str]:
+    """Return the fields of records or images that a store has an array for."""
+    return [name for name in kind.names or () if name != _NOT_STORED]
 
 
 def _dimensions(name: str, count: int) -> tuple[str, ...]:

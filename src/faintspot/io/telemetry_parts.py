@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.telemetry import NOT_STORED, attributes_of, finished_of
+from faintspot.io.telemetry import attributes_of, finished_of, stored_names
 from faintspot.io.zarr_store import read_items
 
 
@@ -65,9 +65,9 @@ class StoredTelemetry:
             When one is missing, or its items have another shape.
         """
         for kind in kinds:
-            for name in kind.names or ():
+            for name in stored_names(kind):
                 wanted = kind[name].shape
-                if name != NOT_STORED and self._array(name).shape[1:] != wanted:
+                if self._array(name).shape[1:] != wanted:
                     raise InputError(
                         f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
                     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
-from faintspot.io.telemetry import NOT_STORED
+from faintspot.io.telemetry import stored_names
 from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page.batch import Batch, Floats, Picture
 from faintspot.live_page.wishes import Wish
@@ -149,9 +149,8 @@ class RecordingSource:
         if self._block[0] != number:
             start, stop = number * together, min((number + 1) * together, self._store.frames)
             records = np.zeros(stop - start, self._type)
-            for name in self._type.names or ():
-                if name != NOT_STORED:
-                    records[name] = self._store.read(name, start, stop)
+            for name in stored_names(self._type):
+                records[name] = self._store.read(name, start, stop)
             self._block = number, records
         return self._block[1]
 
