@@ -11,6 +11,7 @@ EXTRAS = {
     "web": ("matplotlib", "jinja2"),
     "study": ("xarray", "dask", "distributed", "bokeh"),
     "realtime": ("pyshmem", "aotpy"),
+    "live": ("tornado",),
     "loop": ("hcipy",),
     "gpu": ("numba_cuda",),
 }

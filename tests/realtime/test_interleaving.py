@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 from tests.estimate.image_cases import refused
+from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
-from faintspot.realtime.interleaving import Interleaving
+from faintspot.realtime.commands import commands_of
+from faintspot.realtime.interleaving import Interleaving, arms_after
+from faintspot.settings import without_denoising
 
 
 def test_texts() -> None:
@@ -53,3 +59,52 @@ def test_anything_else_is_refused(text: str) -> None:
 def test_every() -> None:
     with pytest.raises(fs.InputError, match="every = 0"):
         Interleaving.parse("none,tv", 0)
+
+
+def test_arms_of_later_interleavings_have_numbers_of_their_own() -> None:
+    changes: list[dict[str, Any]] = [
+        {"changes": {"noise_std": 2.0}},
+        {"changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 5}},
+        {"changes": {"modules": {}}},
+        {"changes": {"arms": ["set"], "first_arm": 4, "every": 5}},
+    ]
+    assert arms_after(["none", "tv"], changes[:1]) == (["none", "tv"], 0)
+    assert arms_after(["none", "tv"], changes) == (["none", "tv", "ml", "set", "set"], 4)
+    # Of a recording, whose arms are all of them already.
+    assert arms_after(["a", "b", "c", "d", "e"], changes[:2]) == (["a", "b", "ml", "set", "e"], 2)
+    garbage: list[dict[str, Any]] = [{}, {"changes": {"arms": "x", "first_arm": 0}}]
+    garbage += [{"changes": {"arms": ["x"], "first_arm": number}} for number in (-1, 9, "0", None)]
+    assert arms_after(["none", "tv"], garbage) == (["none", "tv"], 0)
+
+
+def test_arms_change_while_the_engine_runs(bench: Bench) -> None:
+    handlers = commands_of(bench.engine)
+    frames = simulated(12)
+    ring = bench.ring()
+    bench.attached()
+    for number in range(4):
+        bench.send(ring, number, frames[number])
+    for wrong in ({"arms": "none,nothing"}, {"arms": "ml,none", "every": 0}, {"arms": ["tv"]}, {}):
+        with pytest.raises(fs.InputError):
+            handlers["interleave"](wrong)
+    with pytest.raises(fs.InputError, match="search_range_px = -1"):  # found only when it is prepared
+        handlers["interleave"]({"arms": "none,search_range_px=-1"})
+    assert bench.engine.status()["arms"] == ["set"]
+    handlers["interleave"]({"arms": "none,tv", "every": 2})
+    for number in range(4, 12):
+        bench.send(ring, number, frames[number])
+    status = bench.engine.status()
+    assert (status["arms"], status["every"]) == (["none", "tv"], 2)
+    bench.until(lambda: bench.telemetry.changes_since(0)[0])
+    (change,), _, _ = bench.telemetry.changes_since(0)
+    assert change["changes"] == {"arms": ["none", "tv"], "first_arm": 1, "every": 2}
+    at = change["frame"]
+    assert at in (4, 5)  # was waited for already, or not
+    assert bench.records["arm"].tolist() == [0] * at + [1 + number // 2 % 2 for number in range(at, 12)]
+    for record, frame in zip(bench.records[at:], frames[at:], strict=True):
+        settings = without_denoising(SETTINGS, "") if record["arm"] == 1 else SETTINGS
+        assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
+    handlers["set"]({"changes": {"noise_std": 2.0}})  # the arms stay
+    bench.send(ring, 12, frames[0])
+    assert bench.engine.live.running.interleaving.labels == ["none", "tv"]
+    ring.close()

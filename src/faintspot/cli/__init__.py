@@ -17,6 +17,7 @@ _COMMANDS = {
     "doctor": "Say what is installed, what this machine allows, and what to do about what is missing.",
     "estimators": "List the estimators, or the options of one.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
+    "live": "Show a running engine, or a recording, as a web page.",
     "loop": "Measure what a method gains in a closed adaptive-optics loop, in simulation.",
     "realtime": "Measure frames as they arrive, row by row, and publish slopes in shared memory.",
     "report": "Make a web page of pictures and tables from slopes or a study.",

@@ -42,6 +42,7 @@ for each in (
     realtime_control.top,
     realtime_control.get,
     realtime_control.set_settings,
+    realtime_control.interleave,
     realtime_control.stop_engine,
     realtime_loop.loop,
     realtime_calibrate.calibrate,

@@ -55,8 +55,24 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
     where = None if subapertures is None else parse_subapertures(subapertures)
     wanted = {"changes": parse_changes(changes), "where": where}
     reply = request(socket_path(name), "set", timeout_s=LENGTHY_TIMEOUT_S, **wanted)
-    frame = reply["frame"]
-    click.echo("taken at the next frame" if frame is None else f"in effect from frame {frame}")
+    click.echo(_since(reply["frame"]))
+
+
+@click.command("interleave")
+@_NAME
+@click.argument("arms")
+@click.option(
+    "--every", type=click.IntRange(1), default=50, show_default=True, help="Frames until the next one's turn."
+)
+def interleave(name: str, arms: str, every: int) -> None:
+    """Have settings take turns in a running engine: ARMS as of run --interleave; "set" ends it.
+
+    \b
+    Example:
+      faintspot realtime interleave none,tv --every 100
+    """
+    reply = request(socket_path(name), "interleave", timeout_s=LENGTHY_TIMEOUT_S, arms=arms, every=every)
+    click.echo(_since(reply["frame"]))
 
 
 @click.command("stop")
@@ -109,6 +125,10 @@ def _table(name: str) -> Any:
         value = latency[f"{key}_us"]
         grid.add_row(f"latency {key.replace('_', '.')}, us", "-" if value is None else f"{value:.1f}")
     return grid
+
+
+def _since(frame: int | None) -> str:
+    return "taken at the next frame" if frame is None else f"in effect from frame {frame}"
 
 
 def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import threading
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
 import click
 
+from faintspot.cli.live import page_beside
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.realtime_control import summary
@@ -62,6 +64,7 @@ from faintspot.realtime.private_socket import socket_path
 )
 @click.option("--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="To begin with; see load.")
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
+@click.option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
 def run(
     config: str,
     name: str,
@@ -78,6 +81,7 @@ def run(
     mean_light: float | None,
     modules: tuple[str, ...],
     frames: int | None,
+    live: bool,
 ) -> None:
     """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
 
@@ -135,7 +139,7 @@ def run(
             f"{name}: {len(layout)} sub-apertures, estimator {settings.estimator.name}; waiting for frames, "
             "Ctrl-C stops"
         )
-        with stop_on_signal() as stop:
+        with stop_on_signal() as stop, page_beside(name) if live else nullcontext():
             threading.Thread(target=_stop_when_set, args=(stop, engine), daemon=True).start()
             engine.run(frames)
     click.echo(summary(engine.status()))

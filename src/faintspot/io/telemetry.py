@@ -211,19 +211,7 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
         When it is not a store of telemetry, or damaged.
     """
     store = Path(path)
-    if not store.exists():
-        raise InputError(f"{store}: no such file or directory")
-    try:
-        attributes: dict[str, Any] = json.loads((store / "zarr.json").read_text(encoding="utf-8"))[
-            "attributes"
-        ]
-        known = attributes["format"] == FORMAT and attributes["version"] == 1
-    except (OSError, ValueError, KeyError, TypeError):
-        known = False
-    if not (known and is_store(store)):
-        raise InputError(
-            f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
-        )
+    attributes = attributes_of(store)
     try:
         group: Any = zarr.open_group(str(store), mode="r")
         finished = {"frame": int(attributes[_FRAMES]), "image": int(attributes[_IMAGES]) if images else 0}
@@ -243,6 +231,35 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     except Exception as error:  # a broken store makes zarr raise many things
         raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
     return Telemetry(**arrays, changes=changes, attributes=attributes)
+
+
+def attributes_of(store: Path) -> dict[str, Any]:
+    """Return what a store of telemetry says of itself.
+
+    Raises
+    ------
+    InputError
+        When it is none.
+    """
+    if not store.exists():
+        raise InputError(f"{store}: no such file or directory")
+    try:
+        attributes: dict[str, Any] = json.loads((store / "zarr.json").read_text(encoding="utf-8"))[
+            "attributes"
+        ]
+        known = attributes["format"] == FORMAT and attributes["version"] == 1
+    except (OSError, ValueError, KeyError, TypeError):
+        known = False
+    if not (known and is_store(store)):
+        raise InputError(
+            f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
+        )
+    return attributes
+
+
+def finished_of(attributes: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many frames and images are whole in a store with these attributes."""
+    return int(attributes[_FRAMES]), int(attributes[_IMAGES])
 
 
 def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, Any]) -> None:
@@ -274,8 +291,12 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
 
 def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
     """The fields of a structured array that are stored, by name."""
-    names = items.dtype.names or ()
-    return [(name, items[name]) for name in names if name != _NOT_STORED]
+    return [(name, items[name]) for name in stored_names(items.dtype)]
+
+
+def stored_names(kind: np.dtype[np.void]) -> list[str]:
+    """Return the fields of records or images that a store has an array for."""
+    return [name for name in kind.names or () if name != _NOT_STORED]
 
 
 def _dimensions(name: str, count: int) -> tuple[str, ...]:

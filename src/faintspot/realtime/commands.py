@@ -11,8 +11,9 @@ from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.module_commands import module_commands
 
-LENGTHY = ("set", "load", "swap", "unload")
+LENGTHY = ("set", "interleave", "load", "swap", "unload")
 """Commands that make something anew, which may compile: other commands are answered meanwhile."""
+_USUAL_TURN = 50  # frames
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
@@ -20,7 +21,7 @@ LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, stop, loop, and those for modules."""
+    """Return the commands: status, get, set, interleave, loop, stop, and those for modules."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return engine.status()
@@ -39,6 +40,13 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
             raise
         return {"frame": engine.live.wait(proposed, _EFFECT_TIMEOUT_S)}
 
+    def interleave(fields: dict[str, Any]) -> Mapping[str, Any]:
+        arms, every = fields.get("arms"), fields.get("every", _USUAL_TURN)
+        if not isinstance(arms, str) or not arms:
+            raise InputError(f"arms = {arms!r:.80}: expected a text such as none,tv")
+        change = engine.interleave(arms, int(number_between("every", every, 1, integer=True)))
+        return {"frame": engine.live.wait(change, _EFFECT_TIMEOUT_S)}
+
     def stop(fields: dict[str, Any]) -> Mapping[str, Any]:
         engine.stop()
         return {}
@@ -46,7 +54,8 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
     def loop(fields: dict[str, Any]) -> Mapping[str, Any]:
         return loop_command(engine, fields)
 
-    own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop, "loop": loop}
+    own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
+    own |= {"interleave": interleave, "loop": loop}
     return own | module_commands(engine.modules)
 
 

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,8 @@ from faintspot.realtime.private_socket import (
 
 Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
 """What a command does: takes the request without its command, returns what the reply says."""
+
+Result = TypeVar("Result")
 
 LARGEST_REQUEST = 64 * 1024
 LENGTHY_TIMEOUT_S = 180.0
@@ -225,7 +227,7 @@ class ControlServer:
         if command not in self._lengthy:
             return work()
         async with self._one_at_a_time:
-            return await _in_thread(work)
+            return await in_thread(work)
 
 
 async def _next_line(connection: socket.socket, inbox: bytearray) -> bytes:
@@ -249,12 +251,12 @@ async def _send(connection: socket.socket, reply: bytes) -> None:
         await asyncio.get_running_loop().sock_sendall(connection, reply)
 
 
-async def _in_thread(work: Callable[[], bytes]) -> bytes:
+async def in_thread(work: Callable[[], Result]) -> Result:
     """Wait for what a function returns in a thread of its own; the end of the process waits for neither."""
     loop = asyncio.get_running_loop()
-    done: asyncio.Future[bytes] = loop.create_future()
+    done: asyncio.Future[Result] = loop.create_future()
 
-    def finish(reply: bytes) -> None:
+    def finish(reply: Result) -> None:
         if not done.done():  # else nobody waits any more
             done.set_result(reply)
 

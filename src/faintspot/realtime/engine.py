@@ -15,9 +15,9 @@ from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.control_loop import STATES, ControlLoop
 from faintspot.realtime.engine_modules import EngineModules
-from faintspot.realtime.interleaving import Interleaving
+from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM, Interleaving
 from faintspot.realtime.light_following import LightFollower
-from faintspot.realtime.live import LiveSettings
+from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
@@ -102,7 +102,7 @@ class Engine:
         mean_light: float | None = None,
     ) -> None:
         self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
-        self.interleaving = Interleaving() if interleaving is None else interleaving
+        interleaving = Interleaving() if interleaving is None else interleaving
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
         """What of the real-time scheduling was not permitted."""
@@ -110,13 +110,13 @@ class Engine:
         self._path: MeasuringPath | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the frame that was measured last
-        self._measured = [0 for _ in self.interleaving.arms]
+        self._measured: dict[int, int] = {}  # by an arm's number
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
         prior = None
         if control is not None and control.prediction != NONE:
             prior = np.zeros((1, 2, len(control.interaction) // 2), np.float32)
-        self.preparer = SettingsPreparer(make_pipeline, self.interleaving, self._workers, deadline_s, prior)
+        self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
         self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
         self.modules = EngineModules(self.live, self.preparer)
         self._light = None if mean_light is None else LightFollower(self.live, mean_light)
@@ -137,7 +137,7 @@ class Engine:
                 name,
                 layout,
                 settings=to_text(settings),
-                arms=self.interleaving.labels,
+                arms=interleaving.labels,
                 commands=commands,
                 reference=None if control is None else control.reference,
             )
@@ -153,7 +153,7 @@ class Engine:
 
     def status(self) -> dict[str, Any]:
         """Return counters and latencies as plain values."""
-        ring = self.preparer.ring
+        ring, interleaving = self.preparer.ring, self.live.running.interleaving
         return {
             "name": self.name,
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
@@ -163,7 +163,8 @@ class Engine:
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
-            "arms": self.interleaving.labels,
+            "arms": interleaving.labels,
+            "every": interleaving.every,
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
@@ -176,6 +177,23 @@ class Engine:
         if self.loop is None:
             return {"state": NONE}
         return {**self.loop.status(), "obstacle": self._streams.commands_obstacle()}
+
+    def interleave(self, text: str, every: int) -> Change:
+        """Have other arms take turns; see `Interleaving.parse`. By one thread at a time.
+
+        Raises
+        ------
+        InputError
+            When it is refused; then nothing changes.
+        """
+        before = self.preparer.interleaving
+        new = Interleaving.parse(text, every, before.first + len(before.arms))
+        self.preparer.interleaving = new
+        try:
+            return self.live.renew({ARMS: new.labels, FIRST_ARM: new.first, EVERY: new.every})
+        except BaseException:
+            self.preparer.interleaving = before
+            raise
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -265,7 +283,7 @@ class Engine:
         path, arm = self._take(ring)
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
-        explain = self._images_every > 0 and self._measured[arm] % self._images_every == 0
+        explain = self._images_every > 0 and self._measured.get(arm, 0) % self._images_every == 0
         if self._prediction is not None:
             path.await_start(arrival)
             self._prediction.fill(self._number + 1)
@@ -282,8 +300,8 @@ class Engine:
     def _take(self, ring: PixelRing) -> tuple[MeasuringPath, int]:
         """Return the path of the next frame, and whose turn it is; changes of settings take effect here."""
         prepared = self.live.take(self._number + 1)
-        arm = self.interleaving.arm_of(self.counters.processed)
-        return prepared.paths(ring)[arm], arm
+        place = prepared.interleaving.arm_of(self.counters.processed)
+        return prepared.paths(ring)[place], prepared.interleaving.first + place
 
     def _end_frame(
         self, ring: PixelRing, path: MeasuringPath, arm: int, arrival: int, number: int, explained: bool
@@ -324,7 +342,7 @@ class Engine:
         if self._arrival and number != self._number + 1:
             counters.skipped += max(number - self._number - 1, 0)
             counters.repeated += number <= self._number
-        self._measured[arm] += 1
+        self._measured[arm] = self._measured.get(arm, 0) + 1
         self._arrival, self._number = arrival, number
 
     def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:

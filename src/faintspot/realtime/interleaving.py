@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,8 @@ from faintspot.settings import Settings, without_denoising
 from faintspot.written_changes import parse_changes
 
 _SET, _NONE = "set", "none"
+ARMS, FIRST_ARM, EVERY = "arms", "first_arm", "every"
+"""What a change of the interleaving is in telemetry: names, number of the first, frames of a turn."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +49,13 @@ class Interleaving:
     arms : tuple of Arm
     every : int
         Frames until the next one's turn.
+    first : int
+        Number of the first arm in telemetry: those of an engine's earlier interleaving keep theirs.
     """
 
     arms: tuple[Arm, ...] = (Arm("set", {}),)
     every: int = 1
+    first: int = 0
 
     def __post_init__(self) -> None:
         number_between("every", self.every, 1, integer=True)
@@ -66,7 +72,7 @@ class Interleaving:
         return [arm.label for arm in self.arms]
 
     @classmethod
-    def parse(cls, text: str, every: int = 1) -> Interleaving:
+    def parse(cls, text: str, every: int = 1, first: int = 0) -> Interleaving:
         """Return what a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml" says.
 
         Each arm is "set" (the settings as they are set), "none" (the same without denoising), the name of an
@@ -77,7 +83,31 @@ class Interleaving:
         InputError
             For anything else.
         """
-        return cls(tuple(_parsed_arm(part.strip()) for part in text.split(",")), every)
+        return cls(tuple(_parsed_arm(part.strip()) for part in text.split(",")), every, first)
+
+
+def arms_after(
+    arms: Sequence[str], changes: Iterable[Mapping[str, Any]], first: int = 0
+) -> tuple[list[str], int]:
+    """Return the names of all arms by their number in telemetry, and the number of the first that runs.
+
+    Parameters
+    ----------
+    arms : sequence of str
+        At the start.
+    changes : iterable of mapping
+        Changes as telemetry has them; those of something else count for nothing.
+    first : int
+        Number of the first that ran before the changes.
+    """
+    names = list(arms)
+    for change in changes:
+        values = change.get("changes", {})
+        number, new = values.get(FIRST_ARM), values.get(ARMS)
+        if isinstance(number, int) and 0 <= number <= len(names) and isinstance(new, list):
+            names[number : number + len(new)] = map(str, new)
+            first = number
+    return names, first
 
 
 def _parsed_arm(text: str) -> Arm:

@@ -74,6 +74,8 @@ class PreparedSettings:
         One for every arm.
     settings : Settings
         Those that the arms' own changes are added to.
+    interleaving : Interleaving
+        Whose arms they are.
     modules : mapping of str to Module
         In place of built-in stages, by stage.
     workers : Workers, optional
@@ -92,13 +94,15 @@ class PreparedSettings:
         self,
         pipelines: Sequence[SlopePipeline],
         settings: Settings,
+        interleaving: Interleaving,
         modules: Mapping[str, Module],
         workers: Workers | None,
         budget_s: float,
         prior: NDArray[np.float32] | None = None,
     ) -> None:
-        self.settings, self.layout, self._prior = settings, pipelines[0].layout, prior
+        self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
         self.pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
+        self._prior = prior
         own = [stages_of(pipeline, modules) for pipeline in self.pipelines]
         self._modular = [
             ModularPipeline(pipeline, stages, budget_s=budget_s) if stages else None
@@ -166,7 +170,9 @@ class SettingsPreparer:
         budget_s: float,
         prior: NDArray[np.float32] | None = None,
     ) -> None:
-        self.make_pipeline, self._interleaving = make_pipeline, interleaving
+        self.make_pipeline = make_pipeline
+        self.interleaving = interleaving
+        """In all that is prepared from now on."""
         self._workers, self._budget_s, self._prior = workers, budget_s, prior
         self.ring: PixelRing | None = None
         """Whose frames are being measured, if any."""
@@ -185,7 +191,7 @@ class SettingsPreparer:
         for pipeline in pipelines:
             check_real_time(pipeline)
         made_for = self._workers, self._budget_s, self._prior
-        prepared = PreparedSettings(pipelines, settings, self.modules, *made_for)
+        prepared = PreparedSettings(pipelines, settings, self.interleaving, self.modules, *made_for)
         ring = self.ring
         if ring is not None:
             prepared.paths(ring)
@@ -193,7 +199,7 @@ class SettingsPreparer:
 
     def of_arms(self, settings: Settings) -> list[Settings]:
         """Return the settings of every arm."""
-        return [arm.of(settings) for arm in self._interleaving.arms]
+        return [arm.of(settings) for arm in self.interleaving.arms]
 
 
 class _WritableMemory:

@@ -20,6 +20,7 @@ from faintspot.checks import number_between
 from faintspot.errors import InputError
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.realtime.camera import StopEvent
+from faintspot.realtime.interleaving import arms_after
 from faintspot.realtime.telemetry import TelemetryReader
 
 _POLL_S = 0.01
@@ -97,9 +98,10 @@ class _Waiting:
         self.records, self.images, self.n_bytes = [], [], 0
         return records, images
 
-    def attributes(self) -> dict[str, Any]:
+    def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
         """What a store's attributes say of it."""
         return {
+            "arms": arms_after(reader.description["arms"], self.changes)[0],
             "changes": self.changes,
             "dropped_records": self.dropped,
             "dropped_images": self.dropped_images,
@@ -130,9 +132,8 @@ class Recorder:
             "name": name,
             "layout": reader.description["layout"],
             "settings": reader.settings,
-            "arms": reader.description["arms"],
             "reference": reader.description.get("reference"),
-            **self._waiting.attributes(),
+            **self._waiting.attributes(reader),
         }
         self._store = TelemetryStore(path, reader.record_type, reader.image_type, attributes)
         self._longest_write_s = self._written_at = self._asked_at = 0.0
@@ -205,7 +206,7 @@ class Recorder:
         start = time.monotonic()
         records, images = self._waiting.taken(self._reader)
         try:
-            self._store.append(records, images, {**self._waiting.attributes(), **attributes})
+            self._store.append(records, images, {**self._waiting.attributes(self._reader), **attributes})
         except InputError as error:
             raise InputError(f"{error}; {self._store.frames} frames are in the store") from None
         self._longest_write_s = max(self._longest_write_s, time.monotonic() - start)

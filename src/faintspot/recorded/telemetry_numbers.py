@@ -96,14 +96,28 @@ def quantities(telemetry: Telemetry) -> dict[str, Floats]:
 
 
 def arms_in_turn(telemetry: Telemetry, values: Floats) -> list[ArmDifference]:
-    """Compare the arms in a number for each frame; each turn with the first arm's turn of the same count.
+    """Compare the arms in a number for each frame; see `compared_arms`."""
+    return compared_arms(telemetry.arm, arm_names(telemetry), values)
+
+
+def compared_arms(arms: NDArray[np.int64], names: Sequence[str], values: Floats) -> list[ArmDifference]:
+    """Compare arms in turn in a number for each frame; each turn with the first arm's turn of the same count.
 
     Intervals come from a bootstrap of blocks of ten neighbouring turns.
+
+    Parameters
+    ----------
+    arms : (n,) array
+        Of each frame.
+    names : sequence of str
+        Of the arms that have frames, by number.
+    values : (n,) array
+        NaN: not known of that frame.
     """
-    by_turn = [_by_turn(telemetry.arm, arm, values) for arm in np.unique(telemetry.arm)]
+    by_turn = [_by_turn(arms, arm, values) for arm in np.unique(arms)]
     first = by_turn[0]
     compared = []
-    for place, (name, own) in enumerate(zip(arm_names(telemetry), by_turn, strict=True)):
+    for place, (name, own) in enumerate(zip(names, by_turn, strict=True)):
         length = min(len(own), len(first))
         difference = None if place == 0 else _mean(own[:length] - first[:length], len(by_turn) - 1)
         compared.append(ArmDifference(name, _mean(own), difference))

@@ -1,0 +1,128 @@
+"""What does the engine notice of a page that is watched?
+
+Camera, engine and page run as processes of their own; four clients of the page read all that comes, and one
+does not read at all. The page takes turns of some seconds with its absence (it is stopped, and goes on), in
+one run of the engine, so that both see the same neighbours. Latencies are those of the engine's own records,
+from the last row's arrival to the slopes' publication; they are read once at each turn's end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+from tornado.httpclient import HTTPRequest
+from tornado.websocket import WebSocketClientConnection, websocket_connect
+
+from benchmarks.measuring import Row, Table, Times, median_ratio, spread
+from benchmarks.realtime_processes import SMALL, USUAL, engine_and_camera
+from faintspot.realtime.telemetry import TelemetryReader
+
+RATE_HZ, TURN_S, TURNS = 300, 5.0, 8
+READING, SLOW = 4, 1
+PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
+_FEWEST_UPDATES_HZ = 10.0
+
+
+def run() -> list[Table]:
+    """Measure latencies with and without clients."""
+    camera = ["--rate", str(RATE_HZ), "--rows-per-block", "4", "--flux-e", "200"]
+    engine = ["--images-every", "30"]
+    with engine_and_camera({**SMALL, **USUAL}, camera, engine) as processes:
+        processes.until_processed(3 * RATE_HZ)
+        with _page(processes.name) as (page, url):
+            latencies, updates_hz = asyncio.run(_turns(processes.name, page, url))
+    rows = []
+    for name, percent in PERCENTILES.items():
+        times: Times = {
+            arm: np.array([np.percentile(each, percent) for each in found])
+            for arm, found in latencies.items()
+        }
+        ratio = median_ratio(times, "watched", "alone")
+        values = {arm: float(np.median(each)) for arm, each in times.items()} | {"ratio": ratio}
+        known = {"ratio": spread(times, lambda each: median_ratio(each, "watched", "alone"))}
+        rows.append(Row(name, values, spread=known))
+    updates = Row(
+        "updates of each client that reads",
+        {"per second": updates_hz},
+        f">= {_FEWEST_UPDATES_HZ:g}",
+        updates_hz >= _FEWEST_UPDATES_HZ,
+    )
+    note = (
+        f"{TURNS} turns of {TURN_S:g} s each at {RATE_HZ} frames/s, {READING} clients that read and {SLOW} "
+        "that does not; medians of the turns, us, and the median of their ratios"
+    )
+    return [
+        Table("live", "From the last row to the slopes, page watched and not there, us", rows, [note]),
+        Table("live-updates", "What the page's clients get", [updates]),
+    ]
+
+
+async def _turns(
+    name: str, page: subprocess.Popen[str], url: str
+) -> tuple[dict[str, list[NDArray[np.float64]]], float]:
+    """Return latencies (us) of every turn by arm, and how often a client was told of new frames."""
+    reader = TelemetryReader.attach(name)
+    clients = [await _client(url) for _ in range(READING + SLOW)]
+    counts = [0] * READING
+    reading = [asyncio.ensure_future(_read(client, counts, i)) for i, client in enumerate(clients[:READING])]
+    found: dict[str, list[NDArray[np.float64]]] = {"alone": [], "watched": []}
+    watched_s, updates = 0.0, 0
+    for turn in range(2 * TURNS):
+        arm = "watched" if turn % 2 else "alone"
+        os.kill(page.pid, signal.SIGCONT if arm == "watched" else signal.SIGSTOP)
+        await asyncio.sleep(0.5)  # the page takes up what it missed
+        before, cursor = sum(counts), reader.newest
+        await asyncio.sleep(TURN_S)
+        records, _, _ = reader.records_since(cursor)
+        found[arm].append((records["published_time_ns"] - records["last_row_time_ns"]) / 1e3)
+        if arm == "watched":
+            watched_s += TURN_S
+            updates += sum(counts) - before
+    for task in reading:
+        task.cancel()
+    for client in clients:
+        client.close()
+    reader.close()
+    return found, updates / READING / watched_s
+
+
+async def _client(url: str) -> WebSocketClientConnection:
+    """Open a web socket as the page does; one that is not read takes no more than one message."""
+    host = urlsplit(url).netloc
+    request = HTTPRequest(f"ws://{host}/stream", headers={"Origin": f"http://{host}"})
+    client = await websocket_connect(request, max_message_size=1 << 26)
+    await client.write_message(json.dumps({"do": "hello"}))
+    return client
+
+
+async def _read(client: WebSocketClientConnection, counts: list[int], place: int) -> None:
+    """Read for ever, and count the messages that say what the newest frame is."""
+    while (message := await client.read_message()) is not None:
+        counts[place] += isinstance(message, bytes) and b'"kind": "now"' in message[:40]
+
+
+@contextmanager
+def _page(name: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Serve the page of an engine; return its process and address."""
+    command = [sys.executable, "-m", "faintspot", "live", "--name", name, "--port", "0"]
+    page = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert page.stdout is not None
+        url = page.stdout.readline().strip()
+        time.sleep(2.0)  # it has imported all that it needs
+        yield page, url
+    finally:
+        page.send_signal(signal.SIGCONT)
+        page.terminate()
+        page.communicate()

@@ -1,0 +1,78 @@
+"""faintspot live: a web page of a running engine, or of a recording."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from faintspot.cli.needs import needs
+from faintspot.extras import require
+
+if TYPE_CHECKING:
+    from faintspot.live_page.server import LiveServer
+
+_NICENESS = 10  # the engine comes first
+
+
+@needs("live", "tornado", "pyshmem", "zarr")
+@click.command(short_help="Show a running engine, or a recording, as a web page.")
+@click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
+@click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+@click.option(
+    "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Of this machine, to listen on."
+)
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8642, show_default=True, help="0: any that is free."
+)
+@click.option("--private", is_flag=True, help="Watching needs the token also on this machine.")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=".",
+    help="For recordings that the page begins. Default: this one.",
+)
+def command(recording: Path | None, name: str, bind: str, port: int, private: bool, folder: Path) -> None:
+    """Serve a web page of the running engine NAME until Ctrl-C.
+
+    It shows frames, slopes, flux, validity, latencies and arms in turn, as they are. Whoever has the address
+    that is printed may change settings; without its end, from # on, a browser on this machine may watch. It
+    reads the engine's telemetry as a recorder does: the engine waits for nobody.
+
+    \b
+    Examples:
+      faintspot live
+      faintspot live night.zarr
+    """
+    from faintspot.cli.realtime_camera import stop_on_signal
+    from faintspot.live_page.serving import serve_engine, serve_recording
+
+    os.nice(_NICENESS)
+    with stop_on_signal() as stop:
+        if recording is not None:
+            serve_recording(recording, stop, _say, address=bind, port=port, private=private)
+        else:
+            serve_engine(name, stop, _say, address=bind, port=port, private=private, folder=folder)
+
+
+@contextmanager
+def page_beside(name: str) -> Iterator[None]:
+    """Serve the page of an engine in a process of its own, which ends with this one's work."""
+    require("live", "tornado", purpose="--live")
+    process = subprocess.Popen([sys.executable, "-m", "faintspot", "live", "--name", name])
+    try:
+        yield
+    finally:
+        process.terminate()  # harmless where Ctrl-C has ended it already
+        process.wait()
+
+
+def _say(server: LiveServer) -> None:
+    """Print where the page is."""
+    click.echo(f"{server.url}\nOpen it in a browser; Ctrl-C ends it")

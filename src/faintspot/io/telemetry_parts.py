@@ -1,0 +1,92 @@
+"""Reading a store of telemetry in parts: more than memory holds, or while it is played."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_zarr
+from faintspot.io.telemetry import attributes_of, finished_of, stored_names
+from faintspot.io.zarr_store import read_items
+
+
+class StoredTelemetry:
+    """A store of telemetry, as it is when this is made, also while it is still written.
+
+    Parameters
+    ----------
+    path : path
+        The Zarr store.
+
+    Attributes
+    ----------
+    path : Path
+    attributes : dict
+        As `Telemetry.attributes`.
+    changes : list of dict
+        As `Telemetry.changes`.
+    frames, images : int
+        That are whole in the store.
+
+    Raises
+    ------
+    InputError
+        When it is not a store of telemetry, or damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.attributes = attributes_of(self.path)
+        try:
+            self._group: Any = load_zarr().open_group(str(self.path), mode="r")
+            self.frames, self.images = finished_of(self.attributes)
+            self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
+            self.frames_together = int(self._group["x"].chunks[0])
+            """Frames in one chunk of slopes, which is read as a whole."""
+        except Exception as error:  # a broken store makes zarr raise many things
+            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None
+
+    def __contains__(self, name: str) -> bool:
+        """Whether there is such an array."""
+        return name in self._group
+
+    def check_shapes(self, kinds: Sequence[np.dtype[np.void]]) -> None:
+        """Refuse a store whose arrays are not those of such records and images.
+
+        Raises
+        ------
+        InputError
+            When one is missing, or its items have another shape.
+        """
+        for kind in kinds:
+            for name in stored_names(kind):
+                wanted = kind[name].shape
+                if self._array(name).shape[1:] != wanted:
+                    raise InputError(
+                        f"{self.path}: the store is damaged ({name}: expected items of {wanted})"
+                    )
+
+    def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of an array, by its name in `Telemetry`.
+
+        Raises
+        ------
+        InputError
+            When the store is damaged there.
+        """
+        array = self._array(name)
+        if stop > array.shape[0]:
+            raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")
+        return np.asarray(read_items(self.path, array, start, stop, whole=False))
+
+    def _array(self, name: str) -> Any:
+        try:
+            return self._group[name]
+        except Exception as error:  # as above
+            raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None

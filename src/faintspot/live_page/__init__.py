@@ -1,0 +1,1 @@
+"""A web page of the running engine, or of a recording."""

@@ -1,0 +1,115 @@
+"""A running engine as the page sees it: through shared memory, as any recorder does."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from faintspot.errors import InputError
+from faintspot.live_page.batch import Batch, Picture
+from faintspot.live_page.streams import NewestOfStream
+from faintspot.realtime.telemetry import TelemetryReader
+from faintspot.realtime.telescope import TRUTH
+from faintspot.sensor.layout import Layout
+
+_STALE_S = 0.25  # between two questions whether the engine lives
+_TRUTH_FIELDS = tuple(TRUTH.index(name) for name in ("strehl", "rms_nm"))
+
+
+class EngineSource:
+    """Telemetry of the engine of a name, the truth and commands where there are any.
+
+    It waits for the engine, and for its return.
+
+    Parameters
+    ----------
+    name : str
+        The engine's.
+
+    Raises
+    ------
+    MissingExtraError
+        Without pyshmem.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.layout: Layout | None = None
+        self.arms: list[str] = []
+        self._reader: TelemetryReader | None = None
+        self._truth, self._commands = NewestOfStream(f"{name}_truth"), NewestOfStream(f"{name}_commands")
+        self._cursors = [0, 0, 0]  # records, images, changes
+        self._asked_s = 0.0
+
+    def read(self) -> Batch | None:
+        """Return what came since the last call; None while there is no engine."""
+        anew = self._reader is None and self._attached()
+        reader = self._reader
+        if reader is None:
+            return None
+        truth = self._newest_truth()
+        # Images first: the record of each was written before it, so that it is among these or older ones.
+        images, self._cursors[1], _ = reader.images_since(max(self._cursors[1], reader.newest_image - 1))
+        records, self._cursors[0], missed = reader.records_since(self._cursors[0])
+        changes, self._cursors[2], _ = reader.changes_since(self._cursors[2])
+        picture = None
+        if len(images):
+            newest = images[-1]
+            picture = Picture(int(newest["image_frame"]), newest["raw"], newest["denoised"])
+        if not len(records):
+            self._let_go_if_stale(reader)
+        commands = self._commands.take()
+        return Batch(
+            records,
+            missed,
+            picture,
+            truth=truth,
+            commands=None if commands is None else commands[1],
+            changes=changes,
+            anew=anew,
+        )
+
+    def place(self) -> dict[str, Any]:
+        """Say whether there is an engine."""
+        there = self._reader is not None
+        return {"kind": "engine", "name": self.name, "there": there}
+
+    def close(self) -> None:
+        """Let go of shared memory."""
+        self._truth.close()
+        self._commands.close()
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _attached(self) -> bool:
+        """Look for the engine's telemetry; return whether it is there."""
+        try:
+            reader = TelemetryReader.attach(self.name)
+        except InputError:
+            return False
+        if reader.stale:
+            reader.close()
+            return False
+        self._reader, self.layout = reader, reader.layout
+        self.arms = reader.description["arms"]
+        self._cursors = [reader.newest, max(0, reader.newest_image - 1), 0]
+        return True
+
+    def _let_go_if_stale(self, reader: TelemetryReader) -> None:
+        """Give up an engine that has ended, when all that it left behind has been read."""
+        if time.monotonic() - self._asked_s < _STALE_S:
+            return
+        self._asked_s = time.monotonic()
+        if reader.stale:
+            reader.close()
+            self._reader = None
+
+    def _newest_truth(self) -> tuple[int, float, float] | None:
+        taken = self._truth.take()
+        if taken is None or len(taken[1]) != len(TRUTH):
+            return None
+        strehl, rms_nm = taken[1][list(_TRUTH_FIELDS)]
+        return (taken[0], float(strehl), float(rms_nm)) if np.isfinite([strehl, rms_nm]).all() else None

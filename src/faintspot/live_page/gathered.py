@@ -1,0 +1,255 @@
+"""What the page knows of the frames so far: the newest one, and a few numbers of each of the last minute."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.live_page.batch import Batch, Floats
+from faintspot.realtime.interleaving import arms_after
+from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
+
+STRIP_S = 30.0
+"""What strip charts show."""
+FRAMES_S = 60.0
+"""What percentiles, the histogram and the arms' figures are of."""
+_MOST_FRAMES = 1 << 17  # also of cameras that are very fast
+_MOST_CHANGES = 20  # that are kept to be shown
+_MEAN_FRAMES = 500  # over which a sub-aperture's mean slope is taken, about which the rms is
+_FEWEST_FRAMES = 10  # of which a mean is one
+_STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
+"""A row of the strip charts: what one look at the telemetry gave."""
+_FRAME = ("time_s", "arm", "latency_us", "rms_px", "flux_e", "valid", "strehl")
+"""A row of the last frames."""
+_BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
+_COMPARED = {
+    "rms of slopes (px)": ("rms_px", 1.0),
+    "flux (e-)": ("flux_e", 1.0),
+    "valid (%)": ("valid", 100.0),
+    "latency (µs)": ("latency_us", 1.0),
+    "Strehl ratio": ("strehl", 1.0),
+}
+
+
+class Gathered:
+    """Numbers of the frames of one engine or recording.
+
+    Parameters
+    ----------
+    arms : list of str
+        Names of the arms of settings in turn; none or one without.
+    """
+
+    def __init__(self, arms: list[str]) -> None:
+        self.arms = list(arms)
+        self.newest: NDArray[Any] | None = None
+        """Record of the newest frame."""
+        self.changes: list[dict[str, Any]] = []
+        self.seen = self.lost = self.missed = 0
+        """Frames, frame numbers that did not come, and records that the page was too slow for."""
+        self.commands: Floats | None = None
+        self._strip: deque[tuple[float, ...]] = deque()
+        self._frames: deque[Floats] = deque()
+        self._first_arm = 0  # of the interleaving that runs
+        self._means: dict[int, Floats] = {}  # of the slopes, by arm, and of how many frames
+        self._seen_of: defaultdict[int, int] = defaultdict(int)
+        # The last ones: a frame's truth may be known before its record.
+        self._truths: deque[tuple[int, float, float]] = deque(maxlen=4)
+        self._last: NDArray[Any] | None = None  # records of the look before
+
+    def add(self, batch: Batch) -> None:
+        """Take in what came."""
+        self.changes = (self.changes + batch.changes)[-_MOST_CHANGES:]
+        self.arms, self._first_arm = arms_after(self.arms, batch.changes, self._first_arm)
+        self.missed += batch.missed
+        if batch.commands is not None:
+            self.commands = batch.commands
+        if batch.truth is not None:
+            self._truths.append(batch.truth)
+        records = batch.records
+        if not len(records):
+            return
+        rows = self._rows(records)
+        for frame, strehl, _ in self._truths:  # known of a few frames alone
+            rows[records["frame"] == frame, _FRAME.index("strehl")] = strehl
+        lost = self._lost_in(records)
+        self.seen, self.lost = self.seen + len(records), self.lost + lost
+        self.newest, self._last = records[-1].copy(), records
+        self._frames.append(rows)
+        self._strip.append(self._strip_row(rows, lost, batch))
+        self._forget(rows[-1, 0])
+
+    def record_of(self, frame: int) -> NDArray[Any] | None:
+        """Return the record of a frame of the last look, None where it is older."""
+        if self._last is None:
+            return None
+        places = np.flatnonzero(self._last["frame"] == frame)
+        return self._last[places[-1]] if len(places) else None
+
+    # What the page is sent ------------------------------------------------------------------------------
+
+    def now(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return values and arrays of the newest frame, and of the strip charts."""
+        newest = self.newest
+        strip = np.array(self._strip, np.float64).reshape(-1, len(_STRIP))
+        if len(strip):
+            strip[:, 0] -= strip[-1, 0]
+        values: dict[str, Any] = {
+            "strip": _STRIP,
+            "strip_s": STRIP_S,
+            "seen": self.seen,
+            "lost": self.lost,
+            "missed": self.missed,
+        }
+        arrays: dict[str, NDArray[Any]] = {"strip": strip.astype(np.float32)}
+        if newest is not None:
+            values |= {"frame": int(newest["frame"]), "arm": self._arm_name(int(newest["arm"]))}
+            arrays |= {name: newest[name] for name in ("x", "y", "flux", "flags")}
+        if self.commands is not None:
+            arrays["commands"] = self.commands.astype(np.float32)
+        return values, arrays
+
+    def figures(self) -> dict[str, Any]:
+        """Return rate, percentiles, histogram and changes; takes milliseconds."""
+        frames = self._all_frames()
+        if not len(frames):
+            return {"frames": 0}
+        latency = frames[:, _FRAME.index("latency_us")]
+        counts, _ = np.histogram(np.clip(latency, _BIN_EDGES_US[0], _BIN_EDGES_US[-1]), _BIN_EDGES_US)
+        used = np.flatnonzero(counts)
+        shown = slice(max(used[0] - 1, 0), used[-1] + 2)
+        seconds = frames[-1, 0] - frames[0, 0]
+        return {
+            "frames": len(frames),
+            "seconds": seconds,
+            "rate_hz": (len(frames) - 1) / seconds if seconds > 0 else None,
+            "percentiles_us": dict(
+                zip(("50", "99", "99.9"), np.percentile(latency, (50, 99, 99.9)), strict=True)
+            ),
+            "longest_us": latency.max(),
+            "histogram": {"from_us": _BIN_EDGES_US[:-1][shown], "counts": counts[shown]},
+            "changes": self.changes,
+        }
+
+    def arms_compared(self) -> list[dict[str, Any]]:
+        """Return the figures of the arms in turn now, with errors; empty where there is only one.
+
+        Takes some 50 ms, most of it for the bootstrap of the errors.
+        """
+        frames = self._all_frames()
+        frames = frames[frames[:, _FRAME.index("arm")] >= self._first_arm]
+        arm = frames[:, _FRAME.index("arm")].astype(np.int64)
+        present = np.unique(arm)
+        if len(present) < 2:
+            return []
+        names = [self._arm_name(place) for place in present]
+        rows: list[dict[str, Any]] = [
+            {"arm": name, "frames": int(np.sum(arm == place)), "figures": {}}
+            for name, place in zip(names, present, strict=True)
+        ]
+        for title, (column, factor) in _COMPARED.items():
+            values = factor * frames[:, _FRAME.index(column)]
+            if np.isfinite(values).any():
+                for row, compared in zip(rows, compared_arms(arm, names, values), strict=True):
+                    row["figures"][title] = _in_plain(compared)
+        return rows
+
+    # Of one look -----------------------------------------------------------------------------------------
+
+    def _rows(self, records: NDArray[Any]) -> Floats:
+        """Return a row of `_FRAME` for each record."""
+        valid = (records["flags"] & INVALID) == 0
+        count = valid.sum(axis=1)
+        some = np.where(count > 0, count, np.nan)
+        rows = np.full((len(records), len(_FRAME)), np.nan)
+        columns: Mapping[str, Any] = {
+            "time_s": records["last_row_time_ns"] / 1e9,
+            "arm": records["arm"],
+            "latency_us": (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3,
+            "rms_px": self._rms(records, valid, some),
+            "flux_e": np.where(valid, records["flux"], 0.0).sum(axis=1) / some,
+            "valid": valid.mean(axis=1),
+        }
+        for name, values in columns.items():
+            rows[:, _FRAME.index(name)] = values
+        return rows
+
+    def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
+        """Return the rms of each frame's slopes about the sub-apertures' running means in their arm."""
+        squares = np.full(len(records), np.nan)
+        for arm in np.unique(records["arm"]):
+            own = records["arm"] == arm
+            self._seen_of[int(arm)] += own.sum()
+            used = valid[own]
+            slopes = np.stack([records["x"][own], records["y"][own]]).astype(np.float64)
+            mean = np.where(used, slopes, 0.0).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
+            before = self._means.get(int(arm), mean)
+            weight = min(1.0, own.sum() / _MEAN_FRAMES)
+            self._means[int(arm)] = before + weight * (mean - before)
+            if self._seen_of[int(arm)] < _FEWEST_FRAMES:
+                continue
+            deviation = np.where(used, slopes - self._means[int(arm)][:, None], 0.0)
+            squares[own] = np.sum(deviation**2, axis=(0, 2))
+        return np.asarray(np.sqrt(squares / (2 * some)))
+
+    def _lost_in(self, records: NDArray[Any]) -> int:
+        """Return how many frame numbers did not come; none where the camera began anew."""
+        frames = records["frame"]
+        if self.newest is not None:
+            frames = np.concatenate([[self.newest["frame"]], frames])
+        steps = np.diff(frames) - 1
+        return int(steps[steps > 0].sum())
+
+    def _strip_row(self, rows: Floats, lost: int, batch: Batch) -> tuple[float, ...]:
+        latency, rms, flux = (rows[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))
+        return (
+            rows[-1, 0],
+            float(np.median(latency)),
+            float(latency.max()),
+            _mean(rms),
+            _mean(flux),
+            float(lost + batch.missed),
+            *(self._truths[-1][1:] if self._truths else (np.nan, np.nan)),
+        )
+
+    def _forget(self, now_s: float) -> None:
+        """Let go of what is too old."""
+        while self._strip and not now_s - STRIP_S <= self._strip[0][0] <= now_s:
+            self._strip.popleft()
+        most = sum(len(rows) for rows in self._frames)
+        while self._frames and (self._frames[0][-1, 0] < now_s - FRAMES_S or most > _MOST_FRAMES):
+            most -= len(self._frames.popleft())
+
+    def _all_frames(self) -> Floats:
+        return np.concatenate([np.empty((0, len(_FRAME))), *self._frames])
+
+    def _arm_name(self, arm: int) -> str:
+        return self.arms[arm] if arm < len(self.arms) else f"arm {arm}"
+
+
+def flag_names() -> list[dict[str, Any]]:
+    """Return the flags that a sub-aperture may have, for the page's legend."""
+    return [
+        {"bit": int(flag), "name": str(flag.name).lower().replace("_", " "), "invalid": bool(flag & INVALID)}
+        for flag in SubapertureFlag
+    ]
+
+
+def _in_plain(compared: ArmDifference) -> dict[str, Any]:
+    """A figure with its half interval, and by how much it differs from the first arm's."""
+    mean, difference = compared.mean, compared.difference
+    row: dict[str, Any] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
+    if difference is not None:
+        row |= {"difference": difference.value, "difference_half": (difference.high - difference.low) / 2}
+        row["decided"] = difference.decided
+    return row
+
+
+def _mean(values: Floats) -> float:
+    kept = values[np.isfinite(values)]
+    return float(kept.mean()) if len(kept) else np.nan

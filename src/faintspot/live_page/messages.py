@@ -1,0 +1,48 @@
+"""What the page is sent: values as JSON and arrays behind them, in one binary message.
+
+Four bytes with the length of the JSON text, little-endian; the text, padded to eight bytes:
+{"kind": ..., "values": {...}, "arrays": {name: [type, shape, offset]}}; the arrays, each padded to eight
+bytes; offsets count from the first.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_ALIGN = 8
+
+
+def packed(kind: str, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None) -> bytes:
+    """Return a message; numbers that are not finite become null in values, and stay in arrays."""
+    described: dict[str, Any] = {}
+    blocks: list[bytes] = []
+    offset = 0
+    for name, array in (arrays or {}).items():
+        data = array.tobytes()
+        described[name] = [array.dtype.name, list(array.shape), offset]
+        blocks += [data, bytes(-len(data) % _ALIGN)]
+        offset += len(data) + len(blocks[-1])
+    head = {"kind": kind, "values": plain(values), "arrays": described}
+    text = json.dumps(head, allow_nan=False).encode()
+    text += b" " * (-(len(text) + 4) % _ALIGN)
+    return b"".join([struct.pack("<I", len(text)), text, *blocks])
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON can hold: null for numbers that are not finite, lists for arrays."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

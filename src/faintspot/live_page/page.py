@@ -1,0 +1,76 @@
+"""The page's own work: look at the source ten times a second and say what has changed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from faintspot.errors import InputError
+from faintspot.live_page.batch import Source
+from faintspot.live_page.gathered import Gathered, flag_names
+from faintspot.live_page.messages import packed
+from faintspot.live_page.pictures import FrameDrawing
+
+UPDATE_S = 0.08
+"""Between two updates of the page."""
+_FIGURES_S, _ARMS_S = 0.5, 2.0
+
+
+class Page:
+    """Looks at a source and tells what the page is to show; by one thread.
+
+    Parameters
+    ----------
+    source : Source
+    tell : function
+        Given kind and message (None: what was told of that kind is not so any more).
+    """
+
+    def __init__(self, source: Source, tell: Callable[[str, bytes | None], None]) -> None:
+        self.source, self._tell = source, tell
+        self.gathered = Gathered([])
+        self._drawing: FrameDrawing | None = None
+        self._figures_s = self._arms_s = 0.0
+        self._arms: list[dict[str, Any]] = []
+        self._place: dict[str, Any] | None = None
+
+    def step(self) -> None:
+        """Look once."""
+        try:
+            batch = self.source.read()
+            place = self.source.place()
+        except InputError as error:  # a damaged recording
+            batch, place = None, {**self.source.place(), "error": str(error)}
+        if batch is not None:
+            if batch.anew or self._drawing is None:
+                self._begin()
+            self.gathered.add(batch)
+            if batch.picture is not None and self._drawing is not None:
+                record = self.gathered.record_of(batch.picture.frame)
+                self._tell("pictures", self._drawing.message(batch.picture, record))
+            if len(batch.records) or batch.anew:
+                self._tell("now", packed("now", *self.gathered.now()))
+            self._tell_figures(now=batch.anew)
+        if place != self._place:
+            self._place = place
+            self._tell("place", packed("place", place))
+
+    def _begin(self) -> None:
+        """Forget what another engine, or another part of the recording, has given."""
+        layout = self.source.layout
+        assert layout is not None
+        self.gathered = Gathered(self.source.arms)
+        if self._drawing is None or self._drawing.layout is not layout:
+            self._drawing = FrameDrawing(layout)
+            self._tell("pictures", None)
+            self._tell("sensor", self._drawing.sensor())
+
+    def _tell_figures(self, now: bool) -> None:
+        moment = time.monotonic()
+        if now or moment - self._figures_s >= _FIGURES_S:
+            self._figures_s = moment
+            if now or moment - self._arms_s >= _ARMS_S:
+                self._arms_s, self._arms = moment, self.gathered.arms_compared()
+            values = {**self.gathered.figures(), "arms": self._arms, "flags": flag_names()}
+            self._tell("figures", packed("figures", values))

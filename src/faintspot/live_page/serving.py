@@ -1,0 +1,101 @@
+"""The page of an engine or a recording, from beginning to end."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from faintspot.live_page.access import Access
+from faintspot.live_page.engine_source import EngineSource
+from faintspot.live_page.recording_source import RecordingSource
+from faintspot.live_page.server import LiveServer
+from faintspot.live_page.status import StatusPoller
+from faintspot.live_page.wishes import EngineWishes
+from faintspot.realtime.camera import StopEvent
+
+PORT = 8642
+
+
+def serve_engine(
+    name: str,
+    stop: StopEvent,
+    ready: Callable[[LiveServer], None],
+    *,
+    address: str = "127.0.0.1",
+    port: int = PORT,
+    private: bool = False,
+    folder: str | Path = ".",
+) -> None:
+    """Serve the page of a running engine until `stop` is set.
+
+    Parameters
+    ----------
+    name : str
+        The engine's; it may come later, and go and come back.
+    stop : event
+    ready : function
+        Called when clients may come.
+    address : str
+        To bind to; with another one than this machine's own (127.0.0.1), reading needs the token, too.
+    port : int
+        0: any free one.
+    private : bool
+        Whether watching needs the token also on this machine.
+    folder : path
+        For recordings that the page begins.
+
+    Raises
+    ------
+    InputError
+        When the address is not one, or cannot be bound.
+    MissingExtraError
+        Without tornado or pyshmem.
+    """
+
+    async def work() -> None:
+        source, wishes = EngineSource(name), EngineWishes(name, folder)
+        server = LiveServer(source, wishes, Access(address, private), address, port)
+
+        def told(kind: str, values: dict[str, Any]) -> None:
+            server.tell(
+                kind, {**values, "recording": wishes.recording.status()} if kind == "status" else values
+            )
+
+        poller = StatusPoller(name, told)
+        try:
+            ready(server)
+            await server.run(stop)
+        finally:
+            poller.close()
+            wishes.close()
+            source.close()
+
+    asyncio.run(work())
+
+
+def serve_recording(
+    path: str | Path,
+    stop: StopEvent,
+    ready: Callable[[LiveServer], None],
+    *,
+    address: str = "127.0.0.1",
+    port: int = PORT,
+    private: bool = False,
+) -> None:
+    """Serve the page of a recording until `stop` is set; see `serve_engine`.
+
+    Raises
+    ------
+    InputError
+        When it is not a recording, and for addresses as `serve_engine`.
+    """
+
+    async def work() -> None:
+        source = RecordingSource(path)
+        server = LiveServer(source, source, Access(address, private), address, port)
+        ready(server)
+        await server.run(stop)
+
+    asyncio.run(work())

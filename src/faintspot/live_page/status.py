@@ -1,0 +1,106 @@
+"""What the engine says of itself on its control channel, asked now and then in a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from faintspot.errors import InputError
+from faintspot.estimators.documentation import allowed_in_words
+from faintspot.estimators.registry import estimators
+from faintspot.realtime.control import request
+from faintspot.realtime.private_socket import socket_path
+from faintspot.settings import SharedOptions
+
+_EVERY_S = 0.5
+_PATIENCE_S = 3.0
+_FEW = 4  # values of sub-apertures that are shown one by one
+
+
+class StatusPoller:
+    """Asks for status, and for settings where they have changed.
+
+    Parameters
+    ----------
+    name : str
+        The engine's.
+    tell : function
+        Given kind ("status" or "settings") and values, from the poller's thread.
+    """
+
+    def __init__(self, name: str, tell: Callable[[str, dict[str, Any]], None]) -> None:
+        self._path, self._tell = socket_path(name), tell
+        self._stopping = threading.Event()
+        self._known: tuple[Any, ...] | None = None
+        self._thread = threading.Thread(target=self._run, name="faintspot-status", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ask no more."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._ask()
+            except InputError as error:
+                self._known = None
+                self._tell("status", {"there": False, "error": str(error)})
+            self._stopping.wait(_EVERY_S)
+
+    def _ask(self) -> None:
+        status = request(self._path, "status", timeout_s=_PATIENCE_S)
+        # Before the settings are asked for: what changes in between is asked for again.
+        counters, source = status["counters"], status["source"]
+        version = (counters["settings_changes"], status["estimator"], source and source["pid"])
+        self._tell("status", {"there": True, **status})
+        if version != self._known:
+            values = request(self._path, "get", timeout_s=_PATIENCE_S)["settings"]
+            self._tell("settings", {"settings": settings_rows(values)})
+            self._known = version
+
+
+def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return settings as rows of a form: name, value as text, meaning, what is allowed, choices.
+
+    Parameters
+    ----------
+    values : dict
+        As the engine's "get" answers.
+    """
+    kinds = estimators()
+    kind = kinds.get(str(values.get("estimator")))
+    declared = {**(kind.declared() if kind is not None else {}), **SharedOptions.declared()}
+    rows = []
+    for name, value in values.items():
+        row = {"name": name, "value": _as_text(value), "meaning": "", "allowed": "", "choices": []}
+        if name == "estimator":
+            row |= {"meaning": "How a position is found.", "choices": list(kinds)}
+        elif name in declared:
+            option = declared[name]
+            row |= {"meaning": option.meaning, "allowed": allowed_in_words(option), "unit": option.unit}
+            row["choices"] = list(option.choices) if isinstance(value, str) else []
+        rows.append(row)
+    return rows
+
+
+def _as_text(value: Any) -> str:
+    """Write a value as a person would for `faintspot realtime set`; many are told by their ends."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if not isinstance(value, list):
+        return f"{value:.6g}" if isinstance(value, float) else str(value)
+    distinct = set(map(str, value))
+    if len(distinct) == 1:
+        return _as_text(value[0])
+    if len(value) <= _FEW:
+        return ",".join(_as_text(item) for item in value)
+    numbers = [item for item in value if isinstance(item, int | float)]
+    ends = (
+        f"{_as_text(min(numbers))} to {_as_text(max(numbers))}" if numbers else f"{len(distinct)} different"
+    )
+    return f"({len(value)} values, {ends})"

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyshmem")
+
+from tests.realtime.telemetry_cases import LAYOUT, as_written, write, write_images
+
+from faintspot.live_page.engine_source import EngineSource
+from faintspot.live_page.streams import NewestOfStream
+from faintspot.realtime.shared_streams import create_stream
+from faintspot.realtime.telemetry import TelemetryRing
+from faintspot.realtime.telescope import TRUTH
+
+
+@pytest.fixture
+def name() -> str:
+    return f"fs_test_{uuid4().hex[:12]}"
+
+
+def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("faintspot.live_page.engine_source._STALE_S", 0.0)
+    source = EngineSource(name)
+    assert source.read() is None
+    assert not source.place()["there"]
+    for arms in ([], ["none", "tv"]):
+        with TelemetryRing.create(name, LAYOUT, arms=arms) as ring:
+            first = source.read()
+            assert first is not None
+            assert first.anew
+            assert source.arms == arms
+            for frame in range(5):
+                write(ring, frame)
+            write_images(ring, 3)
+            ring.write_change(2, 1, {"noise_std": 2.0}, None)
+            batch = source.read()
+            assert batch is not None
+            assert not batch.anew
+            assert batch.records["frame"].tolist() == [0, 1, 2, 3, 4]
+            assert as_written(batch.records)
+            assert batch.picture is not None
+            assert batch.picture.frame == 3
+            assert batch.picture.raw[0, 0] == 3
+            assert [change["changes"] for change in batch.changes] == [{"noise_std": 2.0}]
+            again = source.read()
+            assert again is not None
+            assert again.picture is None
+            assert not len(again.records)
+        source.read()
+        assert source.read() is None
+        assert not source.place()["there"]
+    source.close()
+
+
+def test_page_that_was_too_slow_says_what_it_missed(name: str) -> None:
+    source = EngineSource(name)
+    with TelemetryRing.create(name, LAYOUT, records=8) as ring:
+        source.read()
+        for frame in range(20):
+            write(ring, frame)
+        batch = source.read()
+        assert batch is not None
+        assert batch.missed + len(batch.records) == 20
+        assert batch.records["frame"][-1] == 19
+    source.close()
+
+
+def test_truth_and_commands_of_streams(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("faintspot.live_page.streams._LOOK_S", 0.0)
+    source = EngineSource(name)
+    with TelemetryRing.create(name, LAYOUT):
+        truth, commands = (
+            create_stream(f"{name}_truth", (len(TRUTH),)),
+            create_stream(f"{name}_commands", (3,)),
+        )
+        values = dict.fromkeys(TRUTH, 0.0) | {"frame": 7.0, "strehl": 0.5, "rms_nm": 150.0}
+        truth.write(np.array(list(values.values())), frame_id=7)
+        commands.write(np.array([1.0, -2.0, 3.0]), frame_id=7)
+        batch = source.read()
+        assert batch is not None
+        assert batch.truth == (7, 0.5, 150.0)
+        assert batch.commands is not None
+        assert batch.commands.tolist() == [1.0, -2.0, 3.0]
+        again = source.read()
+        assert again is not None
+        assert again.truth is None
+        truth.unlink()
+        commands.unlink()
+    source.close()
+
+
+def test_stream_that_is_made_anew_with_another_length(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("faintspot.live_page.streams._LOOK_S", 0.0)
+    newest = NewestOfStream(name)
+    assert newest.take() is None
+    for length in (2, 5):
+        stream = create_stream(name, (length,))
+        stream.write(np.ones(length), frame_id=length)
+        taken = newest.take()
+        assert taken is not None
+        assert (taken[0], len(taken[1])) == (length, length)
+        assert newest.take() is None
+        stream.unlink()
+    assert newest.take() is None
+    newest.close()
