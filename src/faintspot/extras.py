@@ -13,6 +13,10 @@ EXTRAS = {
     "realtime": ("pyshmem", "aotpy"),
     "loop": ("hcipy",),
     "gpu": ("numba_cuda",),
+    "oopao": ("OOPAO",),
+    "specula": ("specula",),
+    "soapy": ("soapy",),
+    "pyrtc": ("pyrtc",),
 }
 """Packages by the extra to name where one is missing; some extras bring those of others along."""
 
