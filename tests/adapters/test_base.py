@@ -60,7 +60,7 @@ def test_calibrating_is_a_block_that_ends() -> None:
             assert measured.noise_free
     assert not measured.noise_free
     np.testing.assert_allclose(calibrated, measured.measure(bright, noise_free=True), atol=1e-6)
-    # Over a mean light of 40 e-, the sums of 100,000 e- are slopes beyond the window: what calibrating avoids.
+    # Over a mean light of 40 e-, the sums of 100,000 e- are slopes beyond the window.
     assert np.abs(measured.measure(bright)).max() > 100 * np.abs(calibrated).max() / 50
 
 
@@ -186,8 +186,8 @@ def test_predictions_come_from_callables_and_objects() -> None:
 
 def test_what_a_tools_file_says(tmp_path: Path) -> None:
     path = tmp_path / "faintspot.toml"
-    text = '[estimator]\nname = "window"\n[settings]\nflux_e = 40.0\nspot_fwhm_px = 2.0\n[calibration]\ndark = 3.0\n'
-    path.write_text(text)
+    lines = "[estimator]", 'name = "window"', "[settings]", "flux_e = 40.0", "spot_fwhm_px = 2.0"
+    path.write_text("\n".join([*lines, "[calibration]", "dark = 3.0"]))
     tables = {
         "estimator": {"name": "window"},
         "settings": {"flux_e": 40.0, "spot_fwhm_px": 2.0},
