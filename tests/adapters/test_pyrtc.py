@@ -73,7 +73,7 @@ def test_only_valid_subapertures_are_measured() -> None:
 
 
 def test_frames_without_light() -> None:
-    own = measuring("window")
+    own = measuring()
     np.testing.assert_array_equal(own.maps(process(), np.zeros((30, 30)), no_stream), 0.0)
     stack = images()
     stack[4] = 0.0
