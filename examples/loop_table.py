@@ -16,8 +16,9 @@ def compare(
     *,
     tuning: Sequence[int] = (1, 2),
     scoring: Sequence[int] = (11, 12, 13, 14),
+    score: str = "Strehl ratio",
 ) -> None:
-    """Print a table: the Strehl ratio of every arm, its standard error over pieces of air, and against the first.
+    """Print a table: the score of every arm, its standard error over pieces of air, and against the first.
 
     Parameters
     ----------
@@ -28,9 +29,11 @@ def compare(
     gains : sequence of float
     tuning, scoring : sequence of int
         Seeds of the air that setups and gains are chosen on, and of that which is scored.
+    score : str
+        What `strehl` returns, more being better.
     """
     first: np.ndarray | None = None
-    print(f"{'':34s} Strehl ratio     against the first  chosen, loop gain")
+    print(f"{'':34s} {score:16s} against the first  chosen, loop gain")
     for name, setups in arms.items():
         begun = time.perf_counter()
         tried = [
