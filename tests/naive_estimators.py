@@ -20,6 +20,7 @@ FWHM_PER_STD = 2 * math.sqrt(2 * math.log(2))
 START_STD_PER_FWHM = 0.73
 STEPS = {"ml": 4, "matched": 4, "map": 4, "weighted": 8}
 LEAST_VARIANCE, LEAST_FLUX = 1e-4, 1e-2
+MOST_MODEL_ERROR_E = 300.0
 LEAST_FRACTION = 0.05
 PRIOR_REACH = 4.0
 
@@ -159,7 +160,19 @@ def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
         return np.ones_like(m)
     light = np.maximum(m, 0.0)  # a spline may dip below zero
     floor = max(task.variance + task.weight_floor * first_flux, LEAST_VARIANCE)
-    return 1.0 / (floor + task.excess * light + (task.model_error * light) ** 2)
+    model_error_squared = min(task.model_error**2, MOST_MODEL_ERROR_E / first_flux)
+    return 1.0 / (floor + task.excess * light + model_error_squared * light**2)
+
+
+def believed_light(g: ArrayLike, expected: float, task: Task) -> float:
+    """The expected light, or that above the window's edges where it is far more."""
+    g = np.asarray(g, np.float64)
+    inner = g[1:-1, 1:-1]
+    edges = g.size - inner.size
+    ratio = inner.size / edges
+    seen = inner.sum() - ratio * (g.sum() - inner.sum())
+    noise = inner.size * max(task.variance, 0.0) + task.excess * max(inner.sum(), 0.0)
+    return seen if seen > 2 * expected + 3 * math.sqrt((1 + ratio) * noise) else expected
 
 
 def information(m: Floats, dm: list[Floats], w: Floats, task: Task, name: str) -> tuple[Floats, Floats]:
@@ -196,7 +209,8 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
             score[:2] += (np.array(task.prior) - (x, y)) / task.prior_std**2
         i, j = information(m, dm, w, task, name)
         margin = min(margin, soundness(i) - 1e-3, *phase_margins(x, y, g.shape, task.spot.phases))
-        move = np.clip(np.linalg.solve(i, score)[:2], -1.0, 1.0) if soundness(i) > 1e-5 else np.zeros(2)
+        whole = np.linalg.solve(i, score) if soundness(i) > 1e-5 else np.zeros(len(score))
+        move = np.clip(whole[:2] / max(1.0, whole[2] / flux), -1.0, 1.0)
         errors = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf)
         x, y = clamp(x + move[0], *limits[0]), clamp(y + move[1], *limits[1])
         others = np.linalg.solve(i[2:, 2:], score[2:] - i[2:, :2] @ move)
@@ -386,11 +400,21 @@ def gravity_error(
 # Trained score ----------------------------------------------------------------------------------------
 
 
-def trained(g: ArrayLike, score: Any, kind: int, flux: float, begin: Estimate, task: Task) -> Estimate:
-    """x <- q + sum psi(u - q) g / flux, pass after pass; `score` has the fields of TrainedScore.
+def trained(
+    g: ArrayLike,
+    score: Any,
+    kind: int,
+    flux: float,
+    begin: Estimate,
+    task: Task,
+    believed: float | None = None,
+) -> Estimate:
+    """x <- q + sum psi(u - q) g / believed, pass after pass; `score` has the fields of TrainedScore.
 
-    `flux` is what the light is divided by; the class is the one nearest to it in logarithm.
+    `believed` is what the light is divided by, by default `flux`; the class is the one nearest to `flux` in
+    logarithm.
     """
+    believed = flux if believed is None else believed
     g = np.asarray(g, np.float64)
     classes = np.abs(np.log(np.asarray(score.flux_e)) - math.log(flux))
     chosen = int(np.argmin(classes))
@@ -401,7 +425,7 @@ def trained(g: ArrayLike, score: Any, kind: int, flux: float, begin: Estimate, t
     for tables in np.asarray(score.tables, np.float64)[kind, chosen]:
         margin = min(margin, *(abs((p * steps) % 1.0 - 0.5) for p in (x, y)))
         qx, qy = np.rint(x * steps) / steps, np.rint(y * steps) / steps
-        moves = [projection(g, table, steps, qx, qy) / flux for table in tables]
+        moves = [projection(g, table, steps, qx, qy) / believed for table in tables]
         x, y = clamp(qx + moves[0], *limits[0]), clamp(qy + moves[1], *limits[1])
     errors = [
         task.error_scale

@@ -14,6 +14,10 @@ EXTRAS = {
     "live": ("tornado",),
     "loop": ("hcipy",),
     "gpu": ("numba_cuda",),
+    "oopao": ("OOPAO",),
+    "specula": ("specula",),
+    "soapy": ("soapy",),
+    "pyrtc": ("pyrtc",),
 }
 """Packages by the extra to name where one is missing; some extras bring those of others along."""
 

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array
+from faintspot import configuration
+from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError
+from faintspot.light import MeanLight
 from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import Score
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
+from faintspot.settings import Settings
 from faintspot.slopes import Slopes
+from faintspot.tables import read_tables
+from faintspot.toml_files import check_keys
 
+CALIBRATION_LIGHT_E = 1000.0
+"""Light (electrons) of a sub-aperture at which frames without noise are measured."""
+LIGHT_FRAMES = 1000.0
+"""Time constant of the mean light, frames."""
+_FIRST_FRAMES = 20  # that the mean light begins with: one faint frame says too little
+_FOLLOW_EVERY = 10  # frames
+_LEAST_LIGHT_E = 1e-3
+_PARTS = "estimator", "settings", "calibration", "psf", "score"
 _EXACT_PX = 1e-6  # what a centre in pixels may be off by rounding
 
 
@@ -79,31 +98,155 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
     return Layout(frame_shape, (side, side), corners, finite_array("lenslet centres", centres))
 
 
-class UnitAdapter:
-    """A pipeline whose slopes are in another tool's unit; it remembers its last measurement.
+class Parts(NamedTuple):
+    """What a pipeline is made of, but for the layout, which the tool knows."""
+
+    settings: Settings
+    calibration: Calibration
+    psf: PSF | None
+    score: Score | None
+
+
+def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
+    """Return what a tool's own file says of faintspot.
 
     Parameters
     ----------
-    pipeline : SlopePipeline
+    source : path or mapping
+        A faintspot.toml, or its tables `estimator`, `settings`, `calibration`, `psf` and `score` as mappings,
+        with files from the working directory.
+
+    Raises
+    ------
+    InputError
+        For an unknown table or key, a bad value, a file that cannot be read.
+    """
+    if isinstance(source, str | Path):
+        path, document = Path(source), read_tables(source)
+    elif isinstance(source, Mapping):
+        path, document = Path("faintspot"), {name: dict(values) for name, values in source.items()}
+        check_keys("faintspot: ", document, _PARTS, what="table")
+    else:
+        raise InputError(f"faintspot: expected a file or tables of settings, got {type(source).__name__}")
+    return Parts(
+        Settings.from_tables(path, document),
+        Calibration.from_tables(path, document),
+        configuration.psf_of(path, document),
+        configuration.score_of(path, document),
+    )
+
+
+class Options(TypedDict, total=False):
+    """What every adapter hands on to `ToolSlopes`."""
+
+    psf: PSF | None
+    score: Score | None
+    calibration_light_e: float
+    light_frames: float | None
+    threads: int | None
+
+
+class ToolSlopes:
+    """A slope pipeline inside another tool: its slopes in the tool's unit, its calibration, prior and light.
+
+    Parameters
+    ----------
+    layout : Layout
+    settings : Settings
+    calibration : Calibration, optional
+        Default: images are in electrons.
     unit_per_px : (2,) array
         The tool's unit per pixel along x and y; negative where its axis runs against the frame's.
+    psf, score : PSF, Score, optional
+        For the estimators that need them, see `faintspot.SlopePipeline`.
+    calibration_light_e : float
+        Mean light of a sub-aperture, electrons, at which frames without noise are measured.
+    light_frames : float, optional
+        Time constant (frames) of the running mean of the light that estimators which use it are given, where
+        the settings have no `flux_e`; begins after 20 frames. None: the light is that of each frame.
+    threads : int, optional
+        See `faintspot.SlopePipeline`.
+
+    Raises
+    ------
+    InputError
+        As for the pipeline, and for numbers out of range.
     """
 
-    def __init__(self, pipeline: SlopePipeline, unit_per_px: ArrayLike) -> None:
-        self.pipeline = pipeline
+    def __init__(
+        self,
+        layout: Layout,
+        settings: Settings,
+        calibration: Calibration | None = None,
+        *,
+        unit_per_px: ArrayLike = (1.0, 1.0),
+        psf: PSF | None = None,
+        score: Score | None = None,
+        calibration_light_e: float = CALIBRATION_LIGHT_E,
+        light_frames: float | None = LIGHT_FRAMES,
+        threads: int | None = None,
+    ) -> None:
+        self.pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score, threads=threads)
         self.unit_per_px = finite_array("unit_per_px", unit_per_px).astype(np.float64).reshape(2, 1)
+        self._light_e = _checked_light(calibration_light_e)
+        if light_frames is not None:
+            number_between("light_frames", light_frames, 1.0)
+        known = not np.isnan(self.pipeline.preparation.sensor.flux_e).any()
+        follows = light_frames is not None and settings.estimator.uses_light and not known
+        self._light_frames = light_frames if follows else None
+        self._first_light: list[NDArray[np.float32]] = []
+        self._light: MeanLight | None = None
+        self._frames = 0
+        self.noise_free = False
+        """Whether frames are a calibration's, without noise, as in `calibrating`."""
+        self._bright: SlopePipeline | None = None
         self._last: Slopes | None = None
 
-    def measure(self, frame: Any) -> NDArray[np.float64]:
+    def measure(
+        self, frame: Any, *, prior_px: ArrayLike | None = None, noise_free: bool = False
+    ) -> NDArray[np.float64]:
         """Return x and y slopes of a frame (h, w) in the tool's unit: (2, n).
+
+        Parameters
+        ----------
+        frame : (h, w) array
+        prior_px : (n, 2) or (2 n,) array, optional
+            Predicted slopes, as for `faintspot.SlopePipeline`.
+        noise_free : bool
+            Whether the frame is a calibration's, without noise: then it is measured as in `calibrating`.
 
         Raises
         ------
         InputError
-            As for the pipeline.
+            As for the pipeline; for a calibration frame without light, or without slopes.
         """
-        self._last = self.pipeline(frame)
+        if noise_free or self.noise_free:
+            self._last = self._calibrated(frame)
+        else:
+            self._last = self.pipeline(frame, prior_px)
+            if self._light_frames is not None:
+                self._follow(self._last.flux)
         return np.stack([self._last.x, self._last.y], dtype=np.float64) * self.unit_per_px
+
+    @contextmanager
+    def calibrating(self, light_e: float | None = None) -> Iterator[None]:
+        """Measure frames without noise, as of interaction matrices and references, in the `with` block.
+
+        Whatever their light is, they are measured at `light_e` electrons a sub-aperture (default: as given
+        when this was made), with no prior, and without what is meant for noise: at a faint star's own light
+        denoising would flatten the spots, and in very bright light models of noise no longer hold.
+
+        Raises
+        ------
+        InputError
+            For light that is not positive.
+        """
+        before = self.noise_free, self._light_e
+        self.noise_free, self._light_e = True, self._light_e if light_e is None else _checked_light(light_e)
+        try:
+            yield
+        finally:
+            self.noise_free, self._light_e = before
 
     @property
     def last(self) -> Slopes:
@@ -123,3 +266,57 @@ class UnitAdapter:
         """Standard errors of the last slopes in the tool's unit, (2, n); infinite where not known."""
         in_px = np.stack([self.last.standard_error_x, self.last.standard_error_y], dtype=np.float64)
         return in_px * np.abs(self.unit_per_px)
+
+    @property
+    def light(self) -> MeanLight | None:
+        """The running mean of the light, once there is one."""
+        return self._light
+
+    def _follow(self, flux_e: NDArray[np.float32]) -> None:
+        """Take a frame's light into the mean; the pipeline follows in steps, as making it anew takes time."""
+        assert self._light_frames is not None
+        self._frames += 1
+        if self._light is not None:
+            self._light = self._light.updated(flux_e)
+        elif self._frames < _FIRST_FRAMES:
+            self._first_light.append(flux_e)
+        else:
+            self._light = MeanLight(np.array([*self._first_light, flux_e]), self._light_frames)
+            self._first_light.clear()
+        if self._light is not None and self._frames % _FOLLOW_EVERY == 0:
+            self.pipeline = self.pipeline.with_light(self._light)
+
+    def _calibrated(self, frame: Any) -> Slopes:
+        """Measure a frame without noise at the light of calibrations."""
+        pipeline, calibration = self.pipeline, self.pipeline.calibration
+        layout = pipeline.layout
+        array = finite_array("calibration frame", frame)
+        if array.shape != layout.frame_shape:
+            raise InputError(f"calibration frame: expected shape {layout.frame_shape}, got {array.shape}")
+        dark, e_per_adu = calibration.maps(layout.frame_shape)
+        images = layout.images((array - dark) * e_per_adu)
+        light = np.nansum(images, axis=(1, 2))
+        if not light.mean() > 0.0:
+            raise InputError(
+                f"calibration frame: expected light in the sub-apertures, got {light.mean():.3g} e- in the "
+                "mean; is the source on, and the calibration's dark right?"
+            )
+        factor = self._light_e / light.mean()
+        if self._bright is None:
+            settings = pipeline.settings
+            bright = settings.replace(estimator=settings.estimator.for_bright_light(), flux_e=None)
+            self._bright = pipeline.with_settings(bright).for_images()
+        if self._bright.settings.estimator.uses_light:
+            self._bright = self._bright.with_light(np.maximum(light * factor, _LEAST_LIGHT_E))
+        slopes = self._bright((images * factor).reshape(-1, layout.window[1]))
+        found = int(np.count_nonzero(slopes.valid))
+        if 2 * found < len(layout):
+            raise InputError(
+                f"calibration frame: expected slopes of {len(layout)} sub-apertures, got {found}; check that "
+                "spots are within their windows and search_range_px, or give another calibration_light_e"
+            )
+        return slopes
+
+
+def _checked_light(light_e: float) -> float:
+    return number_between("calibration_light_e", light_e, 0.0, 1e9, low_open=True)

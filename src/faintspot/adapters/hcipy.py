@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.adapters.base import UnitAdapter, largest_window, layout_around, on_detector
+from faintspot.adapters.base import Options, ToolSlopes, largest_window, layout_around, on_detector
+from faintspot.adapters.checks import check_version, predicted
 from faintspot.checks import finite_array, number_between
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.settings import Settings
 from faintspot.slopes import Slopes
@@ -22,6 +21,8 @@ try:
     import hcipy
 except ImportError:
     raise MissingExtraError("hcipy", "loop", "faintspot.adapters.hcipy") from None
+
+TESTED = "0.7.1", "0.7.1"
 
 
 class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
@@ -42,15 +43,17 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         Per-sub-aperture values are in the order of the `estimation_subapertures` attribute.
     calibration : Calibration, optional
         Default: images are in electrons. Its maps have the shape of `image.shaped`.
-    psf : PSF, optional
-    score : Score, optional
-        For the estimators that need them, see `faintspot.SlopePipeline`.
     detector_grid : hcipy.Grid, optional
         Pixel centres, m: regular and Cartesian. Default: the grid of `mla_index`; a detector with other
         pixels than the optics' grid needs it.
     pixels : int, optional
         Side of the windows. Default: the largest in which neighbours do not overlap. Windows are whole
         pixels, lenslets need not be: slopes are from the lenslet's centre in any case.
+    predict : callable or object with `predict`, optional
+        Takes the last slopes, (2, n) m, and returns those that are expected next, for estimators that take a
+        prior; called before each frame but the first.
+    **options
+        psf, score, calibration_light_e, light_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Attributes
     ----------
@@ -58,8 +61,8 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         Numbers of the lenslets that are measured.
     estimation_grid : hcipy.Grid
         Their centres: the grid of the slopes.
-    pipeline : SlopePipeline
-        Which measures; its layout has the windows.
+    measured : ToolSlopes
+        What measures: its `pipeline`, the `last` slopes (px), `light`.
 
     Raises
     ------
@@ -76,11 +79,12 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         *,
         settings: Settings,
         calibration: Calibration | None = None,
-        psf: PSF | None = None,
-        score: Score | None = None,
         detector_grid: Any = None,
         pixels: int | None = None,
+        predict: Any = None,
+        **options: Unpack[Options],
     ) -> None:
+        check_version("HCIPy", "hcipy", *TESTED)
         self.mla_grid = mla_grid
         self.mla_index = mla_index
         self.detector_grid = _checked_grid(mla_index if detector_grid is None else detector_grid)
@@ -94,8 +98,8 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         selected = np.isin(np.arange(len(centres)), self.estimation_subapertures)
         self.estimation_grid = mla_grid.subset(selected)
         layout = layout_around(centres[selected], self._frame_shape, side)
-        self.pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score)
-        self._adapter = UnitAdapter(self.pipeline, pitch)
+        self.measured = ToolSlopes(layout, settings, calibration, unit_per_px=pitch, **options)
+        self._predict, self._slopes = predict, None
 
     def estimate(self, images: Any) -> Any:
         """Measure the slopes of an image.
@@ -116,22 +120,37 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         InputError
             For an image that is not on the detector's grid.
         """
-        return hcipy.Field(self._adapter.measure(self._frame(images)), self.estimation_grid)
+        frame = self._frame(images)
+        if self.measured.noise_free:
+            return hcipy.Field(self.measured.measure(frame), self.estimation_grid)
+        expected = predicted(self._predict, self._slopes, (2, self.estimation_grid.size))
+        prior_px = None if expected is None else (expected / self.measured.unit_per_px).ravel()
+        self._slopes = hcipy.Field(self.measured.measure(frame, prior_px=prior_px), self.estimation_grid)
+        return self._slopes
+
+    def calibrating(self, light_e: float | None = None) -> Any:
+        """Measure images without noise in a `with` block, see `ToolSlopes.calibrating`."""
+        return self.measured.calibrating(light_e)
+
+    @property
+    def pipeline(self) -> SlopePipeline:
+        """Which measures; its layout has the windows."""
+        return self.measured.pipeline
 
     @property
     def slopes(self) -> Slopes:
         """The last estimate in pixels, with flux, flags and iterations."""
-        return self._adapter.last
+        return self.measured.last
 
     @property
     def flags(self) -> NDArray[np.uint8]:
         """Bits of `faintspot.SubapertureFlag` of the last estimate, (n,)."""
-        return self._adapter.last.flags
+        return self.measured.last.flags
 
     @property
     def standard_errors(self) -> Any:
         """Field (2, n): standard errors of the last estimate, m; infinite where they are not known."""
-        return hcipy.Field(self._adapter.standard_errors, self.estimation_grid)
+        return hcipy.Field(self.measured.standard_errors, self.estimation_grid)
 
     def _frame(self, images: Any) -> NDArray[Any]:
         """The image as rows and columns."""

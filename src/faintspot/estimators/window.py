@@ -91,7 +91,7 @@ class Window(Estimator):
 
     def for_bright_light(self) -> Window:
         """Divide by the light that is there."""
-        return self.replaced({"normalisation": FRAME}) if self.normalisation == MEAN else self
+        return self.replaced({"normalisation": FRAME}) if self.uses_light else self
 
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""

@@ -224,6 +224,9 @@ def _move(lanes: Any, lane_values: Any) -> None:
     sound = minimum(left - splat(lanes, 1e-5) * axx, ayy) > zero
     dx = select(sound, (bx - slope * by) / maximum(left, tiny), zero)
     dy = select(sound, (by - axy * dx) / maximum(ayy, tiny), zero)
+    # A step is too long by how much more light there is than the model has: linear is only their product.
+    growth = maximum((sf - ixf * dx - iyf * dy) * inverse_ff, one)
+    dx, dy = dx / growth, dy / growth
     most, least = splat(lanes, LARGEST_MOVE_PX), splat(lanes, -LARGEST_MOVE_PX)
     dx, dy = minimum(maximum(dx, least), most), minimum(maximum(dy, least), most)
     df = (sf - ixf * dx - iyf * dy) * inverse_ff

@@ -43,6 +43,11 @@ LEAST_SIGNIFICANCE = 1.0
 """A spot less significant than this many standard deviations counts as no light."""
 SMALLEST_VARIANCE = 1e-4
 """Electrons squared: keeps the weights finite where there is no noise."""
+MOST_MODEL_ERROR_E = 300.0
+"""Electrons: the square of a model error counts no more than this over the light, so that in bright light
+dark wings, where a PSF is least known, do not get all the weight."""
+BRIGHT = 2.0
+"""Times the expected light from which on that of the window is believed instead, if it is significant."""
 _LIT_FRACTION = 0.2  # of the expected light: what is surely less is no light
 _SURELY = 3.0  # standard deviations
 _BROAD = 0.5  # standard deviation, in units of the grid's spacing, above which sums over the grid are good
@@ -193,6 +198,7 @@ def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     if tables.from_peak:
         _begin_at_peak(group, tables.taps, scratch)
     _expect_light(group, own.lane_values)
+    _believe_bright_light(group, scratch.image, own.lane_values)
     apply_score(
         group.lanes,
         scratch.image,
@@ -267,7 +273,8 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
         variance = lane_values[spot_rows.VARIANCE * width + lane] + floor
         lane_values[spot_rows.WEIGHT_VARIANCE * width + lane] = max(variance, SMALLEST_VARIANCE)
         lane_values[spot_rows.WEIGHT_EXCESS * width + lane] = settings[WEIGHT_EXCESS, s]
-        lane_values[spot_rows.MODEL_ERROR * width + lane] = settings[MODEL_ERROR, s] ** 2
+        most = MOST_MODEL_ERROR_E / lane_values[spot_rows.FLUX * width + lane]
+        lane_values[spot_rows.MODEL_ERROR * width + lane] = min(settings[MODEL_ERROR, s] ** 2, most)
     fit_group(
         group.lanes,
         scratch.image,
@@ -290,6 +297,35 @@ def _expect_light(group: Any, lane_values: Any) -> None:
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
         lane_values[spot_rows.FLUX * width + lane] = max(settings[FLUX, s], LEAST_LIGHT_E)
+
+
+@compiled
+def _believe_bright_light(group: Any, image: Any, lane_values: Any) -> None:
+    """Take the light above the window's edges where that is far more: moves would be too long by as much."""
+    lanes, ny, nx = group.lanes, group.ny, group.nx
+    width = width_of(lanes)
+    edge, inner = splat(lanes, 0.0), splat(lanes, 0.0)
+    for y in range(ny):
+        row = splat(lanes, 0.0)  # a sum for each row: they need not wait for each other
+        for x in range(nx):
+            g = load(lanes, image, (y * nx + x) * width)
+            if y == 0 or y == ny - 1 or x == 0 or x == nx - 1:
+                edge = edge + g
+            else:
+                row = row + g
+        inner = inner + row
+    n_inner = max(ny - 2, 0) * max(nx - 2, 0)
+    ratio = n_inner / (ny * nx - n_inner)
+    store(lane_values, spot_rows.SEEN * width, inner - splat(lanes, ratio) * edge)
+    store(lane_values, spot_rows.SEEN_ERROR * width, inner)
+    for lane in range(width):
+        light = lane_values[spot_rows.SEEN * width + lane]
+        noise = n_inner * lane_values[spot_rows.VARIANCE * width + lane]
+        counts = max(lane_values[spot_rows.SEEN_ERROR * width + lane], 0.0)
+        noise += lane_values[spot_rows.EXCESS * width + lane] * counts
+        expected = lane_values[spot_rows.FLUX * width + lane]
+        if light > BRIGHT * expected + _SURELY * math.sqrt((1.0 + ratio) * noise):
+            lane_values[spot_rows.FLUX * width + lane] = light
 
 
 @compiled

@@ -1,0 +1,180 @@
+"""The slope pipeline in OOPAO (Heritier et al. 2023, AO4ELT7): in place of its sensor's centroiding."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.adapters.base import Options, ToolSlopes
+from faintspot.adapters.checks import check_version, predicted
+from faintspot.errors import InputError
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.settings import Settings
+
+TESTED = "1.0.0", "1.0.0"
+_LEAST_UNIT = 1e-6  # of OOPAO's slopes, that of a tilt of one pixel being about 1
+
+
+def attach(
+    wfs: Any,
+    settings: Settings,
+    calibration: Calibration | None = None,
+    *,
+    predict: Any = None,
+    **options: Unpack[Options],
+) -> Attached:
+    """Let an OOPAO `ShackHartmann` measure its slopes with faintspot, and calibrate it anew.
+
+    Reference slopes and `slopes_units` are made again (`initialize_wfs`); interaction matrices and
+    reconstructors made afterwards are in the same unit and order as OOPAO's own.
+
+    Parameters
+    ----------
+    wfs : OOPAO.ShackHartmann.ShackHartmann
+        Diffractive, without a weighting map of its own.
+    settings : Settings
+    calibration : Calibration, optional
+        Default: images are in electrons.
+    predict : callable or object with `predict`, optional
+        Takes the last `wfs.signal`, (2 n,), and returns the one that is expected next, for estimators that
+        take a prior; called before each frame but the first. For an asterism a list, one for each source.
+    **options
+        psf, score, calibration_light_e, light_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
+
+    Returns
+    -------
+    Attached
+        `calibrating`, `slopes`, `flags`; `detach()` puts OOPAO's own centroiding back.
+
+    Raises
+    ------
+    InputError
+        For another or a geometric sensor, one with a weighting map, or as for `ToolSlopes`.
+    """
+    return Attached(wfs, settings, calibration, predict, options)
+
+
+class Attached:
+    """faintspot in a sensor of OOPAO's; see `attach`."""
+
+    def __init__(
+        self,
+        wfs: Any,
+        settings: Settings,
+        calibration: Calibration | None,
+        predict: Any,
+        options: Options,
+    ) -> None:
+        if getattr(wfs, "tag", None) != "shackHartmann":
+            raise InputError(f"wfs: expected a ShackHartmann of OOPAO's, got {type(wfs).__name__}")
+        check_version("OOPAO", "oopao", *TESTED)
+        if wfs.is_geometric:
+            raise InputError("wfs.is_geometric = True: expected a diffractive sensor, which has images")
+        self.wfs = wfs
+        sources = list(wfs.sh_data.values())
+        if any(np.any(np.asarray(source.weighting_map) != 1) for source in sources):
+            raise InputError(
+                'wfs: expected no weighting map, got one; leave it out and take the estimator "window"'
+            )
+        several = len(sources) > 1
+        predicts = list(predict) if several and predict is not None else [predict] * len(sources)
+        if len(predicts) != len(sources):
+            raise InputError(f"predict: expected one for each of {len(sources)} sources, got {len(predicts)}")
+        self._sources = [
+            _Source(wfs, source, settings, calibration, each, options)
+            for source, each in zip(sources, predicts, strict=True)
+        ]
+        self._current = self._sources[0]
+        self._own = wfs.wfs_integrate
+        wfs.wfs_integrate, wfs.centroid = self._integrate, self._centroid
+        wfs.initialize_wfs()
+        if not abs(float(wfs.slopes_units)) > _LEAST_UNIT:  # NaN is not, either
+            raise InputError(
+                f"wfs.slopes_units: expected about 1 from OOPAO's tilt, got {float(wfs.slopes_units):g}; "
+                "check search_range_px, or give another calibration_light_e"
+            )
+
+    def detach(self) -> None:
+        """Put OOPAO's own centroiding back, calibrated."""
+        del self.wfs.wfs_integrate, self.wfs.centroid
+        self.wfs.initialize_wfs()
+
+    @contextmanager
+    def calibrating(self, light_e: float | None = None) -> Iterator[None]:
+        """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`.
+
+        OOPAO's frames without photon and read-out noise are measured so anyway.
+        """
+        with ExitStack() as stack:
+            for each in self.measured:
+                stack.enter_context(each.calibrating(light_e))
+            yield
+
+    @property
+    def measured(self) -> tuple[ToolSlopes, ...]:
+        """Of every source: what measures it, with `last` slopes (px), `standard_errors` and `light`."""
+        return tuple(source.slopes for source in self._sources)
+
+    def _integrate(self, src: Any, sh_data: Any) -> Any:
+        """OOPAO's own step, which calls `centroid`, for the source that it is about."""
+        self._current = next((s for s in self._sources if s.data is sh_data), self._sources[0])
+        return self._own(src, sh_data)
+
+    def _centroid(self, image: Any, threshold: float = 0.01) -> NDArray[np.float64]:
+        """Positions as OOPAO's: (n, 2) px from the first pixel, along rows, then along columns."""
+        return self._current.positions(image)
+
+
+class _Source:
+    """One source's sub-apertures."""
+
+    def __init__(
+        self,
+        wfs: Any,
+        data: Any,
+        settings: Settings,
+        calibration: Calibration | None,
+        predict: Any,
+        options: Options,
+    ) -> None:
+        self.wfs, self.data, self._predict = wfs, data, predict
+        self._n, self._side = int(data.nValidSubaperture), int(wfs.n_pix_subap)
+        layout = Layout.stacked(self._n, (self._side, self._side))
+        self.slopes = ToolSlopes(layout, settings, calibration, **options)
+        self._signal: NDArray[np.float64] | None = None
+
+    def positions(self, image: Any) -> NDArray[np.float64]:
+        """See `Attached._centroid`."""
+        images = np.asarray(image)
+        shape = self._n, self._side, self._side
+        if images.shape != shape:
+            raise InputError(f"OOPAO's images: expected shape {shape}, got {images.shape}")
+        camera, first = self.wfs.cam, 0.5 * (self._side - 1)
+        switched_off = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)
+        noise_free = switched_off or self.slopes.noise_free
+        reference, unit = self._reference(), float(self.wfs.slopes_units)
+        prior = None
+        if not noise_free:
+            signal = predicted(self._predict, self._signal, (2 * self._n,))
+            if signal is not None:
+                rows, columns = (signal * unit + reference).reshape(2, -1) - first
+                prior = np.concatenate([columns, rows])
+        found = self.slopes.measure(images.reshape(-1, self._side), prior_px=prior, noise_free=noise_free)
+        places = found[::-1].ravel() + first  # along rows, which is y, before along columns
+        places = np.where(np.tile(self.slopes.last.valid, 2), places, reference)
+        if not noise_free:
+            self._signal = (places - reference) / unit
+        return np.ascontiguousarray(places.reshape(2, -1).T)
+
+    def _reference(self) -> NDArray[np.float64]:
+        """OOPAO's reference positions, (2 n,); the middle before it has any."""
+        reference = np.asarray(self.data.reference_signal_2D, np.float64)
+        if reference.ndim < 2:
+            return np.full(2 * self._n, 0.5 * (self._side - 1))
+        found: NDArray[np.float64] = reference[self.data.valid_signal_2D]
+        return found

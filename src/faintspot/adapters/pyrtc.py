@@ -1,0 +1,170 @@
+"""The slope pipeline in pyRTC: `FaintspotSlopes`, a slopes process of its own.
+
+::
+
+    slopes:
+      class_name: faintspot.adapters.pyrtc.FaintspotSlopes
+      faintspot: faintspot.toml
+
+`FaintspotSlopes` is made when it is first asked for: pyRTC is imported then, not before.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, ToolSlopes, layout_around, parts_of
+from faintspot.adapters.checks import check_version
+from faintspot.errors import InputError, MissingExtraError
+
+TESTED = "2.1.0", "2.1.0"
+PREDICTED = "predicted"
+"""Name of the input stream of predicted slopes."""
+
+
+def __getattr__(name: str) -> Any:
+    if name == "FaintspotSlopes":
+        return slopes_process()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+@functools.cache
+def slopes_process() -> Any:
+    """Return the class `FaintspotSlopes`, a `SlopesProcess` of pyRTC's.
+
+    Its configuration is that of a `SlopesProcess` of type "SHWFS", and
+
+    faintspot : str or dict
+        A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
+    noise_free : bool
+        Whether frames are a calibration's without noise, as of a simulated sensor. Default false.
+    calibration_light_e, light_frames : float
+        See `faintspot.adapters.base.ToolSlopes`; `light_frames` 0: no running mean.
+    input_streams: predicted : str
+        Stream of the slopes that are expected next, as long as `signal`; optional.
+
+    Raises
+    ------
+    MissingExtraError
+        When pyRTC is not installed.
+    """
+    try:
+        from pyrtc import SlopesProcess, open_stream
+    except ImportError:
+        raise MissingExtraError("pyrtc", "pyrtc", "faintspot.adapters.pyrtc") from None
+    check_version("pyRTC", "pyrtcao", *TESTED)
+
+    class FaintspotSlopes(SlopesProcess):  # type: ignore[misc]
+        """A slopes process of pyRTC's, with faintspot in place of its centroiders."""
+
+        def __init__(self, conf: Any) -> None:
+            self.measuring = _Measuring(conf)
+            super().__init__(conf)
+
+        def _compute_slopes_shwfs(self, image: Any) -> NDArray[np.float32]:
+            """Slopes as pyRTC's centroiders give them: (2 N, N) px, the x map above the y map."""
+            return self.measuring.maps(self, image, open_stream)
+
+        def calibrating(self, light_e: float | None = None) -> Any:
+            """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`."""
+            return self.measuring.tool.calibrating(light_e)
+
+    FaintspotSlopes.__module__, FaintspotSlopes.__qualname__ = __name__, "FaintspotSlopes"
+    return FaintspotSlopes
+
+
+class _Measuring:
+    """What a slopes process measures with; made when its geometry is known."""
+
+    def __init__(self, conf: Any) -> None:
+        if "faintspot" not in conf:
+            raise InputError("slopes.faintspot: expected a faintspot.toml or its tables, got none")
+        self.parts = parts_of(conf["faintspot"])
+        self.noise_free = bool(conf.get("noise_free", False))
+        self.light_e = conf.get("calibration_light_e", CALIBRATION_LIGHT_E)
+        frames = conf.get("light_frames", LIGHT_FRAMES)
+        self.light_frames = frames if frames else None
+        self.stream_name = (conf.get("input_streams") or {}).get(PREDICTED)
+        self._stream: Any = None
+        self._tool: ToolSlopes | None = None
+        self._places = np.empty(0, np.int64)
+
+    @property
+    def tool(self) -> ToolSlopes:
+        """What measures.
+
+        Raises
+        ------
+        InputError
+            Before the geometry is known.
+        """
+        if self._tool is None:
+            raise InputError("slopes: expected a frame to be measured first, got none")
+        return self._tool
+
+    def maps(self, process: Any, image: Any, open_stream: Any) -> NDArray[np.float32]:
+        """Measure an image; only sub-apertures that pyRTC counts as valid are."""
+        n = int(process.num_regions)
+        valid = np.asarray(process.valid_sub_aps, bool)
+        used = np.flatnonzero(valid[:n] | valid[n:])
+        if self._tool is None or not np.array_equal(used, self._places):
+            self._tool, self._places = self._made(process, image.shape, used), used
+        at = np.concatenate([used, used + n * n])
+        reference = np.asarray(process.ref_slopes, np.float64).ravel()[at].reshape(2, -1)
+        prior = self._predicted(valid, open_stream)
+        prior = None if prior is None else (prior.ravel()[at].reshape(2, -1) + reference).ravel()
+        if not image.any():  # pyRTC's first frame, with which kernels are compiled, is no light of a star's
+            self._tool.pipeline(image)
+            return np.zeros((2 * n, n), np.float32)
+        found = self._tool.measure(image, prior_px=prior, noise_free=self.noise_free)
+        slopes = np.zeros((2 * n, n), np.float32)
+        slopes.ravel()[at] = np.where(self._tool.last.valid, found - reference, 0.0).ravel()
+        return slopes
+
+    def _made(self, process: Any, shape: tuple[int, int], used: NDArray[np.int64]) -> ToolSlopes:
+        """Make the pipeline for pyRTC's sub-apertures."""
+        side, spacing, n = int(process.region_size), float(process.sub_ap_spacing), int(process.num_regions)
+        first = np.array([round(spacing * i) for i in range(n)])
+        rows, columns = first[used // n] + process.offset_y, first[used % n] + process.offset_x
+        corners = np.column_stack([columns, rows])
+        outside = (corners < 0).any(axis=1) | (corners + side > np.array(shape)[::-1]).any(axis=1)
+        if outside.any():
+            where = int(used[np.argmax(outside)])
+            raise InputError(
+                f"slopes.valid_sub_aps: expected sub-apertures of {side} px on the frame of {shape[0]} x "
+                f"{shape[1]}, got {np.count_nonzero(outside)} that leave it, first row {where // n}, column "
+                f"{where % n}; leave them out, or change sub_ap_offset_x and _y"
+            )
+        settings, calibration, psf, score = self.parts
+        return ToolSlopes(
+            layout_around(corners + 0.5 * (side - 1), shape, side),
+            settings,
+            calibration,
+            psf=psf,
+            score=score,
+            calibration_light_e=self.light_e,
+            light_frames=self.light_frames,
+        )
+
+    def _predicted(self, valid: NDArray[np.bool_], open_stream: Any) -> NDArray[np.float64] | None:
+        """Return the predicted slopes, as maps, once there are any."""
+        if self.stream_name is None:
+            return None
+        if self._stream is None:
+            try:
+                self._stream = open_stream(self.stream_name)
+            except FileNotFoundError:
+                return None  # whoever predicts has not begun
+        if not self._stream.count:
+            return None
+        values = np.asarray(self._stream.read())
+        wanted = np.count_nonzero(valid)
+        if values.size != wanted:
+            raise InputError(f"stream {self.stream_name}: expected {wanted} slopes, got {values.size}")
+        maps = np.zeros(valid.shape)
+        maps[valid] = values.ravel()
+        return maps

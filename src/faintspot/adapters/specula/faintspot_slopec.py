@@ -1,0 +1,193 @@
+"""SPECULA's slope computer with faintspot inside."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, Options, ToolSlopes, parts_of
+from faintspot.adapters.checks import check_version
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.sensor.layout import Layout
+
+try:
+    from specula import cpuArray
+    from specula.base_processing_obj import InputDesc, OutputDesc
+    from specula.connections import InputValue
+    from specula.data_objects.slopes import Slopes
+    from specula.data_objects.subap_data import SubapData
+    from specula.processing_objects.slopec import Slopec
+except ImportError:
+    raise MissingExtraError("specula", "specula", "faintspot.adapters.specula") from None
+
+TESTED = "1.1.0", "1.1.0"
+
+
+class FaintspotSlopec(Slopec):  # type: ignore[misc]
+    """Slopes of a Shack-Hartmann sensor, in place of SPECULA's `ShSlopec`.
+
+    Unit, order and sign of the slopes, slope nulls, filters and calibration files are those of `ShSlopec`.
+    Pixels are in electrons, or in ADU with a calibration that says so.
+
+    Parameters
+    ----------
+    subapdata : SubapData
+        SPECULA's sub-apertures.
+    faintspot : str or dict
+        A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
+    calibrating : bool
+        True in parameter files that calibrate (slope null, interaction matrix), whose detector has no noise:
+        frames are then measured at `calibration_light_e`, see `ToolSlopes.calibrating`.
+    calibration_light_e : float
+        Mean light of a sub-aperture, electrons.
+    light_frames : float
+        Time constant of the running mean of the light, frames; 0: none.
+    sn, filtmat, interleave, target_device_idx, precision
+        As for `ShSlopec`; slopes are measured on the processor.
+
+    Raises
+    ------
+    InputError
+        For sub-apertures that are no squares of pixels, or as for `ToolSlopes`.
+    """
+
+    def __init__(
+        self,
+        subapdata: SubapData,
+        faintspot: Any = None,
+        sn: Slopes = None,
+        calibrating: bool = False,
+        calibration_light_e: float = CALIBRATION_LIGHT_E,
+        light_frames: float = LIGHT_FRAMES,
+        filtmat: Any = None,
+        interleave: bool = False,
+        target_device_idx: int | None = None,
+        precision: int | None = None,
+    ) -> None:
+        check_version("SPECULA", "specula", *TESTED)
+        self.subapdata = subapdata  # the base class asks for the number of sub-apertures
+        super().__init__(
+            sn=sn,
+            filtmat=filtmat,
+            interleave=interleave,
+            target_device_idx=target_device_idx,
+            precision=precision,
+        )
+        self._settings, self._calibration, psf, score = parts_of(faintspot)
+        self._options: Options = {
+            "psf": psf,
+            "score": score,
+            "calibration_light_e": calibration_light_e,
+            "light_frames": light_frames if light_frames > 0 else None,
+        }
+        self._noise_free = bool(calibrating)
+        self._tool: ToolSlopes | None = None
+        self._idxs = np.empty((0, 0), np.int64)
+        self.slopes.single_mask, self.slopes.display_map = subapdata.single_mask(), subapdata.display_map
+        self.inputs["in_predicted"] = InputValue(type=Slopes, optional=True)
+        self.outputs["out_subapdata"] = subapdata
+
+    @classmethod
+    def input_names(cls) -> Any:
+        """Return SPECULA's inputs, and the slopes that a loop predicts."""
+        return {
+            **super().input_names(),
+            "in_predicted": InputDesc(Slopes, "Slopes that are expected, after the slope null (optional)"),
+        }
+
+    @classmethod
+    def output_names(cls) -> Any:
+        """Return SPECULA's outputs."""
+        return {**super().output_names(), "out_subapdata": OutputDesc(SubapData, "Sub-apertures")}
+
+    def nsubaps(self) -> int:
+        """Return the number of sub-apertures."""
+        return int(self.subapdata.n_subaps)
+
+    def nslopes(self) -> int:
+        """Return twice that."""
+        return 2 * self.nsubaps()
+
+    @property
+    def measured(self) -> ToolSlopes:
+        """What measures: `last` slopes (px), flags, `standard_errors`, `light`.
+
+        Raises
+        ------
+        InputError
+            Before the first frame.
+        """
+        if self._tool is None:
+            raise InputError("slopes: expected a frame to be measured first, got none")
+        return self._tool
+
+    def compute_slopes(self) -> None:
+        """Measure the pixels that came in; SPECULA then subtracts the slope null."""
+        pixels = np.asarray(cpuArray(self.local_inputs["in_pixels"].pixels))
+        if self._tool is None:
+            self._tool, self._idxs = self._prepared((int(pixels.shape[0]), int(pixels.shape[1])))
+        images = pixels.ravel()[self._idxs]
+        null = np.zeros((2, self.nsubaps())) if self.sn is None else _two_rows(self.sn)
+        prior, predicted = None, self.local_inputs.get("in_predicted")
+        if predicted is not None and predicted.generation_time > 0:
+            prior = ((_two_rows(predicted) + null) / self._tool.unit_per_px).ravel()
+        found = self._tool.measure(images, prior_px=prior, noise_free=self._noise_free)
+        last = self._tool.last
+        found = np.where(last.valid, found, null)
+        self.slopes.xslopes, self.slopes.yslopes = (self.to_xp(row, dtype=self.dtype) for row in found)
+        flux = np.nan_to_num(last.flux).astype(np.float64)
+        self.flux_per_subaperture_vector.value[:] = self.to_xp(flux, dtype=self.dtype)
+        self.total_counts.value[:] = flux.sum()
+        self.subap_counts.value[:] = flux.mean()
+
+    def post_trigger(self) -> None:
+        """Say when the outputs were made."""
+        super().post_trigger()
+        self.outputs["out_subapdata"].generation_time = self.current_time
+
+    def _prepared(self, frame_shape: tuple[int, int]) -> tuple[ToolSlopes, NDArray[np.int64]]:
+        """Make the pipeline for frames of a shape, and which pixels it reads, as one tall frame."""
+        idxs = checked_squares(np.asarray(cpuArray(self.subapdata.idxs)), frame_shape)
+        n, side = len(idxs), int(self.subapdata.np_sub)
+        layout, unit = Layout.stacked(n, (side, side)), (2.0 / side, 2.0 / side)
+        tool = ToolSlopes(layout, self._settings, self._calibration, unit_per_px=unit, **self._options)
+        return tool, idxs.reshape(n * side, side)
+
+
+def checked_squares(idxs: NDArray[Any], frame_shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return SPECULA's sub-apertures, when they are squares of a frame's pixels.
+
+    Parameters
+    ----------
+    idxs : (n, pixels) array of int
+        Pixels of each, counted along the rows of the frame.
+    frame_shape : (int, int)
+
+    Raises
+    ------
+    InputError
+        When they are not squares of pixels, row by row, or leave the frame.
+    """
+    height, width = frame_shape
+    if idxs.min() < 0 or idxs.max() >= height * width:
+        raise InputError(
+            f"subapdata.idxs: expected pixels of frames of {height} x {width}, got numbers up to {idxs.max()}"
+            "; calibrate the sub-apertures with this detector"
+        )
+    side = math.isqrt(idxs.shape[1])
+    square = (width * np.arange(side)[:, None] + np.arange(side)).ravel()
+    inside = idxs[:, 0] % width + side <= width
+    if side * side != idxs.shape[1] or not (idxs == idxs[:, :1] + square).all() or not inside.all():
+        raise InputError(
+            f"subapdata.idxs: expected squares of pixels, row by row, of frames of {height} x {width}, got "
+            "others; calibrate the sub-apertures with this detector"
+        )
+    return idxs.astype(np.int64)
+
+
+def _two_rows(slopes: Any) -> NDArray[np.float64]:
+    """X and y slopes of a Slopes object, (2, n)."""
+    return np.stack([np.asarray(cpuArray(part), np.float64) for part in (slopes.xslopes, slopes.yslopes)])

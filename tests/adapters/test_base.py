@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.adapters.adapter_cases import (
+    ESTIMATORS,
+    EVERYTHING,
+    FAINT_E,
+    POSITIONS,
+    PSF,
+    READ_NOISE,
+    SIDE,
+    N,
+    images,
+    noisy,
+)
+
+import faintspot as fs
+from faintspot import InputError, Settings
+from faintspot.adapters import checks
+from faintspot.adapters.base import ToolSlopes, parts_of
+from faintspot.adapters.checks import UntestedVersionWarning, check_matrix, check_version, predicted
+
+LAYOUT = fs.Layout.stacked(N, (SIDE, SIDE))
+
+
+def tool(settings: Settings, **options: Any) -> ToolSlopes:
+    return ToolSlopes(LAYOUT, settings, READ_NOISE, **{"psf": PSF, **options})
+
+
+def tall(stack: np.ndarray) -> np.ndarray:
+    return stack.reshape(-1, SIDE)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_calibration_does_not_depend_on_its_light(name: str) -> None:
+    # The frame is brought to the same light first; pixels are rounded to float32, and light that the pipeline
+    # is told counts in steps of up to 10 % ("map").
+    slopes = []
+    for light in (FAINT_E, 1e3, 5e6):
+        measured = tool(ESTIMATORS[name])
+        slopes.append(measured.measure(tall(images(light)), noise_free=True))
+        assert measured.last.valid.all()
+    np.testing.assert_allclose(slopes[1:], [slopes[0], slopes[0]], rtol=0, atol=2e-4)
+    # Spots within 1 px, where all of these see at least 0.7 of a displacement, and none more than 1.2 of it.
+    gain = np.polyfit(POSITIONS.T.ravel(), slopes[0].ravel(), 1)[0]
+    assert 0.7 < gain < 1.2
+
+
+def test_calibrating_is_a_block_that_ends() -> None:
+    measured = tool(Settings("window", flux_e=FAINT_E))
+    bright = tall(images(1e5))
+    with measured.calibrating(500.0):
+        calibrated = measured.measure(bright)
+        with measured.calibrating():
+            assert measured.noise_free
+    assert not measured.noise_free
+    np.testing.assert_allclose(calibrated, measured.measure(bright, noise_free=True), atol=1e-6)
+    # Over a mean light of 40 e-, the sums of 100,000 e- are slopes beyond the window.
+    assert np.abs(measured.measure(bright)).max() > 100 * np.abs(calibrated).max() / 50
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (np.zeros((N * SIDE, SIDE)), "expected light in the sub-apertures"),
+        (np.full((N * SIDE, SIDE), np.nan), "expected finite numbers"),
+        (np.ones((4, 4)), "expected shape"),
+    ],
+)
+def test_calibration_frames_that_say_nothing(frame: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        tool(EVERYTHING).measure(frame, noise_free=True)
+
+
+def test_a_calibration_without_slopes_is_refused() -> None:
+    stack = images()
+    stack[2:] = 0.0
+    with pytest.raises(InputError, match=r"slopes of 9 sub-apertures, got 2; check"):
+        tool(EVERYTHING).measure(tall(stack), noise_free=True)
+
+
+def test_mean_light_is_followed_where_nobody_says_it() -> None:
+    rng, middle = np.random.default_rng(2), np.zeros((N, 2))
+    measured = tool(Settings("window"))
+    for _ in range(19):
+        measured.measure(tall(noisy(rng, positions=middle)))
+    assert measured.light is None
+    for _ in range(81):
+        measured.measure(tall(noisy(rng, positions=middle)))
+    # 100 frames of 40 e-; the sum under the window has a noise of 10 e- or less, its mean of 1.
+    assert measured.light is not None
+    np.testing.assert_allclose(measured.light.flux_e, FAINT_E, atol=6.0)
+    known = measured.pipeline.preparation.sensor.flux_e
+    np.testing.assert_allclose(known, measured.light.flux_e, rtol=0.1)
+    measured.measure(tall(images(1e6)), noise_free=True)
+    assert measured.light.flux_e.max() < 60.0  # calibrations do not count
+
+
+@pytest.mark.parametrize(
+    ("settings", "options"),
+    [
+        (Settings("window", flux_e=FAINT_E), {}),
+        (Settings("window"), {"light_frames": None}),
+        (Settings("brightest"), {}),
+    ],
+)
+def test_mean_light_that_is_known_or_not_wanted(settings: Settings, options: dict[str, Any]) -> None:
+    rng, measured = np.random.default_rng(2), tool(settings, **options)
+    before = measured.pipeline
+    for _ in range(30):
+        measured.measure(tall(noisy(rng)))
+    assert measured.light is None
+    assert measured.pipeline is before
+
+
+def test_a_prior_draws_slopes_towards_it() -> None:
+    measured = tool(Settings("map", flux_e=5.0, prior_std_px=0.2))
+    frame = tall(noisy(np.random.default_rng(3), 5.0))
+    to_left, to_right = (measured.measure(frame, prior_px=np.full(2 * N, x)) for x in (-0.6, 0.6))
+    assert (to_right - to_left).mean() > 0.3  # 5 electrons say little: most of 1.2 px
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"calibration_light_e": 0.0}, "calibration_light_e = 0"),
+        ({"light_frames": 0.5}, "light_frames = 0.5"),
+        ({"psf": None}, "psf"),
+    ],
+)
+def test_refused_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        tool(Settings("ml"), **options)
+
+
+def test_a_version_that_was_not_tested_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_version.cache_clear()
+    monkeypatch.setattr(checks.importlib.metadata, "version", lambda name: "2.1.0rc1")
+    with pytest.warns(UntestedVersionWarning, match=r"Tool 2.1.0rc1: .* tested with 1.0.0 to 2.0.3"):
+        check_version("Tool", "tool", "1.0.0", "2.0.3")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_version("Tool", "tool", "1.0.0", "2.0.3")
+        check_version("Tool", "tool", "2.1", "2.1")
+    with pytest.warns(UntestedVersionWarning, match=r"tested with 2.2;"):
+        check_version("Tool", "tool", "2.2", "2.2")
+    check_version.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.full((3, 4), np.nan), "12 NaN or infinite of 12"),
+        (np.zeros((3, 4)), "zeros only"),
+        (np.ones(3), "at least 2 dimensions"),
+    ],
+)
+def test_matrices_of_a_calibration_gone_wrong(matrix: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        check_matrix("interaction matrix", matrix)
+    assert "\n" not in str(error.value)
+    assert check_matrix("interaction matrix", np.eye(2)).shape == (2, 2)
+
+
+class Predictor:
+    def predict(self, slopes: np.ndarray) -> np.ndarray:
+        return 2 * slopes
+
+
+def test_predictions_come_from_callables_and_objects() -> None:
+    last = np.arange(4.0)
+    assert predicted(None, last, (4,)) is None
+    assert predicted(Predictor(), None, (4,)) is None
+    assert predicted(lambda slopes: None, last, (4,)) is None
+    np.testing.assert_array_equal(predicted(Predictor(), last, (2, 2)), [[0, 2], [4, 6]])
+    with pytest.raises(InputError, match=r"predict: expected slopes of shape \(6,\), got \(4,\)"):
+        predicted(Predictor(), last, (6,))
+    with pytest.raises(InputError, match="predict: expected a callable"):
+        predicted(3, last, (4,))
+
+
+def test_what_a_tools_file_says(tmp_path: Path) -> None:
+    path = tmp_path / "faintspot.toml"
+    lines = "[estimator]", 'name = "window"', "[settings]", "flux_e = 40.0", "spot_fwhm_px = 2.0"
+    path.write_text("\n".join([*lines, "[calibration]", "dark = 3.0"]))
+    tables = {
+        "estimator": {"name": "window"},
+        "settings": {"flux_e": 40.0, "spot_fwhm_px": 2.0},
+        "calibration": {"dark": 3.0},
+    }
+    for source in (path, str(path), tables):
+        settings, calibration, psf, score = parts_of(source)
+        assert (settings.estimator.name, settings.flux_e, calibration.dark) == ("window", 40.0, 3.0)
+        assert psf is None
+        assert score is None
+    with pytest.raises(InputError, match="layuot"):
+        parts_of({**tables, "layuot": {}})
+    with pytest.raises(InputError, match="expected a file or tables"):
+        parts_of(None)
+    assert parts_of({**tables, "psf": {"profile": "gaussian", "size": 1.0}}).psf is not None

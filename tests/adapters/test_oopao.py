@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from tests.adapters.adapter_cases import (
+    ESTIMATORS,
+    EVERYTHING,
+    FAINT_E,
+    POSITIONS,
+    PSF,
+    READ_NOISE,
+    SIDE,
+    N,
+    images,
+    needs,
+    noisy,
+)
+
+from faintspot import InputError, Settings
+from faintspot.adapters import oopao
+
+MIDDLE = 0.5 * (SIDE - 1)
+
+
+class StandIn:
+    """What an adapter asks of OOPAO's sensor; its spots are at POSITIONS, times a number."""
+
+    tag, is_geometric, n_pix_subap, threshold_cog = "shackHartmann", False, SIDE, 0.01
+
+    def __init__(self, sources: tuple[int, ...] = (N,)) -> None:
+        self.cam = SimpleNamespace(photonNoise=0, readoutNoise=0)
+        self.sh_data = {
+            f"src_{i}": SimpleNamespace(
+                nValidSubaperture=n,
+                weighting_map=1,
+                reference_signal_2D=0,
+                valid_signal_2D=np.ones((2, n), bool),
+            )
+            for i, n in enumerate(sources)
+        }
+        self.slopes_units: Any = 1.0
+
+    def centroid(self, image: Any, threshold: float) -> Any:
+        raise AssertionError("OOPAO's own")
+
+    def wfs_integrate(self, src: Any, sh_data: Any) -> Any:
+        """Return places less references over the unit, as OOPAO does: all along rows first."""
+        found = self.centroid(src[: sh_data.nValidSubaperture], self.threshold_cog)
+        reference = np.asarray(sh_data.reference_signal_2D)
+        return (found.T - reference) / self.slopes_units
+
+    def initialize_wfs(self) -> None:
+        self.slopes_units = 1.0
+        for data in self.sh_data.values():
+            data.reference_signal_2D = 0
+            data.reference_signal_2D = self.wfs_integrate(images(7.0, np.zeros((N, 2))), data)
+        tilted = images(7.0, np.ones((N, 2)))
+        self.slopes_units = float(np.mean(self.wfs_integrate(tilted, self.sh_data["src_0"])))
+
+
+def signal(wfs: StandIn, frame: Any, source: int = 0) -> np.ndarray:
+    return np.asarray(wfs.wfs_integrate(src=frame, sh_data=wfs.sh_data[f"src_{source}"]))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_has_the_tools_unit_and_order(name: str) -> None:
+    wfs = StandIn()
+    oopao.attach(wfs, ESTIMATORS[name], READ_NOISE, psf=PSF)
+    # Noise-free, at the light of calibrations: the unit has taken the estimator's gain out.
+    rows, columns = signal(wfs, images(5e5))
+    assert np.polyfit(POSITIONS[:, 1], rows, 1)[0] == pytest.approx(1.0, abs=0.15)
+    assert np.polyfit(POSITIONS[:, 0], columns, 1)[0] == pytest.approx(1.0, abs=0.15)
+    assert abs(wfs.slopes_units) > 0.5
+
+
+def test_noise_switches_calibration_off_and_prediction_on() -> None:
+    wfs, asked = StandIn(), []
+
+    def predict(last: np.ndarray) -> np.ndarray:
+        asked.append(last.copy())
+        return np.concatenate([POSITIONS[:, 1], POSITIONS[:, 0]])
+
+    settings = Settings("map", flux_e=FAINT_E, prior_std_px=0.05)
+    attached = oopao.attach(wfs, settings, READ_NOISE, psf=PSF, predict=predict)
+    assert not asked  # references and units are not predicted
+    wfs.cam.photonNoise, wfs.cam.readoutNoise = True, 1.0
+    rng = np.random.default_rng(1)
+    first, second = (signal(wfs, noisy(rng)) for _ in range(2))
+    np.testing.assert_allclose(asked, [first.ravel()])
+    # The prior is where the spots are, and says far more than 40 electrons: within 2 of its widths.
+    assert np.abs(second - POSITIONS[:, ::-1].T).max() < 0.1
+    assert np.abs(first - POSITIONS[:, ::-1].T).max() > 0.2  # the first had one of 0
+    assert attached.measured[0].last.valid.all()
+    with attached.calibrating(500.0):
+        signal(wfs, images())
+    assert len(asked) == 1
+
+
+def test_a_spot_without_light_has_slope_zero() -> None:
+    wfs = StandIn()
+    oopao.attach(wfs, EVERYTHING)
+    wfs.sh_data["src_0"].reference_signal_2D += 0.3
+    frame = images()
+    frame[2] = 0.0
+    found = signal(wfs, frame)
+    np.testing.assert_allclose(found[:, 2], 0.0, atol=1e-12)
+    assert np.abs(found[:, 3]).max() > 0.1
+
+
+def test_sources_with_other_numbers_of_subapertures() -> None:
+    wfs = StandIn((N, 4))
+    attached = oopao.attach(wfs, EVERYTHING)
+    assert signal(wfs, images(), 1).shape == (2, 4)
+    assert [len(each.pipeline.layout) for each in attached.measured] == [N, 4]
+    np.testing.assert_allclose(signal(wfs, images())[:, :4], signal(wfs, images(), 1), atol=1e-6)
+
+
+def test_detach() -> None:
+    wfs = StandIn()
+    attached = oopao.attach(wfs, EVERYTHING)
+    wfs.initialize_wfs = lambda: None  # type: ignore[method-assign]
+    attached.detach()
+    with pytest.raises(AssertionError, match="own"):
+        signal(wfs, images())
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        ({"tag": "pyramid"}, {}, "expected a ShackHartmann of OOPAO's, got StandIn"),
+        ({"is_geometric": True}, {}, "expected a diffractive sensor"),
+        ({"weighting_map": 0.5}, {}, 'take the estimator "window"'),
+        ({"two": True}, {"predict": [None]}, "expected one for each of 2 sources, got 1"),
+        ({"dark": True}, {}, "expected light in the sub-apertures"),
+    ],
+)
+def test_refused_in_one_line(change: dict[str, Any], options: dict[str, Any], message: str) -> None:
+    wfs = StandIn((N, N) if "two" in change else (N,))
+    for name, value in change.items():
+        setattr(wfs, name, value)
+    if "weighting_map" in change:
+        wfs.sh_data["src_0"].weighting_map = np.full((N, SIDE, SIDE), 0.5)
+    if "dark" in change:
+        wfs.initialize_wfs = lambda: signal(wfs, np.zeros((N, SIDE, SIDE)))  # type: ignore[method-assign]
+    with pytest.raises(InputError, match=message) as error:
+        oopao.attach(wfs, EVERYTHING, **options)
+    assert "\n" not in str(error.value)
+
+
+def test_images_of_another_size_and_units_of_nothing() -> None:
+    wfs = StandIn()
+    oopao.attach(wfs, EVERYTHING)
+    with pytest.raises(InputError, match=r"OOPAO's images: expected shape \(9, 10, 10\), got \(9, 8, 8\)"):
+        signal(wfs, np.ones((N, 8, 8)))
+    wfs.slopes_units, wfs.initialize_wfs = float("nan"), lambda: None  # type: ignore[method-assign]
+    with pytest.raises(InputError, match=r"wfs.slopes_units: expected about 1 .* got nan"):
+        oopao.attach(wfs, EVERYTHING)
+
+
+@needs("OOPAO", "oopao")
+@pytest.mark.filterwarnings("ignore")
+class TestRealTool:
+    @pytest.fixture(scope="class")
+    def system(self) -> Any:
+        from OOPAO.ShackHartmann import ShackHartmann
+        from OOPAO.Source import Source
+        from OOPAO.Telescope import Telescope
+
+        telescope = Telescope(resolution=50, diameter=3.0, samplingTime=1 / 500, centralObstruction=0.2)
+        star = Source(optBand="R", magnitude=8)
+        star * telescope
+        wfs = ShackHartmann(
+            nSubap=5, telescope=telescope, lightRatio=0.5, shannon_sampling=True, threshold_cog=0
+        )
+        return SimpleNamespace(star=star, telescope=telescope, wfs=wfs)
+
+    def slopes(self, system: Any, opd_m: Any) -> np.ndarray:
+        from OOPAO.OPD_map import OPD_map
+
+        system.star**system.telescope * OPD_map(opd_m) * system.wfs
+        return np.array(system.wfs.signal)
+
+    def test_slopes_and_interaction_matrix_are_oopaos(self, system: Any) -> None:
+        rng = np.random.default_rng(1)
+        pokes = [2e-6 * gaussian_filter(rng.normal(size=(50, 50)), 7) for _ in range(6)]
+        own, unit = np.array([self.slopes(system, poke) for poke in pokes]), system.wfs.slopes_units
+        attached = oopao.attach(system.wfs, Settings("centroid"))
+        ours = np.array([self.slopes(system, poke) for poke in pokes])
+        # The same pixels are summed: float32 pixels against float64.
+        np.testing.assert_allclose(ours, own, atol=1e-4 * np.abs(own).max())
+        assert np.abs(own).max() > 0.2
+        assert system.wfs.slopes_units == pytest.approx(unit, rel=1e-5)
+        attached.detach()
+        np.testing.assert_allclose(self.slopes(system, pokes[0]), own[0], atol=1e-12)
+
+    def test_a_faint_star(self, system: Any) -> None:
+        attached = oopao.attach(system.wfs, Settings("window", spot_fwhm_px=2.0, flux_e=50.0), READ_NOISE)
+        ramp = 200e-9 * np.linspace(-1, 1, 50)[:, None] * np.ones(50)
+        bright = self.slopes(system, ramp)
+        system.star.nPhoton *= 50.0 * system.wfs.nValidSubaperture / system.wfs.cam.frame.sum()
+        system.wfs.cam.photonNoise, system.wfs.cam.readoutNoise = True, 1.0
+        try:
+            faint = np.mean([self.slopes(system, ramp) for _ in range(100)], axis=0)
+        finally:
+            system.wfs.cam.photonNoise, system.wfs.cam.readoutNoise = False, 0
+            attached.detach()
+        # The mean of 100 frames and 20 sub-apertures has an error of 0.01 px.
+        means = [signals.reshape(2, -1).mean(axis=1) for signals in (faint, bright)]
+        np.testing.assert_allclose(means[0], means[1], atol=0.05)
+        assert np.abs(means[1]).max() > 0.2

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images, needs, noisy
+from tests.adapters.test_specula import GRID, TABLES, frame_of
+
+from faintspot import InputError, MissingExtraError
+from faintspot.adapters import pyrtc
+from faintspot.adapters.pyrtc import _Measuring
+
+REFERENCE = np.linspace(-0.2, 0.2, 2 * N, dtype=np.float32).reshape(2 * GRID, GRID)
+
+
+def process(**changes: Any) -> Any:
+    """Return what the adapter asks of a slopes process."""
+    valid = np.ones((2 * GRID, GRID), bool)
+    values = {
+        "num_regions": GRID,
+        "region_size": SIDE,
+        "sub_ap_spacing": float(SIDE),
+        "offset_x": 0,
+        "offset_y": 0,
+        "valid_sub_aps": valid,
+        "ref_slopes": REFERENCE,
+    }
+    return SimpleNamespace(**{**values, **changes})
+
+
+def measuring(name: str = "centroid", **options: Any) -> _Measuring:
+    return _Measuring({"faintspot": {**TABLES, **ESTIMATORS[name].to_tables()}, **options})
+
+
+class Stream:
+    def __init__(self, values: np.ndarray, count: int = 1) -> None:
+        self.values, self.count = values, count
+
+    def read(self) -> np.ndarray:
+        return self.values
+
+
+def no_stream(name: str) -> Any:
+    raise FileNotFoundError(name)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_has_the_tools_unit_and_order(name: str) -> None:
+    own = measuring(name, noise_free=True)
+    maps = own.maps(process(), frame_of(images(5e5)), no_stream)
+    assert maps.shape == (2 * GRID, GRID)
+    assert maps.dtype == np.float32
+    assert 0.7 < np.polyfit(POSITIONS.T.ravel(), (maps + REFERENCE).ravel(), 1)[0] < 1.2
+    assert own.tool.last.valid.all()
+
+
+def test_only_valid_subapertures_are_measured() -> None:
+    valid = np.ones((2 * GRID, GRID), bool)
+    valid[1, 2] = valid[GRID + 1, 2] = False
+    own, everything = measuring(), measuring()
+    frame = frame_of(images())
+    maps = own.maps(process(valid_sub_aps=valid), frame, no_stream)
+    expected = np.where(valid, everything.maps(process(), frame, no_stream), 0.0)
+    np.testing.assert_allclose(maps, expected, atol=1e-6)
+    assert len(own.tool.pipeline.layout) == N - 1
+    assert len(everything.tool.pipeline.layout) == N
+    own.maps(process(), frame, no_stream)  # the mask may change
+    assert len(own.tool.pipeline.layout) == N
+
+
+def test_frames_without_light() -> None:
+    own = measuring()
+    np.testing.assert_array_equal(own.maps(process(), np.zeros((30, 30)), no_stream), 0.0)
+    stack = images()
+    stack[4] = 0.0
+    maps = own.maps(process(), frame_of(stack), no_stream)
+    assert maps[1, 1] == maps[GRID + 1, 1] == 0.0
+
+
+def test_predicted_slopes_come_by_a_stream() -> None:
+    true = POSITIONS.T.reshape(2 * GRID, GRID) - REFERENCE
+    frame = frame_of(noisy(np.random.default_rng(1), 5.0))
+    errors = []
+    for stream in (Stream(true.ravel(), 0), Stream(true.ravel(), 1)):
+        own = measuring("map", input_streams={"predicted": "name"})
+        own.parts = own.parts._replace(settings=own.parts.settings.replace(flux_e=5.0, prior_std_px=0.1))
+        errors.append(np.std(own.maps(process(), frame, lambda name, stream=stream: stream) - true))
+    assert errors[1] < 0.3 * errors[0]
+    own = measuring("map", input_streams={"predicted": "name"})
+    own.maps(process(), frame, no_stream)  # whoever predicts has not begun
+    with pytest.raises(InputError, match="stream name: expected 18 slopes, got 4"):
+        own.maps(process(), frame, lambda name: Stream(np.zeros(4)))
+
+
+def test_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"slopes.faintspot: expected a faintspot.toml"):
+        _Measuring({})
+    with pytest.raises(InputError, match="measured first"):
+        _ = measuring().tool
+    message = r"10 px on the frame of 30 x 30, got 3 that leave it, first row 2, column 0; leave them out"
+    with pytest.raises(InputError, match=message):
+        measuring().maps(process(offset_y=1), frame_of(images()), no_stream)
+
+
+def test_a_missing_pyrtc_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrtc", None)
+    pyrtc.slopes_process.cache_clear()
+    with pytest.raises(MissingExtraError, match=r"faintspot\[pyrtc\]"):
+        _ = pyrtc.FaintspotSlopes
+    with pytest.raises(AttributeError, match="no attribute 'Slopes'"):
+        _ = pyrtc.Slopes
+
+
+@needs("pyrtc", "pyrtc")
+@pytest.mark.filterwarnings("ignore")
+def test_signals_are_pyrtcs_own() -> None:
+    from pyrtc import SlopesProcess, clear_shms, create_stream
+    from pyrtc.component_loading import resolve_class_symbol
+
+    pyrtc.slopes_process.cache_clear()
+    ours = resolve_class_symbol("faintspot.adapters.pyrtc.FaintspotSlopes")
+    assert issubclass(ours, SlopesProcess)
+    name, stack = uuid4().hex[:8], images()
+    streams = {stream: f"faintspot_{name}_{stream}" for stream in ("wfs", "signal", "signal_2d")}
+    frame = frame_of(np.maximum(stack, 0.0)).astype(np.float32)
+    camera = create_stream(streams["wfs"], frame.shape, np.float32)
+    configuration = {
+        "type": "SHWFS",
+        "signal_type": "slopes",
+        "sub_ap_spacing": SIDE,
+        "sub_ap_offset_x": 0,
+        "sub_ap_offset_y": 0,
+        "input_streams": {"wfs": streams["wfs"]},
+        "output_streams": {"signal": streams["signal"], "signal_2d": streams["signal_2d"]},
+        "functions": [],
+    }
+    found = []
+    try:
+        for kind in (SlopesProcess, ours):
+            component = kind({**configuration, "faintspot": {"estimator": {"name": "centroid"}}})
+            component.set_ref_slopes(REFERENCE)
+            camera.write(frame)
+            component.compute_signal()
+            found.append(np.array(component.read(block=False)))
+            component.close()
+    finally:
+        clear_shms(streams.values())
+    # The same pixels are summed in float32.
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5)
+    assert np.ptp(found[0]) > 1.0

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.adapters.adapter_cases import ESTIMATORS, POSITIONS, SIDE, N, images, needs, noisy
+
+from faintspot import InputError, MissingExtraError
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+GRID = 3
+TABLES = {"calibration": {"read_noise_e": 1.0}, "psf": {"profile": "gaussian", "size": 1.0}}
+
+
+def frame_of(stack: np.ndarray) -> np.ndarray:
+    """Return one frame with the images of GRID x GRID sub-apertures."""
+    return stack.reshape(GRID, GRID, SIDE, SIDE).transpose(0, 2, 1, 3).reshape(GRID * SIDE, GRID * SIDE)
+
+
+def idxs() -> np.ndarray:
+    numbers = np.arange((GRID * SIDE) ** 2).reshape(GRID * SIDE, GRID * SIDE)
+    return numbers.reshape(GRID, SIDE, GRID, SIDE).transpose(0, 2, 1, 3).reshape(N, SIDE * SIDE)
+
+
+def test_a_missing_specula_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "specula", None)
+    monkeypatch.delitem(sys.modules, "faintspot.adapters.specula.faintspot_slopec", raising=False)
+    with pytest.raises(MissingExtraError, match=r"faintspot\[specula\]"):
+        import faintspot.adapters.specula.faintspot_slopec  # noqa: F401
+
+
+@needs("specula", "specula")
+class TestRealTool:
+    @pytest.fixture(scope="class")
+    def specula(self) -> Any:
+        import specula
+
+        specula.init(-1, precision=1)
+        return specula
+
+    @pytest.fixture
+    def subapertures(self, specula: Any) -> Any:
+        from specula.data_objects.subap_data import SubapData
+
+        return SubapData(idxs(), np.arange(N), GRID, GRID)
+
+    def made(self, subapertures: Any, name: str = "centroid", **options: Any) -> Any:
+        """Return the class as SPECULA finds it."""
+        from specula.lib.utils import import_class
+
+        settings = ESTIMATORS[name]
+        tables = {**TABLES, **settings.to_tables()}
+        kind = import_class("FaintspotSlopec", ["faintspot.adapters.specula"])
+        return kind(subapertures, faintspot=tables, **options)
+
+    def slopes(self, computer: Any, frame: np.ndarray, predicted: Any = None, time: int = 1) -> np.ndarray:
+        from specula.data_objects.pixels import Pixels
+
+        pixels = Pixels(frame.shape[1], frame.shape[0])
+        pixels.set_value(frame)
+        pixels.generation_time = time
+        computer.inputs["in_pixels"].set(pixels)
+        if predicted is not None:
+            computer.inputs["in_predicted"].set(predicted)
+        computer.setup()
+        computer.check_ready(time)
+        computer.trigger()
+        computer.post_trigger()
+        return np.array(computer.slopes.slopes)
+
+    def test_slopes_are_speculas_own(self, specula: Any, subapertures: Any) -> None:
+        from specula.data_objects.slopes import Slopes
+        from specula.processing_objects.sh_slopec import ShSlopec
+
+        null = Slopes(slopes=np.linspace(-0.1, 0.1, 2 * N))
+        frame = frame_of(np.maximum(images(), 0.0))
+        for interleave in (False, True):
+            theirs = ShSlopec(subapertures, sn=null, interleave=interleave)
+            ours = self.made(subapertures, sn=null, interleave=interleave)
+            # The same pixels are summed in float32.
+            expected = self.slopes(theirs, frame)
+            np.testing.assert_allclose(self.slopes(ours, frame), expected, atol=1e-6)
+            np.testing.assert_allclose(ours.slopes_map.value, theirs.slopes_map.value, atol=1e-6)
+            assert ours.total_counts.value[0] == pytest.approx(theirs.total_counts.value[0], rel=1e-5)
+            assert set(ours.outputs) == set(theirs.outputs)
+            assert np.ptp(expected) > 0.2
+
+    @pytest.mark.parametrize("name", ESTIMATORS)
+    def test_every_estimator_has_the_tools_unit_and_order(self, subapertures: Any, name: str) -> None:
+        computer = self.made(subapertures, name, calibrating=True)
+        slopes = self.slopes(computer, frame_of(images(5e5))) * (SIDE / 2)
+        assert 0.7 < np.polyfit(POSITIONS.T.ravel(), slopes, 1)[0] < 1.2
+        assert computer.measured.last.valid.all()
+
+    def test_predicted_slopes_come_by_an_input(self, subapertures: Any, specula: Any) -> None:
+        from specula.data_objects.slopes import Slopes
+
+        true = POSITIONS.T.ravel() / (SIDE / 2)
+        null = Slopes(slopes=np.full(2 * N, 0.05))
+        predicted = Slopes(slopes=true - 0.05)
+        frame = frame_of(noisy(np.random.default_rng(1), 5.0))
+        errors = []
+        for time in (0, 1):  # generated never, and now
+            predicted.generation_time = time
+            tables = {
+                **TABLES,
+                "estimator": {"name": "map", "prior_std_px": 0.1},
+                "settings": {"flux_e": 5.0},
+            }
+            computer = self.made(subapertures, sn=null)
+            computer = type(computer)(subapertures, faintspot=tables, sn=null)
+            slopes = self.slopes(computer, frame, predicted)
+            errors.append(np.std(slopes - (true - 0.05)))
+        assert errors[1] < 0.3 * errors[0]  # 5 electrons say little, and a prior of 0.1 px a lot
+
+    def test_a_spot_without_light_has_the_slope_of_the_null(self, subapertures: Any, specula: Any) -> None:
+        from specula.data_objects.slopes import Slopes
+
+        stack = images()
+        stack[3] = 0.0
+        null = Slopes(slopes=np.full(2 * N, 0.05))
+        slopes = self.slopes(self.made(subapertures, sn=null), frame_of(stack))
+        np.testing.assert_allclose(slopes[[3, 3 + N]], 0.0, atol=1e-7)
+
+    def test_refused_in_one_line(self, subapertures: Any, specula: Any) -> None:
+        from specula.data_objects.subap_data import SubapData
+
+        with pytest.raises(InputError, match="got numbers up to 899; calibrate the sub-apertures"):
+            self.slopes(self.made(subapertures), np.ones((20, 20)))
+        with pytest.raises(InputError, match="expected squares of pixels, row by row, of frames of 30 x 40"):
+            self.slopes(self.made(subapertures), np.ones((30, 40)))
+        backwards = SubapData(idxs()[:, ::-1], np.arange(N), GRID, GRID)
+        with pytest.raises(InputError, match="got others"):
+            self.slopes(self.made(backwards), frame_of(images()))
+        with pytest.raises(InputError, match="faintspot: expected a file or tables"):
+            type(self.made(subapertures))(subapertures)
+        with pytest.raises(InputError, match="measured first"):
+            _ = self.made(subapertures).measured
+
+
+@needs("specula", "specula")
+def test_a_parameter_file_finds_the_class() -> None:
+    code = (
+        "import specula; specula.init(-1, precision=1)\n"
+        "from specula.lib.utils import import_class\n"
+        "print(import_class('FaintspotSlopec', ['faintspot.adapters.specula']).input_names().keys())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "in_predicted" in run.stdout
