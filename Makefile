@@ -2,6 +2,7 @@
 # make test   lint, types, tests
 # make fuzz   hostile values at every door for MINUTES=60; a finding names its seed
 # make docs   the documentation as pages, build/docs/index.html; QUICK=1 leaves out what tutorials compute
+# make release  wheel and sdist, tried in new environments with every extra (long; TRY="--extras none,io")
 # make bench  speed against other packages, as ratios in one run, as a page (about 15 minutes)
 # make bench-compare  what changed since the run before, beyond noise (or: OLD=file NEW=file)
 # make clean  remove what these made
@@ -15,7 +16,7 @@ export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export OPENBLAS_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint types unit fuzz docs bench bench-compare clean
+.PHONY: demo test lint types unit fuzz docs release bench bench-compare clean
 
 demo: $(VENV)/installed
 	$(BIN)/faintspot demo
@@ -38,6 +39,10 @@ fuzz: $(VENV)/installed
 docs: $(VENV)/installed-docs
 	$(BIN)/python -m sphinx -W --keep-going -q -b html $(if $(QUICK),-D plot_gallery=0) docs build/docs
 	@echo "build/docs/index.html: open it in a browser"
+
+release: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet build twine
+	$(BIN)/python release/try_packages.py $(TRY)
 
 bench: $(VENV)/installed-benchmarks
 	$(BIN)/python -m benchmarks

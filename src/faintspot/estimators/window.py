@@ -77,7 +77,7 @@ class Window(Estimator):
     method = "centre of gravity under a fixed window, over its mean light and gain"
     needs = frozenset({Need.WIDTH})
     cost = 0.08
-    style = Style("#000000", "--", "o")
+    style = Style("#8C510A", "-", "p")
 
     @property
     def uses_light(self) -> bool:
