@@ -15,11 +15,12 @@ from faintspot.checks import finite_array
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
 from faintspot.control.compiled import CompiledIntegrator
-from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, Learnt, Model, Plant
+from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, POLC, Learnt, Model, Plant
 from faintspot.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.options import Options, option
+from faintspot.sensor.calibration import Calibration
 from faintspot.settings import Settings
 from faintspot.tables import errors_of_table, read_tables, save_tables
 from faintspot.toml_files import check_keys
@@ -217,6 +218,21 @@ class Control:
             raise InputError(
                 f"{TABLE}.{INTERACTION}: expected {2 * n} rows for {n} sub-apertures (all x, then all y), "
                 f"got {slopes}"
+            )
+
+    def check_errors(self, calibration: Calibration) -> None:
+        """Refuse a camera whose read noise is not known, where slopes are weighed by their standard errors.
+
+        Raises
+        ------
+        InputError
+            It says what is missing.
+        """
+        kind = self.options.controller
+        if kind in (POLC, KALMAN) and calibration.read_noise_photoelectrons is None:
+            raise InputError(
+                f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
+                "camera's read noise: calibration.read_noise_e"
             )
 
     def line(self) -> CommandLine:

@@ -124,6 +124,7 @@ class Engine:
         self._raw = np.zeros(layout.frame_shape, np.float32)
         if control is not None:
             control.check_fits(len(layout))
+            control.check_errors(self.live.running.pipelines[0].calibration)
         commands = 0 if control is None else control.commands
         self._streams = SlopeStreams(name, len(layout), commands)
         try:
