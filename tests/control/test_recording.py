@@ -87,10 +87,11 @@ def test_what_is_refused() -> None:
 
 
 def test_theory_of_a_layout() -> None:
-    by_side, by_diameter = (
-        theories_of(Layout.grid((3, 3), pixels=8, **size), 250.0)["winds from anywhere"]
-        for size in ({"subaperture_m": 0.6}, {"diameter_m": 1.8})
+    layouts = (
+        Layout.grid((3, 3), pixels=8, subaperture_m=0.6),
+        Layout.grid((3, 3), pixels=8, diameter_m=1.8),
     )
+    by_side, by_diameter = (theories_of(each, 250.0)["winds from anywhere"] for each in layouts)
     np.testing.assert_allclose(by_side, by_diameter)
     assert by_side.shape == (3, 18, 18)
     assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0

@@ -130,8 +130,8 @@ def test_a_prediction_s_writer_may_die() -> None:
 def test_the_mean_light_is_told(sky: Sky, files: tuple[Path, Control]) -> None:
     """The star fades by three quarters: the settings follow."""
     path, control = files
-    sky.start(make_engine(sky.name, path, control, mean_light=20.0))
-    engine = sky.running.engine
+    engine = make_engine(sky.name, path, control, mean_light=20.0)
+    sky.start(engine)
     sky.frames(25)
     sky.until(lambda: engine.live.change_number > 0 or sky.frame() is None)
     told = np.mean(engine.live.settings.flux_e)
