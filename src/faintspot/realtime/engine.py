@@ -46,7 +46,7 @@ class FrameSource(Protocol):
 
 
 class Engine:
-    """Measures the frames of a pixel ring and publishes their slopes, and commands that follow from them.
+    """Measures the frames of a pixel ring, publishes their slopes and, where asked to, commands, until stopped.
 
     Parameters
     ----------
