@@ -46,7 +46,7 @@ class FrameSource(Protocol):
 
 
 class Engine:
-    """Measures the frames of a pixel ring, publishes their slopes and, where asked to, commands, until stopped.
+    """Measures the frames of a pixel ring and publishes slopes, and commands, until it is told to stop.
 
     Parameters
     ----------
