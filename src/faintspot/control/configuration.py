@@ -21,6 +21,7 @@ from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.options import Options, option
 from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.tables import errors_of_table, read_tables, save_tables
 from faintspot.toml_files import check_keys
@@ -250,6 +251,14 @@ class Control:
             matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
             return CompiledIntegrator(line, self.interaction, matrix, 1.0, options.leak)
         return Learnt(self.plant, self.model).controller(line)
+
+
+def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
+    """Return how wide the prior of an estimator is, (2 n,); None where it has none."""
+    if not settings.estimator.takes_prior or PRIOR not in settings.declared():
+        return None
+    each = settings.values(PRIOR, len(layout), layout.pixels).astype(np.float64)
+    return np.tile(each, 2) if np.isfinite(each).all() else None
 
 
 def load_control(path: str | Path) -> Control | None:
