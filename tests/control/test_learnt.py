@@ -14,6 +14,7 @@ from faintspot.control.configuration import Control, ControlOptions
 from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
 from faintspot.control.learnt import Learnt, Model
 from faintspot.errors import InputError
+from faintspot.sensor.calibration import Calibration
 from faintspot.settings import Settings
 
 KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
@@ -93,6 +94,10 @@ def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
     refused("model: expected a file with what predictive Kalman filter has learnt, got none", kalman, None)
     model.save(path)
     refused("expected what 'polc' has learnt, got that of 'kalman'", ControlOptions(controller="polc"))
+    with pytest.raises(InputError, match="which need the camera's read noise"):
+        Control(INTERACTION, None, kalman, model).check_errors(Calibration())
+    Control(INTERACTION, None, kalman, model).check_errors(Calibration(read_noise_e=1.0))
+    Control(INTERACTION).check_errors(Calibration())
     refused('prediction = "stream"', ControlOptions(controller="kalman", prediction="stream"))
     arrays = dict(np.load(path))
     np.savez(path, **{**arrays, "first": arrays["first"][:4]})

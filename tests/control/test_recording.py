@@ -18,6 +18,7 @@ from faintspot.control.configuration import Control, ControlOptions, load_contro
 from faintspot.control.recording import telemetry_of_recording, theories_of
 from faintspot.errors import InputError
 from faintspot.sensor.layout import Layout
+from faintspot.settings import Settings
 
 GAIN = 0.8
 OPTIONS = ControlOptions(gain=0.3, centroid_gain=GAIN)
@@ -69,7 +70,28 @@ def test_open_loop_slopes_of_the_longest_stretch() -> None:
     np.testing.assert_array_equal(found.trust, ~lost)
 
 
+@pytest.mark.parametrize("prediction", ["none", "controller"])
+def test_the_estimator_s_prior_is_taken_out(prediction: str) -> None:
+    """Slopes were drawn half-way to what was expected: 0, or what the integrator expects."""
+    night, prior = recording(), np.full(18, 0.3 * GAIN)
+    control = Control(INTERACTION, None, OPTIONS.replaced({"prediction": prediction, "centroid_gain": 1.0}))
+    sent = night.commands.astype(np.float64) @ INTERACTION.T
+    expected = np.zeros((699, 18))
+    if prediction == "controller":
+        expected[2:] = sent[:-2] - sent[1:-1]
+    night.slopes = (expected + 0.5 * (night.slopes / GAIN - expected)).astype(np.float32)
+    for name in ("standard_error_x", "standard_error_y"):
+        setattr(night, name, getattr(night, name) * np.float32(np.sqrt(0.5)))
+    found, _ = telemetry_of_recording(night, control, prior)
+    np.testing.assert_allclose(found.open_loop_px, OPEN_LOOP[103:], atol=1e-3)
+    np.testing.assert_allclose(found.variance_px2, (0.3 * GAIN) ** 2, rtol=1e-4)
+    np.testing.assert_allclose(found.trust, 0.5, rtol=1e-4)
+
+
 def test_what_is_refused() -> None:
+    told = Control(INTERACTION, None, OPTIONS.replaced({"prediction": "stream"}))
+    with pytest.raises(InputError, match="expected a loop closed with an integrator"):
+        telemetry_of_recording(recording(), told, np.full(18, 0.3))
     for changes, message in (
         ({"commands": np.zeros((699, 0))}, "expected 12 commands, as the interaction matrix has, got 0"),
         ({"loop": np.ones(699)}, "expected 202 frames in a row with a closed loop, got 0"),
@@ -87,10 +109,11 @@ def test_what_is_refused() -> None:
 
 
 def test_theory_of_a_layout() -> None:
-    by_side, by_diameter = (
-        theories_of(Layout.grid((3, 3), pixels=8, **size), 250.0)["winds from anywhere"]
-        for size in ({"subaperture_m": 0.6}, {"diameter_m": 1.8})
+    layouts = (
+        Layout.grid((3, 3), pixels=8, subaperture_m=0.6),
+        Layout.grid((3, 3), pixels=8, diameter_m=1.8),
     )
+    by_side, by_diameter = (theories_of(each, 250.0)["winds from anywhere"] for each in layouts)
     np.testing.assert_allclose(by_side, by_diameter)
     assert by_side.shape == (3, 18, 18)
     assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0
@@ -100,6 +123,7 @@ def test_theory_of_a_layout() -> None:
 def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "faintspot.toml"
     configuration_file.save(path, Layout.grid((3, 3), pixels=8, subaperture_m=0.6))
+    configuration_file.save(path, Settings("brightest"))
     np.save(tmp_path / "m.npy", INTERACTION)
 
     def learn(*options: str) -> Any:

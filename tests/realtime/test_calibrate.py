@@ -98,6 +98,11 @@ def test_what_is_refused(files: tuple[Path, Control], tmp_path: Path) -> None:
         deaf = calibrated(path, sky, "--commands", "3", "--rounds", "6")
         assert "the mirror does not answer: pokes of 50" in str(deaf.exception)
         assert "[control]" not in path.read_text()
+        large = ("--amplitude", "60", "--commands", "3")
+        save_control(files[0], largest_command=50.0)
+        assert "--amplitude 60: expected at most largest_command, 50" in str(
+            calibrated(files[0], sky, *large).exception
+        )
         assert not path.with_suffix(".control.npz").exists()
     assert "no engine" in str(
         calibrated(path, sky, "--commands", "3").exception

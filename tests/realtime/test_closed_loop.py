@@ -17,6 +17,7 @@ import pytest
 
 import faintspot
 from faintspot import configuration as configuration_file
+from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import Control
 from faintspot.errors import InputError
 from faintspot.loop import LoopArm, simulate_loop
@@ -130,8 +131,12 @@ def test_the_guard_opens_a_loop_that_diverges(
     path, control = files
     sky.start(make_engine(sky.name, path, with_options(control, guard_frames=10, **changes)))
     sky.frames(12)
+    assert isinstance(sky.loop.controller, CompiledIntegrator)
     sky.loop.controller.gain = gain
     sky.loop.close()
+    limit = sky.loop.guard._largest_px
+    sky.loop.close()  # again: what is too much stays what the open loop has shown
+    assert sky.loop.guard._largest_px == limit
     for _ in range(80):
         sky.frame()
         if not sky.loop.closed:
@@ -166,7 +171,9 @@ def test_the_guard_opens_a_loop_that_has_lost_its_star(
     np.testing.assert_array_equal(sent[-1], sent[-2])
 
 
-def test_a_controller_that_fails_opens_the_loop(sky: Sky, files: tuple[Path, Control]) -> None:
+def test_a_controller_that_fails_opens_the_loop(
+    sky: Sky, files: tuple[Path, Control], monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, control = files
     sky.start(make_engine(sky.name, path, control))
     sky.loop.close()
@@ -175,7 +182,7 @@ def test_a_controller_that_fails_opens_the_loop(sky: Sky, files: tuple[Path, Con
     def fails(*_: Any) -> None:
         raise ZeroDivisionError("by zero")
 
-    sky.loop.controller.update = fails  # type: ignore[method-assign]
+    monkeypatch.setattr(sky.loop.controller, "update", fails)
     sky.frames(2)
     assert sky.loop.opened_because == "the controller failed: ZeroDivisionError: by zero"
     sent = sky.records["commands"]

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from faintspot.cli.needs import needs
-from faintspot.errors import InputError
+from faintspot.errors import InputError, MissingExtraError
 
 
 @needs("realtime", "pyshmem")
@@ -73,10 +73,13 @@ def calibrate(
     layout, former = Layout.load(config), load_control(config)
     if keep_reference and (former is None or former.reference is None):
         raise InputError(f"--keep-reference: expected reference_slopes in [control] of {config}")
+    stroke = None if former is None else former.options.largest_command
+    if stroke is not None and amplitude > stroke:
+        raise InputError(f"--amplitude {amplitude:g}: expected at most largest_command, {stroke:g}")
     number = commands or _known_commands(former, name)
     with (
         StreamedMirror(name, number, settle_frames=settle_frames, frames=frames) as mirror,
-        progress_bar("rounds") as advance,
+        progress_bar("pokes", "rounds") as advance,
     ):
         total: Any = None
         found = calibrate_mirror(mirror, amplitude, error, rounds, lambda done, _: advance(done, total))
@@ -84,13 +87,18 @@ def calibrate(
     if len(reference) != len(found.reference):
         raise InputError(f"{config}: {len(reference) // 2} sub-apertures, the engine's has another number")
     store = save_calibration(config, found, np.asarray(reference))
-    save_picture(store.with_suffix(".png"), found, np.asarray(reference), layout)
+    written = [str(store)]
+    try:
+        save_picture(store.with_suffix(".png"), found, np.asarray(reference), layout)
+        written.append(store.with_suffix(".png").name)
+    except MissingExtraError as error:
+        click.echo(f"no picture: {error}", err=True)
     for line in _in_words(found):
         click.echo(line)
     if former is not None and former.interaction.shape == found.interaction.shape:
         gain, gain_error = centroid_gain(found, former.interaction)
         click.echo(f"slopes are {gain:.3f} +- {gain_error:.3f} times those of the former matrix")
-    click.echo(f"{store}, {store.with_suffix('.png').name} and [control] of {config} written")
+    click.echo(f"{', '.join(written)} and [control] of {config} written")
 
 
 def _known_commands(former: Any, name: str) -> int:

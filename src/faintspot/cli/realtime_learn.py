@@ -31,20 +31,20 @@ def learn(store: Path, config: str, kind: str, wind_speeds: str) -> None:
     """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
 
     STORE is what `faintspot realtime record` wrote while the engine ran with TOML, at least 200 frames
-    without a gap and with an estimator that was told no prediction; 2000 are better. The layout must know
-    subaperture_m or diameter_m. Takes up to some minutes; writes TOML's name with .model.npz, and
-    controller and model of [control].
+    without a gap; 2000 are better. The layout must know subaperture_m or diameter_m. Takes up to some
+    minutes; writes TOML's name with .model.npz, and controller and model of [control].
 
     \b
     Example:
       faintspot realtime record night.zarr --seconds 10
       faintspot realtime learn night.zarr --control kalman
     """
-    from faintspot.control.configuration import load_control, save_control
+    from faintspot.control.configuration import load_control, prior_std_px, save_control
     from faintspot.control.learning import learn as learnt_by
     from faintspot.control.recording import telemetry_of_recording, theories_of
     from faintspot.io import read_telemetry
     from faintspot.sensor.layout import Layout
+    from faintspot.settings import Settings
 
     control = load_control(config)
     if control is None:
@@ -53,8 +53,10 @@ def learn(store: Path, config: str, kind: str, wind_speeds: str) -> None:
         speeds = [float(each) for each in wind_speeds.split(",")]
     except ValueError:
         raise InputError(f"--wind-speeds {wind_speeds!r}: expected numbers such as 5,10,20") from None
-    telemetry, rate_hz = telemetry_of_recording(read_telemetry(store, images=False), control)
-    learnt = learnt_by(kind, control.plant, telemetry, theories_of(Layout.load(config), rate_hz, speeds))
+    layout, night = Layout.load(config), read_telemetry(store, images=False)
+    prior = prior_std_px(Settings.load(config), layout)
+    telemetry, rate_hz = telemetry_of_recording(night, control, prior)
+    learnt = learnt_by(kind, control.plant, telemetry, theories_of(layout, rate_hz, speeds))
     path = Path(config).with_suffix(".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)

@@ -15,11 +15,13 @@ from faintspot.checks import finite_array
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
 from faintspot.control.compiled import CompiledIntegrator
-from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, Learnt, Model, Plant
+from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, POLC, Learnt, Model, Plant
 from faintspot.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.options import Options, option
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.tables import errors_of_table, read_tables, save_tables
 from faintspot.toml_files import check_keys
@@ -219,6 +221,21 @@ class Control:
                 f"got {slopes}"
             )
 
+    def check_errors(self, calibration: Calibration) -> None:
+        """Refuse a camera whose read noise is not known, where slopes are weighed by their standard errors.
+
+        Raises
+        ------
+        InputError
+            It says what is missing.
+        """
+        kind = self.options.controller
+        if kind in (POLC, KALMAN) and calibration.read_noise_photoelectrons is None:
+            raise InputError(
+                f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "
+                "camera's read noise: calibration.read_noise_e"
+            )
+
     def line(self) -> CommandLine:
         """Return the way of commands to a mirror that is flat."""
         options = self.options
@@ -234,6 +251,14 @@ class Control:
             matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
             return CompiledIntegrator(line, self.interaction, matrix, 1.0, options.leak)
         return Learnt(self.plant, self.model).controller(line)
+
+
+def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
+    """Return how wide the prior of an estimator is, (2 n,); None where it has none."""
+    if not settings.estimator.takes_prior or PRIOR not in settings.declared():
+        return None
+    each = settings.values(PRIOR, len(layout), layout.pixels).astype(np.float64)
+    return np.tile(each, 2) if np.isfinite(each).all() else None
 
 
 def load_control(path: str | Path) -> Control | None:

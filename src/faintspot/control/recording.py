@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import numbers_between
-from faintspot.control.configuration import Control
+from faintspot.control.configuration import NONE, STREAM, Control
+from faintspot.control.learnt import INTEGRATOR, MODAL
 from faintspot.control.telemetry import Telemetry, make_telemetry
 from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
@@ -28,16 +29,20 @@ _ARCSEC = math.pi / 180 / 3600
 _CLOSED = 2
 
 
-def telemetry_of_recording(recording: Recording, control: Control) -> tuple[Telemetry, float]:
+def telemetry_of_recording(
+    recording: Recording, control: Control, prior_std_px: Floats | None = None
+) -> tuple[Telemetry, float]:
     """Return open-loop slopes of the longest stretch of a recording without a gap, and its frame rate.
 
-    The loop must have been closed, with this control and an estimator that was told no prediction.
+    The loop must have been closed with this control.
 
     Parameters
     ----------
     recording : faintspot.io.Telemetry
     control : Control
-        Whose matrix, delay and centroid gain count.
+        Whose matrix, delay and centroid gain count; and whether the estimator was told what it expects.
+    prior_std_px : (2 n,) array, optional
+        How wide the estimator's prior was. Default: it had none.
 
     Returns
     -------
@@ -47,13 +52,20 @@ def telemetry_of_recording(recording: Recording, control: Control) -> tuple[Tele
     Raises
     ------
     InputError
-        When there are no commands, as many as the control has, or no stretch that is long enough.
+        When there are no commands, as many as the control has, or no stretch that is long enough; and where
+        the estimator had a prior around what is not known any more.
     """
     commands = recording.commands
     if commands.shape[1] != control.commands:
         raise InputError(
             f"recording: expected {control.commands} commands, as the interaction matrix has, got "
             f"{commands.shape[1]}"
+        )
+    predicted = prior_std_px is not None and control.prediction != NONE
+    if predicted and (control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM):
+        raise InputError(
+            "recording: expected a loop closed with an integrator, as what another controller or program has "
+            "told the estimator to expect was not recorded"
         )
     start, stop = _longest(np.asarray(recording.frame), np.asarray(recording.loop) == _CLOSED)
     delay, gain = control.options.delay_frames, control.options.centroid_gain
@@ -70,9 +82,13 @@ def telemetry_of_recording(recording: Recording, control: Control) -> tuple[Tele
         raise InputError("recording: expected standard errors of slopes; give the calibration a read noise")
     slopes = recording.slopes[part].astype(np.float64) / gain
     held = commands[start : stop - delay].astype(np.float64) @ control.interaction.T
+    expected = np.zeros_like(slopes)
+    if predicted:  # what acts less the latest command
+        latest = commands[start + delay - 1 : stop - 1].astype(np.float64) @ control.interaction.T
+        expected = held - latest
     times = recording.last_row_time_ns[start:stop]
     rate = (stop - start - 1) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
-    return make_telemetry(slopes, error / gain, held, np.zeros_like(slopes), None), rate
+    return make_telemetry(slopes, error / gain, held, expected, prior_std_px), rate
 
 
 def theories_of(

@@ -148,12 +148,14 @@ class ControlLoop:
         except Exception as error:  # in the frame path nothing raises
             reason = f"the controller failed: {type(error).__name__}: {error}".split("\n")[0]
         line.hold(before.copy())
-        self.closed, self.opened_because = False, reason
+        self.closed, self.opened_because = False, self.guard.end(reason)
 
     # Any thread -------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Close the loop, from what the mirror holds on."""
+        """Close the loop, from what the mirror holds on; of one that is closed already nothing changes."""
+        if self.closed:
+            return
         self.guard.begin()
         self.opened_because, self._begins = "", True
         self.closed = True

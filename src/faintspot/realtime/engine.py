@@ -46,7 +46,7 @@ class FrameSource(Protocol):
 
 
 class Engine:
-    """Measures the frames of a pixel ring and publishes their slopes, and commands that follow from them.
+    """Measures the frames of a pixel ring and publishes slopes, and commands, until it is told to stop.
 
     Parameters
     ----------
@@ -124,6 +124,7 @@ class Engine:
         self._raw = np.zeros(layout.frame_shape, np.float32)
         if control is not None:
             control.check_fits(len(layout))
+            control.check_errors(self.live.running.pipelines[0].calibration)
         commands = 0 if control is None else control.commands
         self._streams = SlopeStreams(name, len(layout), commands)
         try:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.control.configuration import prior_std_px
 from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
@@ -146,7 +147,7 @@ class FramePath:
             width = min(narrow)
             groups = full * wide // width, full * wide // width + 1
             self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1, prior)
-        self.prior_std_px = None if prior is None else _prior_std_px(pipeline)
+        self.prior_std_px = None if prior is None else prior_std_px(pipeline.settings, pipeline.layout)
         """How wide the prior is that slopes are drawn to, (2 n,); None: they are not."""
         self._plain = results, self._stages[:0]
         self._explaining = results, self._stages
@@ -239,15 +240,6 @@ def check_real_time(pipeline: SlopePipeline) -> None:
             "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
             f'real time {pipeline.settings.estimator.label} and "auto" need it before the frame is there'
         )
-
-
-def _prior_std_px(pipeline: SlopePipeline) -> NDArray[np.float64] | None:
-    """The width of an estimator's prior, (2 n,); None where it has none."""
-    settings, name = pipeline.settings, "prior_std_px"
-    if not settings.estimator.takes_prior or name not in settings.declared():
-        return None
-    each = settings.values(name, len(pipeline.layout), pipeline.layout.pixels).astype(np.float64)
-    return np.tile(each, 2) if np.isfinite(each).all() else None
 
 
 def last_rows_of_groups(pipeline: SlopePipeline, width: int) -> NDArray[np.int64]:

@@ -98,8 +98,8 @@ class StreamedMirror:
                 self._wait(end)
                 continue
             end = time.monotonic() + _NO_FRAMES_S
-            after = int(records["frame"][0]) + self._settle if after is None else after
-            settled = records[records["frame"] >= after][: self._frames - count]
+            after = int(records["sequence"][0]) + self._settle if after is None else after
+            settled = records[records["sequence"] >= after][: self._frames - count]
             found.append(settled)
             count += len(settled)
         seen = np.concatenate(found)

@@ -60,7 +60,7 @@ class SlopeStreams:
             self._commands = create_stream(stream, (commands,)) if commands else None
             undo.pop_all()
         self._all = [each for each in (self._slopes, self._details, self._marks, self._commands) if each]
-        self._n = n
+        self._n, self._closed = n, False
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
 
@@ -109,7 +109,8 @@ class SlopeStreams:
 
     def commands_obstacle(self) -> str | None:
         """Return why nobody sees the commands, None where they do; by any thread."""
-        assert self._commands is not None
+        if self._commands is None or self._closed:
+            return None
         name = self._commands.name
         try:
             there = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
@@ -120,6 +121,7 @@ class SlopeStreams:
 
     def close(self) -> None:
         """Remove all streams."""
+        self._closed = True
         for stream in self._all:
             stream.unlink()
 
