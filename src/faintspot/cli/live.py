@@ -18,7 +18,7 @@ from faintspot.extras import require
 if TYPE_CHECKING:
     from faintspot.live_page.server import LiveServer
 
-_NICENESS = 10  # the engine comes first
+_NICENESS = 5  # the engine comes first
 
 
 @needs("live", "tornado", "pyshmem", "zarr")
