@@ -130,7 +130,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 
     with ExitStack() as contexts:
 
-        def opened(url: str, **options: Any) -> Any:
+        def opened(url: str, *, drawn: bool = True, **options: Any) -> Any:
             context = contexts.enter_context(browser.new_context(**({"viewport": DESKTOP} | options)))
             page = context.new_page()
             page.set_default_timeout(PATIENCE_MS)
@@ -139,7 +139,8 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
             home = url.partition("#")[0]
             page.on("request", lambda made: faults.extend([] if made.url.startswith(home) else [made.url]))
             page.goto(url)
-            until(page, "document.documentElement.dataset.frames > 0")
+            if drawn:
+                until(page, "document.documentElement.dataset.frames > 0")
             return page
 
         yield opened
@@ -270,6 +271,17 @@ def test_without_the_token_one_may_only_watch(open_page: Any, server: LiveServer
     assert page.locator("#token-form").is_hidden()
     page.reload()
     page.locator("#setting-noise_std").wait_for()  # the tab remembers
+
+
+def test_private_page_shows_nothing_before_the_token(open_page: Any, engine: Running, tmp_path: Path) -> None:
+    with served(serve_engine, engine.name, folder=tmp_path, private=True) as server:
+        page = open_page(server.url.partition("#")[0], drawn=False)
+        page.locator("#token-error").filter(has_text="needs the token").wait_for()
+        assert page.locator("#tiles dd").count() == 0
+        page.locator("#token").fill(server.access.token)
+        page.locator("#token").press("Enter")
+        page.locator("#setting-noise_std").wait_for()
+        until(page, "document.getElementById('raw-caption').textContent !== ''")
 
 
 def test_telephone_light_and_dark(open_page: Any, server: LiveServer) -> None:

@@ -170,6 +170,18 @@ def test_recording_of_another_sensor_than_it_says_is_refused(tmp_path: Path) -> 
         RecordingSource(tmp_path / "night.zarr")
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"layout": {}}, {"layout": 5}, {"changes": [{}]}, {"changes": [{"frame": "x"}]}]
+)
+def test_attributes_that_make_no_sense_are_one_line(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    made, images = records(0, 5), image_type(LAYOUT.frame_shape, N, LAYOUT.window)
+    attributes = {"layout": layout_values(LAYOUT), "arms": []}
+    store = TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes)
+    store.append(made, np.zeros(0, images), {"changes": []} | wrong)
+    with pytest.raises(InputError, match="the store is damaged"):
+        RecordingSource(tmp_path / "night.zarr")
+
+
 def test_parts_of_a_store_are_those_of_the_whole(night: Path) -> None:
     store = StoredTelemetry(night)
     assert (store.frames, store.images) == (FRAMES, 100)

@@ -185,3 +185,12 @@ def test_what_cannot_be_recorded(name: str, tmp_path: Path) -> None:
         for wrong in ({"n_frames": 0}, {"seconds": 0.0}):
             with pytest.raises(InputError, match=next(iter(wrong))):
                 Recorder(name, tmp_path / f"{next(iter(wrong))}.zarr").run(**wrong)
+
+
+def test_arms_that_came_later_are_named(name: str, tmp_path: Path) -> None:
+    with TelemetryRing.create(name, LAYOUT, arms=["none", "tv"]) as ring:
+        recording = Recorder(name, tmp_path / "night.zarr")
+        write(ring, 1)
+        ring.write_change(2, 1, {"arms": ["ml", "set"], "first_arm": 2, "every": 50}, None)
+        recording.run(n_frames=1)
+    assert read_telemetry(tmp_path / "night.zarr").attributes["arms"] == ["none", "tv", "ml", "set"]

@@ -18,7 +18,7 @@ from faintspot.extras import require
 if TYPE_CHECKING:
     from faintspot.live_page.server import LiveServer
 
-_NICENESS = 10  # the engine comes first
+_NICENESS = 5  # the engine comes first
 
 
 @needs("live", "tornado", "pyshmem", "zarr")
@@ -54,6 +54,7 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
     from faintspot.live_page.serving import serve_engine, serve_recording
 
     os.nice(_NICENESS)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # does not push others aside when it wakes
     with stop_on_signal() as stop:
         if recording is not None:
             serve_recording(recording, stop, _say, address=bind, port=port, private=private)

@@ -45,8 +45,9 @@ class RecordingSource:
         self.name = store.path.name
         try:
             self.layout: Layout | None = Layout(**store.attributes["layout"])
-            self.arms: list[str] = list(store.attributes.get("arms", []))
-        except (KeyError, TypeError) as error:
+            self.arms = [str(arm) for arm in store.attributes.get("arms", [])]
+            changed = [(int(change["frame"]), dict(change["changes"]))[0] for change in store.changes]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{path}: the store is damaged ({type(error).__name__}: {error})") from None
         self._type = record_type(len(self.layout))
         store.check_shapes(
@@ -56,7 +57,7 @@ class RecordingSource:
         self._times_s = np.maximum.accumulate((times - times[0]) / 1e9)
         frames = store.read("frame", 0, store.frames)
         self._pictures = places_of(store.read("image_frame", 0, store.images), frames)
-        self._change_places = np.searchsorted(frames, [change["frame"] for change in store.changes])
+        self._change_places = np.searchsorted(frames, changed)
         self._told = 0
         self._lock = threading.Lock()  # of what follows: watched by one thread, moved by others
         self._playing, self._speed, self._position_s = True, 1.0, 0.0

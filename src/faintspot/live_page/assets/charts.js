@@ -5,6 +5,7 @@ import { inWords } from "./message.js";
 
 const SHORT = new Intl.NumberFormat("en", { notation: "compact" });
 const inTime = (us) => us < 1e3 ? `${inWords(us)} µs` : us < 1e6 ? `${inWords(us / 1e3)} ms` : `${inWords(us / 1e6)} s`;
+const GAP_S = 1; // for longer nothing came: no line goes across
 const LEFT = 52, BOTTOM = 20, TOP = 6, RIGHT = 8;
 
 /** Axes with a grid; return functions from values to places. */
@@ -77,6 +78,7 @@ export function drawStrip(canvas, times, seconds, lines, { from, to, logarithmic
     for (let i = 0; i < times.length; i++) {
       if (!Number.isFinite(values[i])) { drawing = false; continue; }
       const v = y(logarithmic ? Math.log10(Math.max(values[i], 1e-3)) : values[i]);
+      drawing &&= times[i] - times[i - 1] < GAP_S;
       if (drawing) context.lineTo(x(times[i]), v); else context.moveTo(x(times[i]), v);
       drawing = true;
     }

@@ -161,7 +161,7 @@ export class Controls {
     const there = Boolean(loop) && loop.state !== "none";
     byId("loop-form").hidden = !there;
     if (there) {
-      byId("loop-state").textContent = loop.state + (loop.opened_because ? `: ${loop.opened_because}` : "");
+      byId("loop-state").textContent = [loop.state, loop.opened_because, loop.obstacle].filter(Boolean).join(": ");
       const gain = byId("gain");
       if (document.activeElement !== gain && !this.gainEdited) gain.value = loop.gain ?? "";
     }

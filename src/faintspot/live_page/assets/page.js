@@ -311,7 +311,7 @@ function showTiles() {
     ["p99", `${inWords(percentiles[99])} µs`],
     ["lost, seen here", inWords(now.lost)],
     ...(now.arm && figures.arms?.length ? [["arm", now.arm]] : []),
-    ...(loop && loop.state !== "none" ? [["loop", loop.state], ["gain", inWords(loop.gain)]] : []),
+    ...(loop && loop.state !== "none" ? [["loop", loop.state], ...(loop.gain == null ? [] : [["gain", inWords(loop.gain)]])] : []),
   ]);
 }
 
