@@ -1,6 +1,6 @@
 """faintspot in a soapy closed loop: its slopes beside soapy's own, for a faint star.
 
-A 3 m telescope, 5x5 lenslets of 10x10 pixels, 38 electrons per lenslet and frame, 250 frames/s, 1 electron of
+A 3 m telescope, 5x5 lenslets of 12x12 pixels, 38 electrons per lenslet and frame, 250 frames/s, 1 electron of
 read noise. One line between `aoinit` and `makeIMat` makes a sensor measure with faintspot. Every arm has an
 interaction matrix of its own and is tuned on other air than it is judged by.
 """
@@ -37,7 +37,7 @@ Atmosphere:
 Telescope: {{telDiam: 3.0, obsDiam: 0.0, mask: circle}}
 WFS:
   0: {{type: ShackHartmann, GSMag: 12.18, GSPosition: [0, 0], GSHeight: 0, wavelength: 650.0e-9, nxSubaps: 5,
-    pxlsPerSubap: 10, subapFOV: 2.5, subapThreshold: 0.5, photonNoise: true, eReadNoise: {READ_NOISE_E},
+    pxlsPerSubap: 12, subapFOV: 1.8, subapThreshold: 0.5, photonNoise: true, eReadNoise: {READ_NOISE_E},
     propagationMode: Geometric, exposureTime: 0.004}}
 DM:
   0: {{type: GaussStack, nxActuators: 6, svdConditioning: 0.05, gain: 0.5}}
@@ -66,7 +66,7 @@ class Setup:
         adapter.attach(wfs, fs.Settings(**self.ours), camera, psf=psf)  # the one line
 
 
-SPOT_PX = 0.65e-6 / 0.6 * 206265 / (2.5 / 10)  # lambda / d
+SPOT_PX = 0.65e-6 / 0.6 * 206265 / (1.8 / 12)  # lambda / d
 
 
 def strehl(setup: Setup, gain: float, seed: int) -> float:
@@ -105,7 +105,7 @@ ARMS = {
         Setup(f"{s:g}, 15 pixels", estimator="tv", noise_std=s, keep_brightest=15) for s in (0.3, 0.6)
     ],
     "faintspot, map": [
-        Setup(f"prior {p:g} px", estimator="map", prior_std_px=p, blur_px=0.6, flux_e=FLUX_E)
+        Setup(f"prior {p:g} px", estimator="map", prior_std_px=p, blur_px=0.8, flux_e=FLUX_E)
         for p in (0.3, 0.6)
     ],
 }

@@ -23,7 +23,7 @@ specula.init(-1, precision=1, log_level=logging.ERROR)
 from specula.simul import Simul  # noqa: E402 - after specula.init
 
 SEEING_ARCSEC, WIND_M_S, MODES, FRAMES, FLUX_E = 0.7, 12.0, 27, 120, 40.0
-GAINS = (0.25, 0.45)
+GAINS = (0.25, 0.45, 0.65)
 FOLDER = Path(tempfile.mkdtemp())
 
 
