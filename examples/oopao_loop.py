@@ -60,7 +60,9 @@ def air(seed: int) -> list[np.ndarray]:
 class Setup:
     """A way to measure slopes, with the interaction matrix that was made through it."""
 
-    def __init__(self, label: str, *, threshold: float = 0.01, fwhm_px: float | None = None, **ours: Any) -> None:
+    def __init__(
+        self, label: str, *, threshold: float = 0.01, fwhm_px: float | None = None, **ours: Any
+    ) -> None:
         self.label, self.threshold, self.fwhm_px, self.ours = label, threshold, fwhm_px, ours
         self.predicts = "prior_std_px" in ours
         self.commands = np.zeros(mirror.nValidAct), np.zeros(mirror.nValidAct)
@@ -139,7 +141,9 @@ ARMS = {
     "faintspot, window": [
         Setup(f"{w:g} px", estimator="window", window_fwhm_px=w, flux_e=FLUX_E) for w in (3.0, 4.0, 5.0)
     ],
-    "faintspot, smoothed": [Setup(f"{k} pixels", estimator="smoothed", keep_brightest=k) for k in (10, 15, 30)],
+    "faintspot, smoothed": [
+        Setup(f"{k} pixels", estimator="smoothed", keep_brightest=k) for k in (10, 15, 30)
+    ],
     "faintspot, TV": [
         Setup(f"{s:g}, 15 pixels", estimator="tv", noise_std=s, keep_brightest=15) for s in (0.3, 0.6)
     ],

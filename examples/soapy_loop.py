@@ -105,8 +105,8 @@ ARMS = {
         Setup(f"{s:g}, 15 pixels", estimator="tv", noise_std=s, keep_brightest=15) for s in (0.3, 0.6)
     ],
     "faintspot, map": [
-        Setup(f"prior {p:g} px", estimator="map", prior_std_px=p, blur_px=0.8, flux_e=FLUX_E)
-        for p in (0.3, 0.6)
+        Setup(f"prior {p:g} px, blur {b:g} px", estimator="map", prior_std_px=p, blur_px=b, flux_e=FLUX_E)
+        for p, b in ((0.5, 0.0), (0.5, 0.3), (1.0, 0.3))
     ],
 }
 
