@@ -1,7 +1,7 @@
 """faintspot in an OOPAO closed loop: its slopes beside OOPAO's own, for a faint star.
 
-A 3.6 m telescope, 6x6 lenslets of 10x10 pixels, 22 electrons per lenslet and frame, 250 frames/s, 1 electron of
-read noise. One line makes a sensor measure with faintspot (`attach`); OOPAO's references, slopes units and
+A 3.6 m telescope, 6x6 lenslets of 10x10 pixels, 22 electrons per lenslet and frame, 250 frames/s, 1 electron
+of read noise. One line makes a sensor measure with faintspot (`attach`); OOPAO's references, slopes units and
 interaction matrix are then made through it. Every arm is tuned on other air than it is judged by.
 """
 
@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from loop_table import compare, by_commands
+from loop_table import by_commands, compare
 from OOPAO.Atmosphere import Atmosphere
 from OOPAO.DeformableMirror import DeformableMirror
 from OOPAO.OPD_map import OPD_map
@@ -23,6 +23,7 @@ from OOPAO.Telescope import Telescope
 
 import faintspot as fs
 from faintspot.adapters import oopao
+from faintspot.adapters.checks import check_matrix
 
 FLUX_E, READ_NOISE_E, FRAMES, SETTLE, IMAGING_M = 22.0, 1.0, 160, 40, 1.65e-6
 GAINS = (0.05, 0.1, 0.2, 0.35)
@@ -96,7 +97,7 @@ class Setup:
             columns = []
             for poke in 2e-8 * np.eye(mirror.nValidAct):
                 columns.append((measured(poke) - measured(-poke)) / 4e-8)
-            self.matrix = fs.adapters.checks.check_matrix("interaction matrix", np.array(columns).T)
+            self.matrix = check_matrix("interaction matrix", np.array(columns).T)
             self.control = np.linalg.pinv(self.matrix, rcond=0.1)
             if self.predicts:
                 attached.detach()

@@ -21,7 +21,7 @@ import faintspot as fs
 from faintspot.adapters import soapy as adapter
 
 FLUX_E, READ_NOISE_E, SETTLE = 38.0, 1.0, 30
-GAINS = (0.4, 0.7)
+GAINS = (0.2, 0.4, 0.6)
 SYSTEM = f"""
 simName:
 pupilSize: 40
@@ -113,4 +113,4 @@ ARMS = {
 
 if __name__ == "__main__":
     print(f"{FLUX_E:g} e- a lenslet, {READ_NOISE_E:g} e- read noise; Strehl ratio at 1.65 um")
-    compare(ARMS, strehl, GAINS, tuning=(1,), scoring=(11, 12, 13))
+    compare(ARMS, strehl, GAINS, tuning=(1, 2, 3))
