@@ -202,6 +202,8 @@ def test_what_a_tools_file_says(tmp_path: Path) -> None:
         assert score is None
     with pytest.raises(InputError, match="layuot"):
         parts_of({**tables, "layuot": {}})
+    with pytest.raises(InputError, match="faintspot: calibration"):
+        parts_of({**tables, "calibration": 3})
     with pytest.raises(InputError, match="expected a file or tables"):
         parts_of(3)  # type: ignore[arg-type]
     assert parts_of({**tables, "psf": {"profile": "gaussian", "size": 1.0}}).psf is not None
