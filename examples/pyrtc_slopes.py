@@ -1,10 +1,10 @@
 """faintspot as pyRTC's slopes process, beside pyRTC's own centroiders, for a faint star.
 
-pyRTC's slopes process and pyRTC's loop, frame by frame; camera, air and mirror are simulated: 6x6 lenslets of 10x10
-pixels, 40 electrons per lenslet and frame, 1 electron of read noise. The mirror makes the 14 modes that the air is
-made of. In the configuration `class_name` changes, and `faintspot` says how to measure. Every arm has an interaction
-matrix of its own and is tuned on other air than it is judged by. What is scored: the part of the air's displacements of
-the spots that is taken off.
+pyRTC's slopes process and pyRTC's loop, frame by frame; camera, air and mirror are simulated: 6x6 lenslets of
+10x10 pixels, 40 electrons per lenslet and frame, 1 electron of read noise. The mirror makes the 14 modes that
+the air is made of. In the configuration `class_name` changes, and `faintspot` says how to measure. Every arm
+has an interaction matrix of its own and is tuned on other air than it is judged by. What is scored: the part
+of the air's displacements of the spots that is taken off.
 """
 
 from __future__ import annotations

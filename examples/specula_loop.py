@@ -1,9 +1,9 @@
 """faintspot in a SPECULA closed loop: its slopes beside SPECULA's own, for a faint star.
 
-A 3.6 m telescope, 6x6 lenslets of 10x10 pixels, about 40 electrons per lenslet and frame, 250 frames/s, 1 electron of
-read noise. In the parameter file the class of the slope computer changes (and `add_modules` says where it is); in the
-file that calibrates, it says `calibrating`. Every arm has a reconstructor of its own and is tuned on other air than it
-is judged by.
+A 3.6 m telescope, 6x6 lenslets of 10x10 pixels, about 40 electrons per lenslet and frame, 250 frames/s, 1
+electron of read noise. In the parameter file the class of the slope computer changes (and `add_modules` says
+where it is); in the file that calibrates, it says `calibrating`. Every arm has a reconstructor of its own and
+is tuned on other air than it is judged by.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ specula.init(-1, precision=1, log_level=logging.ERROR)
 from specula.simul import Simul  # noqa: E402 - after specula.init
 
 SEEING_ARCSEC, WIND_M_S, MODES, FRAMES, FLUX_E = 0.7, 12.0, 27, 120, 40.0
-GAINS = (0.25, 0.45)
+GAINS = (0.25, 0.45, 0.65)
 FOLDER = Path(tempfile.mkdtemp())
 
 

@@ -28,13 +28,13 @@ def needs(package: str, extra: str) -> pytest.MarkDecorator:
 
 def images(light_e: float = 1000.0, positions: Any = POSITIONS) -> np.ndarray:
     """Return spots without noise, (n, SIDE, SIDE) electrons."""
-    return PSF.images(np.asarray(positions), (SIDE, SIDE), light_e)
+    return np.asarray(PSF.images(np.asarray(positions), (SIDE, SIDE), light_e))
 
 
 def noisy(rng: np.random.Generator, light_e: float = FAINT_E, positions: Any = POSITIONS) -> np.ndarray:
     """Return the same with photon noise and 1 electron of read noise."""
     clean = images(light_e, positions)
-    return rng.poisson(np.maximum(clean, 0.0)) + rng.normal(0.0, 1.0, clean.shape)
+    return np.asarray(rng.poisson(np.maximum(clean, 0.0)) + rng.normal(0.0, 1.0, clean.shape))
 
 
 ESTIMATORS = {

@@ -200,6 +200,29 @@ def test_refused_in_one_line(optics: Any, change: dict[str, Any], message: str) 
     assert "\n" not in str(error.value)
 
 
+def test_calibration_and_prediction(optics: Any) -> None:
+    asked: list[Any] = []
+
+    def predict(slopes: Any) -> Any:
+        asked.append(slopes)
+        return None
+
+    settings = Settings("window", flux_e=30.0, spot_fwhm_px=2.0)
+    estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=settings, predict=predict)
+    image = image_through(optics)
+    with estimator.calibrating():
+        bright, faint = (np.asarray(estimator.estimate([image * scale])) for scale in (1.0, 1e-5))
+    # The image is brought to the same light first: rounding to float32 is what is left.
+    np.testing.assert_allclose(bright, faint, atol=1e-5 * PIXEL_M)
+    assert not asked
+    first = estimator.estimate([image])
+    estimator.estimate([image])
+    assert len(asked) == 1
+    assert asked[0] is first
+    # 20,000 e- over a mean light of 30: what calibrating is for.
+    assert np.abs(np.asarray(first)).max() > 10 * np.abs(bright).max()
+
+
 def test_images_that_do_not_fit(optics: Any) -> None:
     estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=FAINT)
     image = image_through(optics)
@@ -216,7 +239,7 @@ def test_images_that_do_not_fit(optics: Any) -> None:
 
 def test_the_loop_of_the_manual_closes(capsys: pytest.CaptureFixture[str]) -> None:
     text = (Path(__file__).resolve().parents[2] / "docs" / "adapters.md").read_text(encoding="utf-8")
-    script = re.search(r"```python\n(.*?)```", text, re.DOTALL)
+    script = re.search(r"```python\n(.*?)```", text[text.index("\n## HCIPy") :], re.DOTALL)
     assert script is not None
     np.random.seed(1)  # noqa: NPY002 - HCIPy's detectors draw from this one
     names: dict[str, Any] = {}

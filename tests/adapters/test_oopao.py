@@ -145,7 +145,7 @@ def test_refused_in_one_line(change: dict[str, Any], options: dict[str, Any], me
     if "weighting_map" in change:
         wfs.sh_data["src_0"].weighting_map = np.full((N, SIDE, SIDE), 0.5)
     if "dark" in change:
-        wfs.initialize_wfs = lambda: signal(wfs, np.zeros((N, SIDE, SIDE)))  # type: ignore[method-assign]
+        wfs.initialize_wfs = lambda: signal(wfs, np.zeros((N, SIDE, SIDE)))  # type: ignore[method-assign,assignment]
     with pytest.raises(InputError, match=message) as error:
         oopao.attach(wfs, EVERYTHING, **options)
     assert "\n" not in str(error.value)

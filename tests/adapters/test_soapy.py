@@ -43,7 +43,7 @@ class StandIn:
     def measure(self, frame: Any) -> np.ndarray:
         centroider = getattr(sys.modules[__name__ + "_wfs"].centroiders, self.config.centMethod)
         found = np.nan_to_num(centroider(frame, threshold=0.1, ref=None)) - SIDE / 2
-        return (found if self.staticData is None else found - self.staticData).ravel()
+        return np.ravel(found if self.staticData is None else found - self.staticData)
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.settings import Settings
 from faintspot.slopes import Slopes
 from faintspot.tables import read_tables
-from faintspot.toml_files import check_keys
+from faintspot.toml_files import check_keys, checked_table
 
 CALIBRATION_LIGHT_E = 1000.0
 """Light (electrons) of a sub-aperture at which frames without noise are measured."""
@@ -124,8 +124,9 @@ def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
     if isinstance(source, str | Path):
         path, document = Path(source), read_tables(source)
     elif isinstance(source, Mapping):
-        path, document = Path("faintspot"), {name: dict(values) for name, values in source.items()}
-        check_keys("faintspot: ", document, _PARTS, what="table")
+        check_keys("faintspot: ", source, _PARTS, what="table")
+        path = Path("faintspot")
+        document = {name: checked_table(f"faintspot: {name}", values) for name, values in source.items()}
     else:
         raise InputError(f"faintspot: expected a file or tables of settings, got {type(source).__name__}")
     return Parts(

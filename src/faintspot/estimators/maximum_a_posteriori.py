@@ -67,9 +67,9 @@ class MaximumAPosteriori(Likelihood):
         """Take the spread of positions that are uniform within their range."""
         return super().for_scene(scene).replaced({"prior_std_px": scene.position_range_px / math.sqrt(3)})
 
-    def for_bright_light(self) -> MaximumAPosteriori:
+    def for_bright_light(self) -> Self:
         """Leave out the prior."""
-        return self.replaced({"prior_std_px": None})
+        return super().for_bright_light().replaced({"prior_std_px": None})
 
     def prepared(self, sensor: Sensor) -> LikelihoodPrepared:
         """See `Estimator`."""

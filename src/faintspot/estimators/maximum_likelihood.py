@@ -32,7 +32,7 @@ class Likelihood(Fitted):
     model_error: Any = option(
         0.0,
         "How far the spots differ from the PSF, as a fraction of each pixel's light: bright pixels are "
-        "trusted no more than that. 0.1 to 0.5 for speckled spots.",
+        "trusted no more than that. 0.1 to 0.5 for speckled spots; counts no more than sqrt(300 e- / light).",
         low=0.0,
         high=10.0,
     )
@@ -49,6 +49,10 @@ class Likelihood(Fitted):
     def for_scene(self, scene: Scene) -> Self:
         """Trust the wings of a learnt PSF less."""
         return self.replaced({"weight_floor": _LEARNT_WEIGHT_FLOOR}) if scene.learnt else self
+
+    def for_bright_light(self) -> Self:
+        """Make no more steps: they would follow the weights of bright light, which are not those of faint."""
+        return self
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
         """Model errors, too, of spots that are speckled."""

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 BASELINE, SECOND = "window", "brightest"
 """What every gain is stated against, first and second: both with the integrator."""
-_CANDIDATES = (SECOND, BASELINE, "trained", "map_predicted", "window+kalman", "map+kalman")
+_CANDIDATES = (SECOND, BASELINE, "map_predicted", "window+kalman", "map+kalman")
 _FAINTER = 4.0  # than the faintest star of the configuration: limiting magnitudes are there
 _AROUND = (1 / 8, 4.0)  # of the star's light, where the configuration has no other stars
 _LEAST_PHOTONS = 0.5
@@ -41,8 +41,8 @@ class LoopQuestion:
         times fainter than the faintest; without any, from four times the star's light to an eighth.
     arms : sequence of str, optional
         Candidates, see `faintspot.loop.arms.arm_kind`; "window" and "brightest" always take part. Default:
-        those, "trained" (where spots are not elongated), "map_predicted", and with the predictive Kalman
-        filter "window+kalman" and "map+kalman" as far as the time goes.
+        those, "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman" as far
+        as the time goes.
     strehl : float, optional
         Strehl ratio that limiting magnitudes are for. Default: half of what the baseline has with the
         brightest star.
