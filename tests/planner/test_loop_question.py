@@ -17,13 +17,8 @@ def names(question: LoopQuestion) -> list[str]:
 
 def test_default_candidates() -> None:
     question = LoopQuestion(configuration())
-    assert names(question) == [
-        "brightest", "window", "trained", "map_predicted", "window+kalman", "map+kalman",
-    ]  # fmt: skip
+    assert names(question) == ["brightest", "window", "map_predicted", "window+kalman", "map+kalman"]
     assert question.left_out == {}
-    elongated = LoopQuestion(load_loop("elongated_3e"))
-    assert "trained" not in names(elongated)
-    assert "elongated" in elongated.left_out["trained"]
     opened = LoopQuestion(load_loop("open_loop"))
     assert not any("+" in name for name in names(opened))
     assert set(opened.left_out) == {"window+kalman", "map+kalman"}

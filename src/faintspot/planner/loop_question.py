@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between, numbers_between
 from faintspot.control.learning import INTEGRATOR, KALMAN
 from faintspot.errors import InputError
-from faintspot.estimators.base import Need
 from faintspot.loop.arms import ArmKind, arm_kind
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.planner.sky import isoplanatic_angle_arcsec
@@ -99,8 +98,6 @@ class LoopQuestion:
         reasons = {}
         for name in _CANDIDATES:
             kind = arm_kind(name)
-            if Need.SCORE in kind.estimator.needs and self.configuration.sensor.spot_elongation > 1:
-                reasons[name] = "it is trained on round spots, these are elongated"
             if kind.control == KALMAN and self.configuration.control.mode != CLOSED:
                 reasons[name] = "its control learns from a closed loop, this one is open"
         return reasons
