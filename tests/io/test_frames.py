@@ -139,6 +139,19 @@ class TestFits:
         assert result.dtype == values.dtype
         np.testing.assert_array_equal(result, values)
 
+    def test_negative_shape(self, tmp_path: Path) -> None:
+        """Two of them make a size that a file can have."""
+        path = tmp_path / "a.npy"
+        header = {"descr": "<f4", "fortran_order": True, "shape": (-3, -4)}
+        with path.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+            file.write(bytes(48))
+        with (
+            pytest.raises(InputError, match=r"damaged: its header has the shape \(-3, -4\)"),
+            open_frames([path]),
+        ):
+            pass
+
     def test_truncated_file(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.fits", cube(100, 20, 20))
         path.write_bytes(path.read_bytes()[:40_000])

@@ -188,6 +188,8 @@ def _read_header(name: str, stream: IO[bytes]) -> _Header:
 def _check(name: str, header: _Header, actual_bytes: int) -> None:
     if header.dtype.hasobject:
         raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+    if any(side < 0 for side in header.shape):
+        raise InputError(f"{name}: damaged: its header has the shape {header.shape}")
     if actual_bytes < header.total_bytes:
         raise InputError(
             f"{name}: truncated: its header promises {header.total_bytes} bytes, there are {actual_bytes}"
