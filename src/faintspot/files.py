@@ -8,7 +8,7 @@ import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,8 @@ _ADVICE = {
 }
 Content = bytes | str | Callable[[BinaryIO], object]
 """What a file is to contain, a text as UTF-8; or what writes that to a stream."""
+
+Made = TypeVar("Made")
 
 # Folders that cannot be synchronised: of some file systems, and those that may be written but not read.
 _CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
@@ -95,6 +97,35 @@ def read_arrays(
         if name not in values and name not in optional:
             raise InputError(f"{path}: expected {what}, but {name} is missing")
     return values
+
+
+def save_fields(path: str | Path, item: object, names: Sequence[str]) -> None:
+    """Write the attributes of these names that are not None with `save_arrays`.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    values = {name: getattr(item, name) for name in names}
+    save_arrays(path, {name: value for name, value in values.items() if value is not None})
+
+
+def load_fields(
+    make: Callable[..., Made], path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
+) -> Made:
+    """Return what is made of the arrays that `save_fields` wrote, see `read_arrays`.
+
+    Raises
+    ------
+    InputError
+        As `read_arrays`; what `make` raises, with the file's name.
+    """
+    values = read_arrays(path, what, names, optional)
+    try:
+        return make(**values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def replace_file(path: Path, content: Content) -> None:

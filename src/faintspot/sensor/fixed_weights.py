@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between
 from faintspot.errors import InputError
-from faintspot.files import read_arrays, save_arrays
+from faintspot.files import load_fields, save_fields
 
 Floats = NDArray[np.float64]
 
@@ -186,7 +186,7 @@ class FixedWeights:
         InputError
             When the file cannot be written.
         """
-        save_arrays(path, {name: getattr(self, name) for name in _FIELDS if getattr(self, name) is not None})
+        save_fields(path, self, _FIELDS)
 
     @classmethod
     def load(cls, path: str | Path) -> FixedWeights:
@@ -197,11 +197,7 @@ class FixedWeights:
         InputError
             When the file cannot be read or holds something else.
         """
-        values = read_arrays(path, "fixed weights", _FIELDS, optional=("light", "index"))
-        try:
-            return cls(**values)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+        return load_fields(cls, path, "fixed weights", _FIELDS, optional=("light", "index"))
 
 
 def _light_weights(values: dict[str, Any]) -> Floats:

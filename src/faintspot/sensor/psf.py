@@ -13,11 +13,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from faintspot.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.errors import InputError
+from faintspot.files import load_fields, save_fields
 from faintspot.simulate.spots import image_shape, per_spot, position_array, spots
 from faintspot.sizes import check_size
 
 Floats = NDArray[np.float64]
 
+_FIELDS = ("samples", "oversampling", "index")
 _ANALYTIC_OVERSAMPLING = 8
 _LARGEST_RADIUS_PX = 128.0  # the largest window seen from its opposite corner takes 91
 _LONGEST_SIDE = 4097  # beyond, singular values take minutes
@@ -270,14 +272,7 @@ class PSF:
         InputError
             When it cannot be written.
         """
-        arrays = {"samples": self.samples, "oversampling": self.oversampling}
-        if self.index is not None:
-            arrays["index"] = self.index
-        try:
-            with Path(path).open("wb") as file:
-                np.savez_compressed(file, **arrays)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+        save_fields(path, self, _FIELDS)
 
     @classmethod
     def load(cls, path: str | Path) -> PSF:
@@ -288,22 +283,7 @@ class PSF:
         InputError
             When it cannot be read or is no PSF.
         """
-        try:
-            # numpy.load leaves a file that it opened itself open when the archive is damaged.
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                stored = {
-                    name: arrays[name] for name in ("samples", "oversampling", "index") if name in arrays
-                }
-        except FileNotFoundError:
-            raise InputError(f"{path}: no such file") from None
-        except Exception:  # a damaged archive raises whatever its decoder meets
-            raise InputError(f"{path}: expected a PSF (.npz), got something else") from None
-        if "samples" not in stored or "oversampling" not in stored:
-            raise InputError(f"{path}: expected a PSF: samples and oversampling, found {', '.join(stored)}")
-        try:
-            return cls(**stored)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+        return load_fields(cls, path, "a PSF", _FIELDS, optional=("index",))
 
 
 def _outer(u: Floats, s: Floats, vt: Floats, rank: int) -> Floats:

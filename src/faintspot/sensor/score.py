@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, image_stack, number_between, numbers_between, one_of
 from faintspot.errors import InputError
-from faintspot.files import read_arrays, save_arrays
+from faintspot.files import load_fields, save_fields
 from faintspot.sensor.fixed_weights import FixedWeights
 
 STARTS = ("reference", "peak")
@@ -228,7 +228,7 @@ class TrainedScore:
         InputError
             When the file cannot be written.
         """
-        save_arrays(path, {name: getattr(self, name) for name in _FIELDS if getattr(self, name) is not None})
+        save_fields(path, self, _FIELDS)
 
     @classmethod
     def load(cls, path: str | Path) -> TrainedScore:
@@ -239,12 +239,11 @@ class TrainedScore:
         InputError
             When the file cannot be read or holds something else.
         """
-        values = read_arrays(path, "a trained score", _FIELDS, optional=("index",))
-        values["start"] = str(values["start"])
-        try:
-            return cls(**values)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+        return load_fields(cls._stored, path, "a trained score", _FIELDS, optional=("index",))
+
+    @classmethod
+    def _stored(cls, *, start: Any, **values: Any) -> TrainedScore:
+        return cls(start=str(start), **values)
 
 
 Score = TrainedScore | FixedWeights
