@@ -35,7 +35,9 @@ class SlopePredictor:
         m = model.slopes
         self.covariance = steady_covariance(model, variance_px2)
         """(2 m, 2 m): of the state's error before a frame is measured."""
-        self._gain = _gain(self.covariance, variance_px2)
+        self.usual_px2 = self.covariance[:m, :m] + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
+        """(m, m): covariance of measured slopes about the prediction, with their usual noise."""
+        self._gain = np.linalg.solve(self.usual_px2, self.covariance[:m]).T
         self._onward = model.both
         self.state = np.zeros(2 * m)
         self._correction = np.zeros(2 * m)
@@ -96,9 +98,3 @@ def steady_covariance(model: SlopeModel, variance_px2: Floats) -> Floats:
         if np.abs(more).max() <= _CONVERGED * np.abs(error).max():
             break
     return np.asarray(error)
-
-
-def _gain(covariance: Floats, variance_px2: Floats) -> Floats:
-    m = len(variance_px2)
-    total = covariance[:m, :m] + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
-    return np.asarray(np.linalg.solve(total, covariance[:m]).T)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from faintspot.checks import finite_array, one_of
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
+from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
 from faintspot.control.kalman import SlopePredictor
@@ -91,14 +92,15 @@ class Model:
         if self.kind == POLC:
             covariances = arrays["now_px2"], arrays["ahead_px2"]
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
-        return Predictive(line, plant.interaction, self._predictor(), clean)
+        return Predictive(line, plant.interaction, self.predictor(), clean)
 
     @property
     def expected_std_px(self) -> Floats | None:
         """(m,): how sure it is of the slopes that it expects; None: it does not know."""
-        return self._predictor().std_px if self.kind == KALMAN else None
+        return self.predictor().std_px if self.kind == KALMAN else None
 
-    def _predictor(self) -> SlopePredictor:
+    def predictor(self) -> SlopePredictor:
+        """Return the filter of what "kalman" has learnt."""
         model = SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
         return SlopePredictor(model, self.arrays["variance_px2"])
 
@@ -159,9 +161,22 @@ class Learnt:
         """(m,): how sure it is of the slopes that it expects; None: it does not know."""
         return self.model.expected_std_px
 
-    def controller(self, line: CommandLine, prior_std_px: Floats | None = None) -> Guarded:
+    def controller(self, line: CommandLine, prior_std_px: Floats | None = None) -> Guarded | CompiledKalman:
         """Return the controller; with the estimator's prior where it has one."""
         plant, model = self.plant, self.model
+        if model.kind == KALMAN:
+            return CompiledKalman(
+                line,
+                plant.interaction,
+                plant.reconstructor.matrix,
+                model.predictor(),
+                plant.reconstructor.clean,
+                model.plain_gain,
+                plant.leak,
+                prior_std_px=prior_std_px,
+                noise_factor=model.noise_factor,
+                prefers_plain=model.left[1] < model.left[0],
+            )
         return Guarded(
             line,
             plant.interaction,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between
 from faintspot.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
+from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import Control
 from faintspot.control.guarded import Guarded
 from faintspot.errors import InputError
@@ -61,10 +62,12 @@ class ControlLoop:
         if held is not None:
             self._line.hold(held.astype(np.float64))
         self.controller = control.controller(self._line)
-        self._guarded = self.controller if isinstance(self.controller, Guarded) else None
+        guarded = isinstance(self.controller, (Guarded, CompiledKalman))
+        self._guarded: Any = self.controller if guarded else None
         self._prior = None if prior is None else prior.reshape(-1)
         self._largest_px = max(layout.frame_shape)
-        self._is_compiled = isinstance(self.controller, CompiledIntegrator)  # whose commands are finite
+        # Whose commands are finite.
+        self._is_compiled = isinstance(self.controller, (CompiledIntegrator, CompiledKalman))
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
         self._said = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
