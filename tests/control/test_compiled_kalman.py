@@ -71,7 +71,7 @@ def test_it_is_the_filter_in_numpy(prior: np.ndarray | None, steps: int, toleran
 
 
 def test_nonsense_is_replaced_by_the_integrator() -> None:
-    """A model with the wrong sign: once the guard has seen enough, the mirror has the integrator's commands."""
+    """A model with the wrong sign: after some frames the mirror has the integrator's commands."""
     wrong = replace(MODEL, first=-MODEL.first)
     (slow, one), (fast, other) = both(wrong, largest=0.8)
     line = CommandLine(COMMANDS, 2, 0.8)

@@ -35,7 +35,9 @@ from faintspot.realtime.private_socket import socket_path
     help="Of SCHED_FIFO, with locked memory. Default: the ordinary scheduler.",
 )
 @click.option(
-    "--interleave", metavar="ARMS", help="Settings that take turns, such as none,tv or ml,noise_std=2."
+    "--interleave",
+    metavar="ARMS",
+    help="Settings, and controllers, that take turns, such as none,tv or ml+integrator,map+kalman.",
 )
 @click.option(
     "--every", type=click.IntRange(1), default=50, show_default=True, help="Frames until the next one's turn."
@@ -112,7 +114,6 @@ def run(
     processors = parse_subapertures(cpus) if cpus else None
     if control is not None:
         control.check_fits(len(layout))
-        settings = control.settings(settings)
     engine = Engine(
         name,
         partial(_pipeline, layout, calibration, psf, score, None if control is None else control.reference),

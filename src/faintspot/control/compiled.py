@@ -104,6 +104,9 @@ def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, lat
         out[c] = min(max(keep * latest[c] - gain * out[c], -largest), largest)
 
 
+_INTEGRATE = Direct(integrate)
+
+
 class CompiledIntegrator:
     """`control.integrator.Integrator` in compiled code, for all slopes counting alike.
 
@@ -128,7 +131,6 @@ class CompiledIntegrator:
         self._line, self._interaction = line, interaction
         self._columns = np.ascontiguousarray(reconstruct.T, np.float64)
         self.gain, self._keep = float(gain), 1.0 - leak
-        self._integrate = Direct(integrate)
 
     def expected(self) -> Expected:
         """See `Controller`."""
@@ -140,7 +142,5 @@ class CompiledIntegrator:
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`; slopes that were not measured are 0."""
         line = self._line
-        self._integrate(
-            slopes_px, self._columns, self.gain, self._keep, line.largest, line.latest, line.spare
-        )
+        _INTEGRATE(slopes_px, self._columns, self.gain, self._keep, line.largest, line.latest, line.spare)
         line.sent()

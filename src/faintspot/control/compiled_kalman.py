@@ -242,6 +242,9 @@ def follow(
     return total
 
 
+_FOLLOW = Direct(follow)
+
+
 class CompiledKalman:
     """`guarded.Guarded` with `predictive.Predictive` and the integrator beside it, in compiled code.
 
@@ -310,7 +313,6 @@ class CompiledKalman:
         self._memory.guard[_CHOSEN] = prefers_plain
         self._numbers = float(noise_factor), float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px = predictor.std_px
-        self._follow = Direct(follow)
 
     @property
     def chosen(self) -> int:
@@ -343,7 +345,7 @@ class CompiledKalman:
             When the filter's numbers have become too large.
         """
         prior, places = self.prior_std_px, (self._line.place, self._learnt.place, self._plain.place)
-        total = self._follow(
+        total = _FOLLOW(
             slopes_px,
             standard_error_px,
             _NO_PRIOR if prior is None else prior,
