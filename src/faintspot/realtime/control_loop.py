@@ -117,7 +117,7 @@ class ControlLoop:
             How wide the prior around the expected slopes was that these are drawn to. Default: they are not.
         """
         line = self._line
-        if self._number >= 0:
+        if number != self._number + 1 and self._number >= 0:
             for _ in range(min(number - self._number - 1, line.delay_frames)):
                 line.put(line.latest)
         self._number = number

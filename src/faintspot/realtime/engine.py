@@ -13,7 +13,7 @@ from faintspot.configuration import to_text
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
-from faintspot.realtime.control_loop import STATES, ControlLoop
+from faintspot.realtime.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM, Interleaving
 from faintspot.realtime.light_following import LightFollower
@@ -336,10 +336,11 @@ class Engine:
         latency = published - moment
         loop, state, commands = self.loop, 0, None
         if loop is not None:
-            state = STATES.index(loop.state)
+            was_closed = loop.closed
             commands = loop.follow(slopes, number, path.prior_std_px)
             self._streams.publish_commands(commands, number)
             loop.latencies.add(time.monotonic_ns() - moment)
+            state = STATES.index(CLOSED if was_closed else OPEN)
             loop.look_after()
         self.latencies.add(latency)
         change = self.live.change_number
