@@ -1,10 +1,10 @@
 """Control: microseconds a frame, from slopes to commands.
 
-Of the 4.2 m telescope, 72 slopes, every controller as it is. The compiled Kalman filter with its guard, as the
-engine and the simulation run it, for more slopes as well. Of an extremely large telescope, 9,232 slopes and
-4,600 commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and sparse
-ones of which each slope knows its neighbours within four sub-apertures (filled with random numbers: what they
-hold does not change the time).
+Of the 4.2 m telescope, 72 slopes, every controller as it is; for more slopes the compiled Kalman filter with
+its guard, as the engine and the simulation run it. Of an extremely large telescope, 9,232 slopes and 4,600
+commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and sparse ones
+of which each slope knows its neighbours within four sub-apertures. They are filled with random numbers: what
+they hold does not change the time.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def sizes_table() -> Table:
         alone = np.eye(slopes)
         predictor = SlopePredictor(SlopeModel(1.5 * alone, -0.6 * alone, 0.1 * alone), np.ones(slopes))
         interaction = rng.standard_normal((slopes, commands)) / np.sqrt(slopes)
-        line = CommandLine(commands, 2)
+        line = CommandLine(commands, 2, 1.0)
         name = f"{slopes} slopes, {commands} commands"
         of_mirror = interaction, interaction.T
         filtered = CompiledKalman(line, *of_mirror, predictor, interaction.T, 0.3, 0.01)

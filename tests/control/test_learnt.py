@@ -70,7 +70,7 @@ def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Lear
 
 
 def test_another_controller_of_the_same_loop(learnt: dict[str, Learnt]) -> None:
-    """The integrator needs no model; where nothing is said, only the filter tells estimators what it expects."""
+    """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
     control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"].model)
     filtered = control.with_controller("kalman")
     assert isinstance(filtered.controller(filtered.line()), CompiledKalman)
