@@ -211,8 +211,8 @@ def budget(
 def engine(configuration: str, folder: str, control: str, rate: float | None) -> None:
     """Write faintspot.toml with which `faintspot realtime run --close-loop` closes this loop.
 
-    Layout, calibration, PSF and [control] with interaction matrix, reference slopes and centroid gain, from the
-    simulation. Estimator, settings and whatever else faintspot.toml says already stay, such as what
+    Layout, calibration, PSF and [control] with interaction matrix, reference slopes and centroid gain, from
+    the simulation. Estimator, settings and whatever else faintspot.toml says already stay, such as what
     `faintspot tune --loop` has chosen; without an estimator it gets the 20 brightest pixels.
 
     \b
