@@ -146,15 +146,6 @@ def _large() -> Table:
     return Table("realtime-commands-elt", f"{_ELT_SLOPES} slopes, {_ELT_COMMANDS} commands, one core", rows)
 
 
-def slowed(configuration: LoopConfiguration, rate_hz: float) -> LoopConfiguration:
-    """Return a configuration with another frame rate, and winds that move the air as far in a frame."""
-    part = rate_hz / configuration.control.frame_rate_hz
-    winds = tuple(part * each for each in configuration.atmosphere.wind_speed_m_per_s)
-    return configuration.replace("control", frame_rate_hz=rate_hz).replace(
-        "atmosphere", wind_speed_m_per_s=winds
-    )
-
-
 @contextmanager
 def _processes(name: str, folder: Path, engine: Path, realisation: int) -> Iterator[subprocess.Popen[bytes]]:
     """Start an engine, and the telescope as soon as it waits for frames; give the telescope."""
@@ -241,7 +232,7 @@ def compared(
 
 
 def _loop() -> Table:
-    configuration = slowed(load_loop("camera_3e").replace("camera", photons_per_subaperture=300.0), RATE_HZ)
+    configuration = load_loop("camera_3e").replace("camera", photons_per_subaperture=300.0).slowed_to(RATE_HZ)
     flux_e = configuration.photons
     predicting = Settings("map", flux_e=flux_e, prior_std_px=1.0)  # the filter says how wide
     arms = [
