@@ -229,7 +229,8 @@ class ImageStreamWriter:
                 for number in range(SEMAPHORES):
                     Semaphore.made(self._mapped.semaphore(number))
                 Semaphore.made(self._mapped.address + places.log_semaphore)
-                self._mapped.pids(places.readers)[:] = self._mapped.pids(places.writers)[:] = -1
+                self._mapped.pids(places.readers)[:] = -1
+                self._mapped.pids(places.writers)[:] = os.getpid()
             os.replace(hidden, self.path)  # complete before it gets its name
         self._identity = identity_of(self.path.stat())
         self._keyword = self._keywords()
@@ -243,6 +244,7 @@ class ImageStreamWriter:
         if self._keyword is not None:
             self._keyword["value"] = number
         if self.kind == ISIO:
+            self._keyword["cnt"] += 1
             fields["atime"] = fields["writetime"] = _clock()
         else:
             fields["atime"][1] = time.time_ns()
