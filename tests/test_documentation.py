@@ -34,6 +34,7 @@ NOT_RUN = {
     "PixelRing.create": "needs a camera",
     "pyshmem.open": "needs a running engine",
     "read_telemetry(": "needs a recording",
+    "read_aot(": "needs a recording",
     "...\n": "a sketch",
 }
 """What marks a block that is not run here, and why."""

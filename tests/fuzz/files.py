@@ -91,6 +91,13 @@ def _read_telemetry(path: Path) -> None:
     write_aot(path.with_name("aot.fits"), telemetry)
 
 
+def _read_aot(path: Path) -> None:
+    from faintspot.io import read_aot
+
+    read_aot(path)
+    _read_frames(path)
+
+
 def _frame_readers() -> dict[str, Callable[[Path], Any]]:
     from tests.io import frame_files
 
@@ -103,6 +110,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     ".slopes.npz.partial": read_slopes,
     "reference.npz": read_reference,
     "telemetry.zarr": _read_telemetry,
+    "aot.fits": _read_aot,
     "psf.npz": PSF.load,
     "score.npz": TrainedScore.load,
     "faintspot.toml": _read_configuration,
@@ -117,8 +125,9 @@ READERS: dict[str, Callable[[Path], Any]] = {
 def _originals() -> Path:
     """Return a folder with a sound file of each, which stays as long as the process."""
     from tests.estimator_cases import random_score
-    from tests.io import frame_files, slope_files, test_telemetry
+    from tests.io import frame_files, slope_files, telemetry_files
 
+    from faintspot.io import read_telemetry, write_aot
     from faintspot.io.telemetry import TelemetryStore
 
     keep = tempfile.TemporaryDirectory()
@@ -135,11 +144,11 @@ def _originals() -> Path:
         raise KeyboardInterrupt
     (folder / ".other.npz.partial").rename(folder / ".slopes.npz.partial")
     store = TelemetryStore(
-        folder / "telemetry.zarr", test_telemetry.RECORD, test_telemetry.IMAGE, test_telemetry.ATTRIBUTES
+        folder / "telemetry.zarr", telemetry_files.RECORD, telemetry_files.IMAGE, telemetry_files.ATTRIBUTES
     )
-    store.append(
-        test_telemetry.records_of(10, 5), test_telemetry.images_of(10), {"changes": test_telemetry.CHANGES}
-    )
+    some = telemetry_files.records_of(10, 5), telemetry_files.images_of(10)
+    store.append(*some, {"changes": telemetry_files.CHANGES})
+    write_aot(folder / "aot.fits", read_telemetry(store.path))
     psf, score = PSF.analytic(radius_px=5), random_score(np.random.default_rng(0), 9)
     psf.save(folder / "psf.npz")
     score.save(folder / "score.npz")

@@ -12,6 +12,18 @@ import pytest
 
 pytest.importorskip("zarr")
 
+from tests.io.telemetry_files import (
+    ATTRIBUTES,
+    CHANGES,
+    IMAGE,
+    RECORD,
+    SHAPE,
+    START_NS,
+    N,
+    images_of,
+    records_of,
+)
+
 from faintspot.errors import InputError
 from faintspot.io import Telemetry, read_telemetry, write_aot
 from faintspot.io.telemetry import TelemetryStore
@@ -19,71 +31,6 @@ from faintspot.sensor.layout import Layout
 
 # A sensor alone has neither, of which the reader of AOT files complains.
 pytestmark = pytest.mark.filterwarnings("ignore:.AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data")
-
-N, SHAPE, WINDOW = 8, (24, 24), (8, 8)
-ATTRIBUTES: dict[str, Any] = {
-    "name": "bench",
-    "layout": {
-        "frame_shape": SHAPE,
-        "window": WINDOW,
-        "corners": [[row, column] for row in (0, 8, 16) for column in (0, 8, 16) if (row, column) != (8, 8)],
-        "centres": [
-            [column + 3.75, row + 3.5]
-            for row in (0, 8, 16)
-            for column in (0, 8, 16)
-            if (row, column) != (8, 8)
-        ],
-        "cells": [[row, column] for row in range(3) for column in range(3) if (row, column) != (1, 1)],
-    },
-    "settings": '[settings]\nestimator = "cog"\nnoise_std = 1.5\n',
-    "arms": ["none", "tv"],
-    "dropped_records": 2,
-}
-CHANGES = [
-    {"frame": 12, "number": 1, "changes": {"noise_std": 2.5, "rule": "it's"}, "where": [1, 2]},
-    {"frame": 20, "number": 2, "changes": {"noise_std": [i / 7 for i in range(200)]}, "where": None},
-]
-RECORD = np.dtype(
-    [
-        *[(name, np.int64) for name in ("sequence", "frame", "arm", "change")],
-        *[(name, np.int64) for name in ("last_row_time_ns", "published_time_ns", "clock_offset_ns")],
-        *[(name, np.float32, (N,)) for name in ("x", "y", "flux", "standard_error_x", "standard_error_y")],
-        ("iterations", np.int32, (N,)),
-        ("flags", np.uint8, (N,)),
-    ]
-)
-IMAGE = np.dtype(
-    [
-        ("sequence", np.int64),
-        ("image_frame", np.int64),
-        ("raw", np.float32, SHAPE),
-        ("denoised", np.float32, (N, *WINDOW)),
-    ]
-)
-START_NS = 1_700_000_000_000_000_000
-
-
-def records_of(first: int, count: int) -> np.ndarray:
-    """Records of frames at 1 kHz, some 1000 s after the machine was started."""
-    rng = np.random.default_rng(first)
-    records = np.zeros(count, RECORD)
-    records["frame"] = np.arange(first, first + count)
-    records["arm"], records["change"] = records["frame"] % 2, first
-    records["last_row_time_ns"] = 10**12 + records["frame"] * 10**6
-    records["published_time_ns"] = records["last_row_time_ns"] + 50_000
-    records["clock_offset_ns"] = START_NS - 10**12
-    for name in ("x", "y", "flux", "standard_error_x", "standard_error_y"):
-        records[name] = rng.normal(size=(count, N))
-    records["flags"][:, 3] = 1
-    return records
-
-
-def images_of(*frames: int) -> np.ndarray:
-    images = np.zeros(len(frames), IMAGE)
-    images["image_frame"] = frames
-    images["raw"] = np.arange(24)[:, None] * 100 + np.arange(24) + np.array(frames)[:, None, None]
-    images["denoised"] = np.array(frames)[:, None, None, None]
-    return images
 
 
 @pytest.fixture
@@ -209,14 +156,15 @@ def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> Non
     )  # complains, as a warning, of anything odd
     assert (system.name, system.ao_mode) == ("bench", "MOAO")
     assert abs(system.date_beginning.timestamp() - telemetry.unix_time_s[0]) < 1e-3  # written to ms
-    assert json.loads(system.config) == {"estimator": "cog", "noise_std": 1.5}
+    tables = {"estimator": {"name": "tv", "noise_std": 1.5}, "settings": {"flux_e": 30.0}}
+    assert json.loads(system.config) == tables
     metadata = {each.key: each.value for each in system.metadata}
     assert [json.loads(metadata[key]) for key in ("CHG1", "CHG2")] == CHANGES
     assert (metadata["DROPPED"], metadata["ARMS"]) == (2, "none, tv")
 
     (sensor,) = system.wavefront_sensors
     assert (sensor.n_valid_subapertures, sensor.subaperture_size) == (N, 8)
-    assert sensor.centroiding_algorithm == "cog"
+    assert sensor.centroiding_algorithm == "tv"
     slopes = sensor.measurements
     assert (slopes.data.shape, slopes.unit) == ((15, 2, N), "pix")
     assert np.array_equal(slopes.data[:, 0], telemetry.x)
@@ -226,8 +174,8 @@ def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> Non
     assert np.array_equal(sensor.subaperture_intensities.data, telemetry.flux)
     assert sensor.subaperture_intensities.unit == "electron"
     assert np.array_equal(sensor.subaperture_mask.data, [[0, 1, 2], [3, -1, 4], [5, 6, 7]])
-    corners = json.loads(sensor.subaperture_mask.metadata_to_dict()["CORNERS"])
-    assert corners == ATTRIBUTES["layout"]["corners"]
+    layout = json.loads(sensor.ref_measurements.metadata_to_dict()["LAYOUT"])
+    assert layout["corners"] == ATTRIBUTES["layout"]["corners"]
     assert np.allclose(sensor.ref_measurements.data, [[0.25] * N, [0.0] * N])
     pixels = sensor.detector.pixel_intensities
     assert np.array_equal(pixels.data, telemetry.raw)

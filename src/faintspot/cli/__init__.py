@@ -16,6 +16,7 @@ _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
     "doctor": "Say what is installed, what this machine allows, and what to do about what is missing.",
     "estimators": "List the estimators, or the options of one.",
+    "export": "Write settings as the files that other controllers read.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "live": "Show a running engine, or a recording, as a web page.",
     "loop": "Measure what a method gains in a closed adaptive-optics loop, in simulation.",

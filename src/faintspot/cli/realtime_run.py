@@ -25,7 +25,9 @@ from faintspot.realtime.private_socket import socket_path
 @click.option(
     "--name", default="faintspot", show_default=True, help="Of the pixel ring, the streams and the engine."
 )
-@click.option("--stream", metavar="NAME", help="Take whole frames from this pyshmem stream.")
+@click.option(
+    "--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE."
+)
 @click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Workers.")
 @click.option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
 @click.option(
@@ -88,8 +90,8 @@ def run(
     """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
 
     Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row, or whole
-    from a pyshmem stream; the engine waits for it, and for its return. Each group of sub-apertures is
-    measured as soon as its last row is there. Slopes go out as the pyshmem streams NAME_slopes (all x, then
+    from another program's stream; the engine waits for it, and for its return. Each group of sub-apertures
+    is measured as soon as its last row is there. Slopes go out as the pyshmem streams NAME_slopes (all x, then
     all y, px), NAME_details and NAME_marks, each stamped with the frame's number; `faintspot realtime record`
     keeps them. Where the configuration has [control], commands follow from them as NAME_commands.
 

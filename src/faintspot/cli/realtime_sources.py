@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
 import click
 
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.errors import InputError
+
+if TYPE_CHECKING:
+    from faintspot.realtime.bridge import BridgeCounters
+    from faintspot.realtime.stream_out import StreamOut
 
 _HEAD_START_S = 0.5
+_ENDS_S = 5.0  # a thread looks at whether to stop many times a second
 _RING = click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring.")
 _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
 
@@ -94,30 +102,110 @@ def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable
 
 
 @needs("realtime", "pyshmem")
-@click.command("bridge", short_help="Follow the frames of a pyshmem stream.")
-@click.argument("stream")
-@_RING
-@click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
+@click.command("bridge", short_help="Frames of other software in, slopes and commands out to it.")
+@click.argument("stream", required=False)
+@click.option("--from", "source", metavar="STREAM", help="Frames: a pyshmem stream, isio:NAME or dao:FILE.")
+@click.option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
+@click.option("--commands", metavar="STREAM", help="Publish the commands so, too.")
+@click.option(
+    "--name", default="faintspot", show_default=True, help="Of the pixel ring, and of the engine's streams."
+)
+@click.option("--frames", type=int, metavar="N", help="Stop after that many came in. Default: at Ctrl-C.")
 @_SLOTS
-def bridge(stream: str, name: str, frames: int | None, slots: int) -> None:
-    """Pass the frames of the pyshmem stream STREAM on to the pixel ring NAME, for `faintspot realtime run`.
+def bridge(
+    stream: str | None,
+    source: str | None,
+    slopes: str | None,
+    commands: str | None,
+    name: str,
+    frames: int | None,
+    slots: int,
+) -> None:
+    """Connect `faintspot realtime run` with other software's streams in shared memory.
 
-    The stream may come later, go away and come back, also with frames of another size. Frames keep the
-    number that their producer gave them (frame_id); where it gives none they are counted, from 0. uint16
-    frames stay so, other real ones become float32. Ctrl-C ends it.
+    Frames of STREAM (or --from) go into the pixel ring NAME; with --to and --commands the engine's slopes
+    (all x, then all y, px) and commands come out. Streams are pyshmem's (frames only), isio:NAME of
+    ImageStreamIO (milk, cacao) in $MILK_SHM_DIR, /milk/shm or /tmp, or dao:FILE.
+
+    The streams may come later, go away and come back, also with frames of another size. Frames keep the
+    number that their producer gave them (frame_id; of ImageStreamIO and dao the counter less one); where it
+    gives none they are counted, from 0. uint16 frames stay so, other real ones become float32. Ctrl-C ends
+    it.
 
     \b
-    Example, for the raw frames of pyRTC's wavefront sensor:
+    Examples, for pyRTC's frames, and for a loop of cacao's:
       faintspot realtime bridge wfs_raw
+      faintspot realtime bridge --from isio:wfsim --to isio:wfsim_slopes
     """
+    if stream and source:
+        raise InputError(f"--from {source}: expected it or STREAM, got {stream} as well")
+    source = stream or source
+    if not (source or slopes or commands):
+        raise InputError("bridge: expected a stream of frames, --to or --commands, got none")
+    if frames is not None and not source:
+        raise InputError("--frames: expected a stream of frames, got none")
+    from faintspot.realtime.bridge import StreamBridge
+    from faintspot.realtime.scheduling import quick_switching
+    from faintspot.realtime.stream_out import StreamOut
+
+    def say(line: str) -> None:
+        click.echo(f"{name}: {line}")
+
+    outs = {
+        what: StreamOut(f"{name}_{what}", target, say)
+        for what, target in (("slopes", slopes), ("commands", commands))
+        if target
+    }
+    counters = None
+    with stop_on_signal() as stop, quick_switching() if outs else nullcontext():
+        if source and not outs:
+            counters = StreamBridge(source, name, say=say, slots=slots).run(frames, stop)
+        else:
+            counters = _both_ways(source, name, say, slots, frames, list(outs.values()), stop)
+    if counters is not None:
+        say(
+            f"{counters.frames} frames, {counters.missed} missed, {counters.incomplete} incomplete, "
+            f"{counters.not_ahead} with a number not ahead; {counters.stalls} stalls, "
+            f"{counters.restarts} restarts of the stream"
+        )
+    for what, out in outs.items():
+        say(f"{out.published} times {what}, {out.missed} missed")
+
+
+def _both_ways(
+    source: str | None,
+    name: str,
+    say: Callable[[str], None],
+    slots: int,
+    frames: int | None,
+    outs: list[StreamOut],
+    stop: threading.Event,
+) -> BridgeCounters | None:
+    """Frames in by this thread, if there are any, the rest by a thread each; the first error ends all."""
     from faintspot.realtime.bridge import StreamBridge
 
-    with stop_on_signal() as stop:
-        counters = StreamBridge(
-            stream, name, say=lambda line: click.echo(f"{name}: {line}"), slots=slots
-        ).run(frames, stop)
-    click.echo(
-        f"{name}: {counters.frames} frames, {counters.missed} missed, {counters.incomplete} incomplete, "
-        f"{counters.not_ahead} with a number not ahead; {counters.stalls} stalls, "
-        f"{counters.restarts} restarts of the stream"
-    )
+    errors: list[Exception] = []
+
+    def run(out: StreamOut) -> None:
+        try:
+            out.run(stop)
+        except Exception as error:
+            errors.append(error)
+            stop.set()
+
+    threads = [threading.Thread(target=run, args=(out,), daemon=True) for out in outs]
+    for thread in threads:
+        thread.start()
+    counters = None
+    try:
+        if source is None:
+            stop.wait()
+        else:
+            counters = StreamBridge(source, name, say=say, slots=slots, spins=False).run(frames, stop)
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(_ENDS_S)
+    if errors:
+        raise errors[0]
+    return counters

@@ -92,7 +92,9 @@ def command(
 
     FRAMES are FITS files (plain, .gz, .fz; images or cubes), TIFF, .npy, .npz or Zarr, in the order given.
     They are read block by block, so that their size does not matter. Interrupted and started again, the
-    command goes on where it stopped.
+    command goes on where it stopped. Of telemetry in the AOT standard the frames of its Shack-Hartmann
+    sensor are measured (--key names one of several); where the configuration has no [layout], with the
+    file's sub-apertures and reference slopes.
 
     The output holds x, y (px, or arcsec, from the sub-aperture's centre, 0 where not valid), flux (e-),
     valid, flags, iterations and bad_pixels of every frame and sub-aperture. A .zarr store opens with
@@ -151,6 +153,8 @@ def describe(summary: Summary, output: str) -> list[str]:
     lines = [
         f"{output}: {_count(summary.n_frames, 'frame')}, {_count(summary.n_subapertures, 'sub-aperture')}"
     ]
+    if summary.origin:
+        lines.append(f"  {summary.origin}")
     if summary.resumed_at:
         lines.append(
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"

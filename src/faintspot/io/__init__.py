@@ -9,23 +9,29 @@ from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.io.aot import write_aot as write_aot
+    from faintspot.io.aot_reading import AotSensor as AotSensor
+    from faintspot.io.aot_reading import read_aot as read_aot
     from faintspot.io.telemetry import Telemetry as Telemetry
     from faintspot.io.telemetry import read_telemetry as read_telemetry
 
 # Imported at first use: they need zarr.
 _HOMES = {
+    "AotSensor": "faintspot.io.aot_reading",
+    "read_aot": "faintspot.io.aot_reading",
     "Telemetry": "faintspot.io.telemetry",
     "read_telemetry": "faintspot.io.telemetry",
     "write_aot": "faintspot.io.aot",
 }
 
 __all__ = [
+    "AotSensor",
     "FrameSource",
     "SlopeWriter",
     "StoredSlopes",
     "Telemetry",
     "create_writer",
     "open_frames",
+    "read_aot",
     "read_array",
     "read_slopes",
     "read_telemetry",

@@ -33,9 +33,11 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     Of the system, AOT demands a telescope, a source and a mode; the first two are there as names without
     data. Slopes are `measurements` (t, 2, n), px, x and y; they were published with the reference subtracted,
     which is `ref_measurements`, px from the middle of each window. Fluxes are sums over the sub-aperture,
-    electrons after background subtraction, where the standard speaks of averages in ADU. The settings at the
-    start are in the keyword CONFIG, changes in CHG1, CHG2 and so on, JSON texts. There are no wavefront
-    correctors and loops, about which aotpy warns when it reads the file. All of it is in memory at once.
+    electrons after background subtraction, where the standard speaks of averages in ADU. Estimator and
+    settings at the start are in the keyword CONFIG, changes in CHG1, CHG2 and so on, the layout and the
+    reference slopes with all their digits in LAYOUT and SUBTRACT of the references, JSON texts. There are no
+    wavefront correctors and loops, about which aotpy warns when it reads the file. All of it is in memory at
+    once.
 
     Parameters
     ----------
@@ -75,17 +77,17 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
 
     unix = telemetry.unix_time_s
     attributes = telemetry.attributes
-    settings = tomllib.loads(attributes["settings"]).get("settings", {})
+    tables = tomllib.loads(attributes["settings"])
     source = aotpy.NaturalGuideStar("SOURCE")
     return aotpy.AOSystem(
         ao_mode=ao_mode,
         name=str(attributes["name"]),
         date_beginning=datetime.fromtimestamp(unix[0], UTC),
         date_end=datetime.fromtimestamp(unix[-1], UTC),
-        config=json.dumps(settings),
+        config=json.dumps(tables),
         main_telescope=aotpy.MainTelescope("TELESCOPE"),
         sources=[source],
-        wavefront_sensors=[_sensor(telemetry, source, settings.get("estimator"))],
+        wavefront_sensors=[_sensor(telemetry, source, tables.get("estimator", {}).get("name"))],
         metadata=_metadata(telemetry),
     )
 
@@ -107,7 +109,8 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
     """The Shack-Hartmann sensor with its measurements."""
     import aotpy
 
-    layout = telemetry.attributes["layout"]
+    attributes = telemetry.attributes
+    layout = attributes["layout"]
     window, corners = layout["window"], np.array(layout["corners"])
     when = aotpy.Time(
         "FRAMES", timestamps=telemetry.unix_time_s.tolist(), frame_numbers=telemetry.frame.tolist()
@@ -116,13 +119,20 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
     subtracted = aotpy.Metadatum("REFSUB", True, "reference has been subtracted already")
     summed = aotpy.Metadatum("FLUXSUM", True, "sum over the sub-aperture after background")
     middle = corners[:, ::-1] + 0.5 * (np.array(window[::-1]) - 1)
+    taken_off = attributes.get("reference")
     reference = (np.array(layout["centres"]) - middle).T
+    if taken_off is not None:
+        reference = reference + np.reshape(taken_off, reference.shape)
+    exact = [
+        aotpy.Metadatum("LAYOUT", json.dumps(layout), "as faintspot has it"),
+        aotpy.Metadatum("SUBTRACT", json.dumps(taken_off), "slopes that were subtracted, px"),
+    ]
     sensor = aotpy.ShackHartmann(
         uid="SENSOR",
         source=source,
         n_valid_subapertures=len(corners),
         measurements=aotpy.Image("SLOPES", slopes, "pix", when, [subtracted]),
-        ref_measurements=aotpy.Image("REFERENCE", reference.astype(np.float32), "pix"),
+        ref_measurements=aotpy.Image("REFERENCE", reference.astype(np.float32), "pix", metadata=exact),
         subaperture_intensities=aotpy.Image("FLUX", telemetry.flux, "electron", when, [summed]),
         # AOT knows square sub-apertures only.
         subaperture_size=float(window[0]) if window[0] == window[1] else None,
@@ -132,8 +142,7 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
     )
     mask = _mask(np.array(layout["cells"]))
     if mask is not None:
-        places = aotpy.Metadatum("CORNERS", json.dumps(corners.tolist()), "row, column of first pixels")
-        sensor.subaperture_mask = aotpy.Image("SUBAPERTURES", mask, metadata=[places])
+        sensor.subaperture_mask = aotpy.Image("SUBAPERTURES", mask)
     return sensor
 
 

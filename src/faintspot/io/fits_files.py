@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.io.aot_reading import AOT_VERSION, frames_of_aot
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_fits
@@ -38,7 +39,14 @@ class Fits(FileFormat):
     endings: tuple[str, ...] = (".fits",)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return an image of a file: the first, or the one whose EXTNAME or number is `key`."""
+        """Return an image of a file: the first, or the one whose EXTNAME or number is `key`.
+
+        Of a file of the AOT standard it is the frames of the sensor `key`, or of the only one.
+        """
+        if AOT_VERSION in next(_units(path)).header:
+            names = {name for unit in _units(path) for name in (unit.name.upper(), str(unit.index))}
+            if key is None or key.strip().upper() not in names:
+                key = frames_of_aot(path, key)
         return _find_fits(path, key)
 
     def require(self) -> None:

@@ -1,8 +1,9 @@
-"""Frames of a pyshmem stream into a pixel ring: for cameras, simulators and pyRTC, which publish them.
+"""Frames of a stream into a pixel ring: for cameras, simulators and controllers, which publish them.
 
 How it waits: while frames come it looks at the stream's count again and again, which notices one within a
-microsecond. When nothing has come for `SPIN_S` it leaves the processor alone and waits as pyshmem does: a
-producer of a stream made with ``notify=True`` wakes it (futex), for others it looks every half millisecond.
+microsecond. When nothing has come for `SPIN_S` it leaves the processor alone and waits: a producer that posts
+semaphores (ImageStreamIO) or notifies (pyshmem, ``notify=True``) wakes it, for others it looks every half
+millisecond.
 With fewer than `SPINNING_NEEDS` processors it always does: it would displace the engine or the camera.
 """
 
@@ -21,7 +22,7 @@ from faintspot.checks import number_between
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.replay import ring_type
-from faintspot.realtime.shared_streams import lock_file, pyshmem_module
+from faintspot.realtime.stream import Follower
 
 SPIN_S = 0.02
 """For so long after a frame the next one is waited for without a pause."""
@@ -29,9 +30,8 @@ SPINNING_NEEDS = 3
 """Processors: for the engine, the bridge, and the producer."""
 STALL_S = 1.0
 """A stream that was silent for so long, after frames had come, has stalled."""
-_PARK_S, _NAP_S = 0.05, 5e-4
+_PARK_S = 0.05
 _LOOK_S = 0.1  # between two looks for a stream that is not there
-_LARGEST_NUMBER = 2**63 - 1
 
 
 @dataclass(slots=True)
@@ -55,14 +55,14 @@ class BridgeCounters:
 class StreamBridge:
     """Follows a stream by its name, through its producer's restarts; its frames go into a pixel ring.
 
-    A frame's number is the publication's `frame_id` where the producer sets one, else its count less one, so
+    A frame's number is pyshmem's `frame_id` where the producer sets one, else the stream's count less one, so
     that both begin with 0. uint16 frames stay so, all other real ones become float32. When the stream comes
     back with frames of another size or type, the ring is closed and another one of that name made.
 
     Parameters
     ----------
     stream : str
-        Name of the stream; it need not exist yet.
+        Name of the stream, which need not exist yet: pyshmem's, isio:NAME or dao:FILE.
     name : str
         Of the pixel ring.
     say : function, optional
@@ -74,8 +74,10 @@ class StreamBridge:
 
     Raises
     ------
+    InputError
+        For a name that no stream can have.
     MissingExtraError
-        Without pyshmem.
+        For one of pyshmem's without pyshmem.
     """
 
     def __init__(
@@ -87,16 +89,14 @@ class StreamBridge:
         slots: int = 4,
         spins: bool | None = None,
     ) -> None:
-        self._pyshmem: Any = pyshmem_module("reading a stream in shared memory")
         self.stream, self.name, self._slots = stream, name, slots
-        self._say = say or (lambda _: None)
+        self._follower = Follower(stream, say or (lambda _: None), _unfit, lambda: "waiting")
         self.counters = BridgeCounters()
         enough = len(os.sched_getaffinity(0)) >= SPINNING_NEEDS
         self._spin_s = SPIN_S if (enough if spins is None else spins) else 0.0
-        self._source: Any = None
         self._ring: PixelRing | None = None
         self._seen, self._last_number = 0, -1
-        self._arrived, self._silent, self._told = -math.inf, True, ""
+        self._arrived, self._silent = -math.inf, True
 
     def run(self, n_frames: int | None = None, stop: StopEvent | None = None) -> BridgeCounters:
         """Follow the stream until so many frames have passed or `stop` is set.
@@ -124,12 +124,8 @@ class StreamBridge:
         InputError
             As `run`.
         """
-        if self._source is None:
-            obstacle = self._open()
-            if obstacle and obstacle != self._told:
-                self._say(f"stream {self.stream}: {obstacle}; waiting")
-            self._told = obstacle
-            if obstacle:
+        if self._follower.source is None:
+            if not self._open():
                 time.sleep(_LOOK_S)
         elif self._new_one():
             return self._pass_on()
@@ -148,71 +144,54 @@ class StreamBridge:
 
     def _new_one(self) -> bool:
         """Wait for a publication; False when there is none for a while."""
-        source, seen = self._source, self._seen
+        source, seen = self._follower.source, self._seen
+        assert source is not None
         end = self._arrived + self._spin_s
         while source.count == seen:
             if time.monotonic() > end:
-                break
-        else:
-            return True
-        try:
-            source.wait_for_count(after=seen, timeout=_PARK_S, poll_interval=_NAP_S)
-        except TimeoutError:
-            return False
-        except self._pyshmem.InconsistentStreamError:
-            time.sleep(_PARK_S)  # a writer died in the middle: there may come another
-            return bool(source.count != seen)
+                return source.wait(seen, _PARK_S)
         return True
 
     def _pass_on(self) -> bool:
         """Copy the newest publication into the ring; return whether it was whole."""
-        source, ring, counters = self._source, self._ring, self.counters
+        source, ring, counters = self._follower.source, self._ring, self.counters
+        assert source is not None
         assert ring is not None
-        expected = _number(source.frame_id, source.count)
+        expected = source.number
         slot = ring.begin(expected)
-        try:
-            with np.errstate(over="ignore"):  # what float32 cannot hold is infinite: a bad pixel
-                publication = source.read_publication(out=slot, timeout=_PARK_S)
-        except (TimeoutError, self._pyshmem.InconsistentStreamError):
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite: a bad pixel
+            publication = source.read(slot, _PARK_S)
+        if publication is None:
             counters.incomplete += 1
             self._seen = source.count
             return False
-        number = _number(publication.frame_id, publication.count)
+        number = publication.number
         if number != expected:  # a newer one came meanwhile
             ring.begin(number)[...] = slot.copy()
         ring.end()
         counters.frames += 1
-        counters.missed += publication.count - self._seen - 1
+        counters.missed += publication.total - self._seen - 1
         counters.not_ahead += number <= self._last_number
         if self._silent and self._last_number >= 0:
-            self._say(f"stream {self.stream}: goes on")
-        self._seen, self._last_number = publication.count, number
+            self._follower.say("goes on")
+        self._seen, self._last_number = publication.total, number
         self._arrived, self._silent = time.monotonic(), False
         return True
 
     # ---- the stream
 
-    def _open(self) -> str:
-        """Open the stream and make the ring for it; return what stands in the way, "" for nothing."""
-        lock_file(self.stream)  # refuses a place that is not private, in which pyshmem makes one
-        try:
-            # Not read-only: pyshmem leaves it to readers to mark what a writer that died has left half
-            # written, and without that its successor's frames cannot be told from torn ones.
-            source = self._pyshmem.open(self.stream, gpu_device=False)
-        except FileNotFoundError:
-            return "is not there"
-        except (OSError, ValueError) as error:  # half made, or not for us
-            return f"cannot be opened ({' '.join(str(error).split())})"
-        shape, dtype = tuple(source.shape), source.dtype
-        if len(shape) != 2 or dtype.kind not in "iuf":
-            source.close()
-            return f"holds {shape} {dtype}, expected frames (rows, columns) of real numbers"
+    def _open(self) -> bool:
+        """Open the stream and make the ring for it; return whether nothing stands in the way."""
+        source = self._follower.open()
+        if source is None:
+            return False
         # What was published before a stream is first met is not missed; what a new producer had published is.
         self._seen = source.count if self._ring is None else 0
-        self._source, self._last_number = source, -1
-        self._make_ring((shape[0], shape[1]), ring_type(dtype))
-        self._say(f"stream {self.stream}: {shape[0]} x {shape[1]} pixels ({dtype}), pid {source.creator_pid}")
-        return ""
+        self._last_number = -1
+        rows, columns = source.shape
+        self._make_ring((rows, columns), ring_type(source.dtype))
+        self._follower.say(f"{rows} x {columns} pixels ({source.dtype}), {source.maker}")
+        return True
 
     def _make_ring(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
         """Have a ring of that shape and type."""
@@ -225,28 +204,25 @@ class StreamBridge:
 
     def _look_after(self) -> None:
         """Nothing came: see whether the stream is still there, and say so when it has stalled."""
-        try:
-            there = self._pyshmem.stat(self.stream)["instance_id"]
-        except (OSError, ValueError):
-            there = None
-        if there != self._source.instance_id:
-            self._say(f"stream {self.stream}: {'was removed' if there is None else 'was made anew'}")
+        follower, source = self._follower, self._follower.source
+        assert source is not None
+        happened = follower.lost()
+        if happened:
+            follower.say(happened)
             self.counters.restarts += 1
-            self._let_go()
+            self._silent = True
         elif not self._silent and time.monotonic() - self._arrived > STALL_S:
-            lives = "lives" if self._source.producer_alive() else "is gone"
-            maker = f"pid {self._source.creator_pid}, which made it, {lives}"
-            self._say(f"stream {self.stream}: no frame for {STALL_S:g} s; {maker}")
+            lives = {True: ", which made it, lives", False: ", which made it, is gone", None: ""}
+            follower.say(f"no frame for {STALL_S:g} s; {source.maker}{lives[source.maker_lives()]}")
             self.counters.stalls += 1
             self._silent = True
 
     def _let_go(self) -> None:
         """Close the stream."""
-        if self._source is not None:
-            self._source.close()
-        self._source, self._silent = None, True
+        self._follower.close()
+        self._silent = True
 
 
-def _number(frame_id: int, count: int) -> int:
-    """Return a publication's frame number; of a writer that stamps nothing, frame_id is 0."""
-    return (frame_id or max(count - 1, 0)) & _LARGEST_NUMBER
+def _unfit(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    """Return what is expected where these are no frames."""
+    return "" if len(shape) == 2 and dtype.kind in "iuf" else "frames (rows, columns) of real numbers"

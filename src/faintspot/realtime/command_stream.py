@@ -1,4 +1,4 @@
-"""A mirror's commands from a pyshmem stream, which may be missing, wrong, or made anew."""
+"""A mirror's commands from a stream, which may be missing, wrong, or made anew."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.realtime.shared_streams import lock_file, pyshmem_module
+from faintspot.realtime.stream import Follower
 
 LARGEST_NM = 1e6
 """Of a command: a mirror that is asked for more keeps what it has."""
@@ -63,18 +63,17 @@ class CommandStream:
     """
 
     def __init__(self, stream: str, commands: int, say: Callable[[str], None]) -> None:
-        self._pyshmem: Any = pyshmem_module("reading commands in shared memory")
-        self.stream, self._say = stream, say
+        self.stream = stream
+        self._follower = Follower(stream, say, self._unfit, lambda: self._keeps)
         self.commands_nm: NDArray[np.float64] = np.zeros(commands)
         self.frame, self.counters = -1, CommandCounters()
-        self._source: Any = None
         self._seen, self._next_look_s = 0, 0.0
-        self._told, self._refuses = "", False
+        self._refuses = False
 
     @property
     def state(self) -> str:
         """What is wrong with the stream, "" for nothing."""
-        return self._told
+        return self._follower.obstacle
 
     def take(self) -> None:
         """Let the mirror have the newest commands."""
@@ -86,32 +85,29 @@ class CommandStream:
 
     def close(self) -> None:
         """Let go of the stream."""
-        if self._source is not None:
-            self._source.close()
-            self._source = None
+        self._follower.close()
 
     def _read(self) -> bool:
         """Take commands that are new; return whether whole ones had come."""
-        counters = self.counters
-        if self._source is None or self._source.count == self._seen:
+        counters, source = self.counters, self._follower.source
+        if source is None or source.count == self._seen:
             return False
-        try:
-            publication = self._source.read_publication(timeout=_READ_S)
-        except (TimeoutError, self._pyshmem.InconsistentStreamError):
+        publication = source.read(None, _READ_S)
+        if publication is None:
             counters.incomplete += 1
             return False
-        counters.overtaken += max(0, publication.count - self._seen - 1)
-        self._seen = publication.count
-        values = publication.payload.astype(np.float64)
+        counters.overtaken += max(0, publication.total - self._seen - 1)
+        self._seen = publication.total
+        values = publication.values.astype(np.float64)
         if not np.all(np.abs(values) <= LARGEST_NM):
             counters.refused += 1
             if not self._refuses:
-                self._say(f"stream {self.stream}: not finite, or beyond {LARGEST_NM:g} nm; {self._keeps}")
+                self._follower.say(f"not finite, or beyond {LARGEST_NM:g} nm; {self._keeps}")
             self._refuses = True
             return True
         counters.taken += 1
         self._refuses = False
-        self.commands_nm, self.frame = values, publication.frame_id
+        self.commands_nm, self.frame = values, publication.number
         return True
 
     @property
@@ -121,35 +117,17 @@ class CommandStream:
 
     def _look_after(self) -> None:
         """Nothing whole has come: see whether the stream is the same, look for one where there is none."""
-        if self._source is not None:
-            try:
-                there = self._pyshmem.stat(self.stream)["instance_id"]
-            except (OSError, ValueError):
-                there = None
-            if there == self._source.instance_id:
+        follower = self._follower
+        if follower.source is not None:
+            if not follower.lost():
                 return
             self.counters.restarts += 1
-            self.close()
-        obstacle = self._open()
-        if obstacle and obstacle != self._told:
-            self._say(f"stream {self.stream}: {obstacle}; {self._keeps}")
-        self._told = obstacle
+        source = follower.open()
+        if source is not None:
+            self._seen = 0
+            follower.say(f"{source.shape[0]} commands ({source.dtype}), {source.maker}")
 
-    def _open(self) -> str:
-        """Open the stream; return what stands in the way, "" for nothing."""
-        lock_file(self.stream)  # refuses a place that is not private, in which pyshmem makes one
-        try:
-            # Not read-only: readers mark what a writer that died has left half written.
-            source = self._pyshmem.open(self.stream, gpu_device=False)
-        except FileNotFoundError:
-            return "is not there"
-        except (OSError, ValueError) as error:  # half made, or not for us
-            return f"cannot be opened ({' '.join(str(error).split())})"
-        shape, dtype = tuple(source.shape), source.dtype
+    def _unfit(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+        """Return what is expected where these are no commands of the mirror."""
         expected = self.commands_nm.shape
-        if shape != expected or dtype.kind not in "iuf":
-            source.close()
-            return f"holds {shape} {dtype}, expected {expected} real numbers, nm"
-        self._source, self._seen = source, 0
-        self._say(f"stream {self.stream}: {shape[0]} commands ({dtype}), pid {source.creator_pid}")
-        return ""
+        return "" if shape == expected and dtype.kind in "iuf" else f"{expected} real numbers, nm"

@@ -17,6 +17,7 @@ from faintspot import configuration
 from faintspot.checks import one_of
 from faintspot.errors import InputError
 from faintspot.flags import SubapertureFlag
+from faintspot.io.aot_reading import is_aot, read_aot
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.labelled import layout_coordinates
 from faintspot.io.locations import split_location
@@ -25,8 +26,10 @@ from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import UNITS, VARIABLES, pixels_in, scaled_positions
 from faintspot.light import MeanLight
 from faintspot.pipeline import SlopePipeline
-from faintspot.settings import with_preset, without_denoising
+from faintspot.sensor.calibration import Calibration
+from faintspot.settings import Settings, with_preset, without_denoising
 from faintspot.slopes import Slopes
+from faintspot.tables import read_tables
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
@@ -49,6 +52,8 @@ class Summary:
     """Frames of this call without a single valid slope."""
     measured: int = 0
     """Slopes made by this call."""
+    origin: str = ""
+    """What was taken from a file of telemetry, in words."""
 
     def add(self, slopes: Slopes) -> None:
         """Count the flags of a block."""
@@ -86,7 +91,9 @@ def measure_recorded(
     frames : sequence of path
         FITS, TIFF, .npy, .npz or Zarr; see `faintspot.io.open_frames`.
     configuration_file : path
-        The TOML file with layout, settings and calibration.
+        The TOML file with layout, settings and calibration. Where it has no layout, sub-apertures and
+        reference slopes are those of the first file of frames, if that is an AOT file, and where there is no
+        such file, the settings, too.
     output : path
         .zarr, .fits, .npz or .csv.
     denoise : bool
@@ -121,7 +128,8 @@ def measure_recorded(
     InputError
         When a file cannot be read or written, or frames and configuration do not fit together.
     """
-    layout, settings, calibration, psf, score = configuration.load_all(configuration_file)
+    given, origin, in_file = _given(configuration_file, frames, key)
+    layout, settings, calibration, psf, score = given
     if changes:
         settings = settings.replace(**changes)
     if not denoise:
@@ -129,6 +137,8 @@ def measure_recorded(
     if preset is not None:
         settings = with_preset(settings, preset)
     positions = read_reference(reference) if isinstance(reference, str | Path) else reference
+    if positions is None:
+        positions = in_file
     try:
         pipeline = SlopePipeline(
             layout, settings, calibration, positions, psf=psf, score=score, threads=threads, device=device
@@ -152,7 +162,7 @@ def measure_recorded(
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
             attributes["reference"] = np.asarray(positions).tolist()
-        summary = Summary(source.n_frames, len(layout))
+        summary = Summary(source.n_frames, len(layout), origin=origin)
         size = block_frames or max(1, _BLOCK_BYTES // (4 * source.shape[0] * source.shape[1]))
         with create_writer(
             output,
@@ -170,6 +180,39 @@ def measure_recorded(
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
     return summary
+
+
+def _given(
+    path: str | Path, frames: Sequence[str | Path], key: str | None
+) -> tuple[configuration.Configuration, str, NDArray[Any] | None]:
+    """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
+    if isinstance(frames, str | Path) or not frames or configuration.has(path, "layout"):
+        return configuration.load_all(path), "", None
+    first, own = split_location(frames[0])
+    if not is_aot(first):
+        return configuration.load_all(path), "", None
+    sensor = read_aot(first, own or key)
+    if sensor.layout is None:
+        raise InputError(
+            f"{first}: sensor {sensor.name!r}: expected its sub-apertures (subaperture_mask, mask_offsets, "
+            f"subaperture_size), found none; give [layout] in {path}"
+        )
+    words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
+    document = dict(sensor.tables)
+    if Path(path).exists() or not document:
+        document = read_tables(path)
+    else:
+        words.append("settings")
+    where = Path(path)
+    parts = configuration.Configuration(
+        sensor.layout,
+        Settings.from_tables(where, document),
+        Calibration.from_tables(where, document),
+        configuration.psf_of(where, document),
+        configuration.score_of(where, document),
+    )
+    listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
+    return parts, f"{listed} of {first}", sensor.reference
 
 
 def _told_mean_light(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
@@ -248,6 +291,8 @@ def _attributes(
 def _files_of_the_spot(configuration_file: str | Path) -> dict[str, str]:
     """Where PSF and score are kept, for a report: a file of their own, or the configuration itself."""
     path = Path(configuration_file).resolve()
+    if not path.exists():  # everything was in a file of telemetry
+        return {}
     tables = tomllib.loads(path.read_text(encoding="utf-8"))
     return {
         f"{part}_file": str(path.parent / tables[part].get("file", path.name))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,19 @@ _FIELDS = ("x", "y", "mean_spot", "light", "index")
 _LARGEST = 1e6  # px, or fractions of the light, for one pixel: beyond, float32 sums say nothing
 _SMALLEST_GAIN = 0.02
 _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
+_SAME = 1e-6  # of the largest weight: what sums in float32 do not tell apart
 _RIDGE = 1e-6  # of the mean variance of a pixel: keeps the solution finite where there is no noise
+
+
+class WeightedCentre(NamedTuple):
+    """Fixed weights as a centre of gravity c of weighted pixels: the slope is gain (c - reference)."""
+
+    weights: Floats
+    """(n_kinds, ny, nx): of every pixel, at most 1."""
+    gain: Floats
+    """(n_kinds, 2): px, x and y, for a centre of gravity that moves by 1 px."""
+    reference: Floats
+    """(n_kinds, 2): centre of gravity where the slope is 0, px from the window's middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +123,42 @@ class FixedWeights:
         kinds: NDArray[np.int64] = self.index
         return kinds
 
+    def weighted_centre(self) -> WeightedCentre:
+        """Return the same as a weighted centre of gravity, divided by the light of the frame.
+
+        Raises
+        ------
+        InputError
+            When x and y do not follow from one map of weights: those of a Gaussian window do.
+        """
+        rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in self.window)
+        counted = (self.x != 0) | (self.y != 0) | (self.light != 0)
+        largest = np.abs(self.light).max(axis=(1, 2), keepdims=True)
+        gains, references = [], []
+        for maps, along in ((self.x, columns), (self.y, rows[:, None])):
+            moved = self.light * along
+            # The best gain and offset of each kind, by least squares.
+            parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.light)]
+            seen = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.light)]
+            determinant = parts[0] * parts[2] - parts[1] ** 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                gain = (parts[2] * seen[0] - parts[1] * seen[1]) / determinant
+                offset = (parts[0] * seen[1] - parts[1] * seen[0]) / determinant
+                rest = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.light)
+                spot = (maps * self.mean_spot).sum(axis=(1, 2))
+                reference = (spot - offset) / gain
+            if not (np.isfinite(gain) & np.isfinite(reference)).all() or not np.all(
+                rest <= _SAME * np.abs(maps).max()
+            ):
+                raise InputError(
+                    "weights: expected one map of weights whose centre of gravity is the slope, as of a "
+                    "Gaussian window, got others in x and y"
+                )
+            gains.append(gain)
+            references.append(reference)
+        weights = np.where(counted, self.light / largest, 0.0)
+        return WeightedCentre(weights, np.stack(gains, axis=1), np.stack(references, axis=1))
+
     @classmethod
     def best_linear(
         cls,
@@ -198,6 +246,11 @@ class FixedWeights:
             When the file cannot be read or holds something else.
         """
         return load_fields(cls, path, "fixed weights", _FIELDS, optional=("light", "index"))
+
+
+def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
+    """Products of two maps that their normal equations need."""
+    return (first, first), (first, second), (second, second)
 
 
 def _light_weights(values: dict[str, Any]) -> Floats:

@@ -1,0 +1,99 @@
+"""What is exported of a configuration: its pipeline, with reference slopes, and its control."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot import configuration
+from faintspot.control.configuration import Control, load_control
+from faintspot.errors import InputError
+from faintspot.estimators.window import NONE, Window
+from faintspot.io.references import read_reference
+from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.fixed_weights import FixedWeights, WeightedCentre
+
+Floats = NDArray[np.float64]
+
+
+def pipeline_of(
+    path: str | Path, reference: ArrayLike | str | Path | None, control: Control | None = None
+) -> SlopePipeline:
+    """Return the pipeline of a configuration file, with the reference slopes that are given or in [control].
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read, or its parts do not fit together.
+    """
+    layout, settings, calibration, psf, score = configuration.load_all(path)
+    slopes: Any = read_reference(reference) if isinstance(reference, str | Path) else reference
+    if slopes is None and control is not None:
+        slopes = control.reference
+    try:
+        return SlopePipeline(layout, settings, calibration, slopes, psf=psf, score=score)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def control_of(path: str | Path) -> Control | None:
+    """Return the control of a configuration file, when that is an integrator; None where there is none.
+
+    Raises
+    ------
+    InputError
+        For another controller, and as `faintspot.control.configuration.load_control`.
+    """
+    control = load_control(path)
+    if control is not None and control.model is not None:
+        raise InputError(
+            f"{path}: control.controller = {control.options.controller!r}: expected 'integrator', which a "
+            "control matrix is; set that, or leave the control out"
+        )
+    return control
+
+
+def fixed_weights(pipeline: SlopePipeline) -> FixedWeights:
+    """Return the weights of estimator "window", one kind for each sub-aperture.
+
+    Raises
+    ------
+    InputError
+        For another estimator, which has none, and for sums that are not divided by the light.
+    """
+    estimator = pipeline.settings.estimator
+    if not isinstance(estimator, Window):
+        raise InputError(
+            f"estimator {estimator.name!r}: expected 'window', which has fixed weights; another's depend on "
+            "the frame"
+        )
+    if estimator.normalisation == NONE:
+        raise InputError('estimator.normalisation = "none": expected "mean" or "frame"')
+    found: FixedWeights = pipeline.preparation.prepared.weights  # type: ignore[attr-defined]
+    kinds = found.kinds(len(pipeline.layout))
+    return FixedWeights(*(maps[kinds] for maps in (found.x, found.y, found.mean_spot, found.light)))
+
+
+def offsets_of(pipeline: SlopePipeline) -> Floats:
+    """Return what references take off the slopes of the weights, (n, 2) px.
+
+    Weights that were given are around the sub-apertures' centres, Gaussian windows around the references.
+    """
+    sensor = pipeline.preparation.sensor
+    given = isinstance(sensor.score, FixedWeights)
+    return sensor.zero - sensor.layout.offsets if given else np.zeros_like(sensor.zero)
+
+
+def centre_of(pipeline: SlopePipeline, weights: FixedWeights) -> WeightedCentre:
+    """Return the weighted centre of gravity of every sub-aperture, its reference as the pipeline's.
+
+    Raises
+    ------
+    InputError
+        When the weights are none.
+    """
+    centre = weights.weighted_centre()
+    return centre._replace(reference=centre.reference + offsets_of(pipeline) / centre.gain)

@@ -1,0 +1,275 @@
+"""Sensors from files of the Adaptive Optics Telemetry standard (AOT, FITS), by way of aotpy.
+
+What the standard leaves open is taken as faintspot writes it: rows of an image are its vertical axis,
+positions are counted from 0, slopes are px from the middle of a sub-aperture's window.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import finite_array
+from faintspot.errors import InputError, MissingExtraError
+from faintspot.io.locations import one_line
+from faintspot.io.optional_packages import load_fits
+from faintspot.sensor.layout import Layout
+
+AOT_VERSION = "AOT-VERS"
+"""Keyword of the primary header."""
+_PIXELS = ("pix", "pixel", "px")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AotSensor:
+    """A Shack-Hartmann sensor of an AOT file, with what the file has of it; None is what it has not."""
+
+    path: Path
+    name: str
+    """Its UID."""
+    n: int
+    """Number of sub-apertures."""
+    layout: Layout | None
+    tables: Mapping[str, Any]
+    """[estimator] and [settings] of a faintspot.toml, in files that faintspot has written."""
+    reference: NDArray[np.float64] | None
+    """(2 n,): slopes that are or were to be subtracted, px from the layout's centres, all x, then all y."""
+    pixels: str | None
+    """The image of the frames: `open_frames` reads "file:pixels"."""
+    image_frame: NDArray[np.float64]
+    """Numbers of those frames; empty where the file does not say."""
+    slopes: NDArray[Any] | None
+    """(t, 2, n): x and y as they are stored, in `unit`."""
+    unit: str
+    frame: NDArray[np.float64]
+    """Numbers of the frames of the slopes; empty where the file does not say."""
+    unix_time_s: NDArray[np.float64]
+    """Their times; empty where the file does not say."""
+    flux: NDArray[Any] | None
+    """(t, n), as it is stored."""
+    interaction: NDArray[np.float64] | None
+    """(2 n, commands): slopes, all x, then all y, for a unit of each command; of the first loop with one."""
+
+    def __repr__(self) -> str:
+        """Say what there is."""
+        what = [name for name in ("layout", "pixels", "slopes", "reference", "interaction") if self.has(name)]
+        return f"AotSensor({self.name!r}, {self.n} sub-apertures, {', '.join(what) or 'no data'})"
+
+    def has(self, name: str) -> bool:
+        """Whether the file has it."""
+        return getattr(self, name) is not None
+
+
+def is_aot(path: str | Path) -> bool:
+    """Tell whether a file is a FITS file of the AOT standard."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return AOT_VERSION in load_fits().getheader(path, 0)
+        except Exception:  # another file, or a damaged one, about which its reader says more
+            return False
+
+
+def frames_of_aot(path: Path, sensor: str | None) -> str:
+    """Return the name of the image that holds a sensor's frames; see `read_aot`.
+
+    Raises
+    ------
+    InputError
+        When the sensor has no pixels, and as `read_aot`.
+    """
+    found = read_aot(path, sensor)
+    if found.pixels is None:
+        raise InputError(
+            f"{path}: sensor {found.name!r}: expected frames (pixel_intensities of its detector), found none"
+        )
+    return found.pixels
+
+
+def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
+    """Read a Shack-Hartmann sensor from an AOT file.
+
+    Parameters
+    ----------
+    path : path
+    sensor : str, optional
+        UID of the sensor, or the name of the image with its frames. Default: the only one, or the only one
+        with pixels.
+
+    Raises
+    ------
+    InputError
+        When it is not a valid AOT file, has no such sensor, or says things of it that do not fit together.
+    MissingExtraError
+        When aotpy is not installed.
+    """
+    path = Path(path)
+    try:
+        import aotpy
+        from aotpy.io.fits import AOTFITSReader
+    except ImportError:
+        raise MissingExtraError("aotpy", "realtime", "Reading an AOT file") from None
+    if not path.exists():
+        raise InputError(f"{path}: no such file or directory")
+    if not is_aot(path):
+        raise InputError(f"{path}: expected an AOT file, whose header has {AOT_VERSION}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what faintspot does not ask for
+        try:
+            # Images elsewhere would be asked for in a dialogue, or fetched.
+            system = AOTFITSReader(path, externals="ignore").get_system()
+        except Exception as error:  # aotpy raises whatever a damaged file leads to
+            raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
+    sensors = [each for each in system.wavefront_sensors if isinstance(each, aotpy.ShackHartmann)]
+    found = _chosen(path, sensors, sensor)
+    loops = [
+        each
+        for each in system.loops
+        if isinstance(each, aotpy.ControlLoop) and each.input_sensor is found and each.interaction_matrix
+    ]
+    try:
+        return _sensor(path, found, system, loops)
+    except InputError as error:
+        raise InputError(f"{path}: sensor {found.uid!r}: {error}") from None
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        raise InputError(f"{path}: sensor {found.uid!r}: not as AOT has it ({one_line(error)})") from None
+
+
+def _chosen(path: Path, sensors: list[Any], name: str | None) -> Any:
+    """The sensor that is meant."""
+    listed = ", ".join(str(each.uid) for each in sensors) or "none"
+    if name is not None:
+        sensors = [each for each in sensors if name in (each.uid, _pixels_of(each))]
+    elif len(sensors) > 1:
+        sensors = [each for each in sensors if _pixels_of(each) is not None]
+    if len(sensors) != 1:
+        wanted = f"a Shack-Hartmann sensor {name!r}" if name else "one Shack-Hartmann sensor with pixels"
+        hint = "; name one" if len(sensors) > 1 else ""
+        raise InputError(f"{path}: expected {wanted}, it has: {listed}{hint}")
+    return sensors[0]
+
+
+def _pixels_of(sensor: Any) -> str | None:
+    """Name of the image with a sensor's frames."""
+    image = None if sensor.detector is None else sensor.detector.pixel_intensities
+    return None if image is None or image.data is None else str(image.name)
+
+
+def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
+    n = int(found.n_valid_subapertures)
+    name, size = _pixels_of(found), None
+    pixels = None if name is None else found.detector.pixel_intensities
+    if pixels is not None:
+        if pixels.data.ndim not in (2, 3):
+            shape = pixels.data.shape
+            raise InputError(f"pixel_intensities: expected (frames, height, width), got shape {shape}")
+        size = int(pixels.data.shape[-2]), int(pixels.data.shape[-1])
+    own = _own(found.ref_measurements)
+    layout = Layout(**own["LAYOUT"]) if "LAYOUT" in own else _layout(found, n, size)
+    if "SUBTRACT" in own:
+        reference = None if own["SUBTRACT"] is None else np.asarray(own["SUBTRACT"], np.float64)
+    else:
+        reference = _reference(found, n)
+    slopes, flux = _data_of(found, "measurements"), _data_of(found, "subaperture_intensities")
+    if slopes is not None and slopes.shape[1:] != (2, n):
+        raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
+    numbers, times = _time_of(found.measurements)
+    return AotSensor(
+        path,
+        str(found.uid),
+        n,
+        layout,
+        _tables(system),
+        reference,
+        name,
+        _time_of(pixels)[0],
+        slopes,
+        "" if slopes is None else str(found.measurements.unit or ""),
+        numbers,
+        times,
+        flux,
+        _interaction(loops, n),
+    )
+
+
+def _layout(found: Any, n: int, size: tuple[int, int] | None) -> Layout | None:
+    """Sub-apertures as the standard has them: a grid of squares of pixels; None where it lacks a part."""
+    mask = _data_of(found, "subaperture_mask")
+    if mask is None or not found.mask_offsets or found.subaperture_size is None:
+        return None
+    if len(found.mask_offsets) != 1:
+        raise InputError(f"mask_offsets: expected one, got {len(found.mask_offsets)}")
+    places = np.argwhere(mask >= 0)
+    numbers = mask[mask >= 0]
+    if not np.array_equal(np.sort(numbers), np.arange(n)):
+        raise InputError(f"subaperture_mask: expected the numbers 0 to {n - 1}, each once, got others")
+    cells = places[np.argsort(numbers)]
+    side, offset = float(found.subaperture_size), found.mask_offsets[0]
+    first = np.array([float(offset.y), float(offset.x)])
+    corners = np.rint(finite_array("mask_offsets", first) + cells * side).astype(np.int64)
+    window = int(side)
+    if size is None:
+        bottom, right = (corners + window).max(axis=0).tolist()
+        size = bottom, right
+    return Layout(size, (window, window), corners, cells=cells)
+
+
+def _reference(found: Any, n: int) -> NDArray[np.float64] | None:
+    """Reference slopes, where they are in pixels."""
+    values = _data_of(found, "ref_measurements")
+    if values is None or str(found.ref_measurements.unit).lower() not in _PIXELS:
+        return None
+    if values.shape != (2, n):
+        raise InputError(f"ref_measurements: expected shape (2, {n}), got {values.shape}")
+    return finite_array("ref_measurements", values).astype(np.float64).reshape(-1)
+
+
+def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
+    """The interaction matrix, (2 n, commands)."""
+    if not loops:
+        return None
+    values = np.asarray(loops[0].interaction_matrix.data)
+    if values.ndim != 3 or values.shape[:2] != (n, 2):
+        raise InputError(f"interaction_matrix: expected shape ({n}, 2, commands), got {values.shape}")
+    matrix: NDArray[np.float64] = values.swapaxes(0, 1).reshape(2 * n, -1).astype(np.float64)
+    return matrix
+
+
+def _data_of(owner: Any, name: str) -> Any:
+    """An image's data in native byte order, or None."""
+    image = None if owner is None else getattr(owner, name)
+    if image is None or image.data is None:
+        return None
+    data = np.asarray(image.data)
+    return data.astype(data.dtype.newbyteorder("="), copy=False)
+
+
+def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frame numbers and times of an image; empty where it has none."""
+    time = None if image is None else image.time
+    values = ([], []) if time is None else (time.frame_numbers, time.timestamps)
+    numbers, stamps = (np.asarray([] if each is None else each, np.float64) for each in values)
+    return numbers, stamps
+
+
+def _own(image: Any) -> dict[str, Any]:
+    """What faintspot has written beside the references."""
+    if image is None:
+        return {}
+    values = {item.key: item.value for item in image.metadata}
+    return {name: json.loads(values[name]) for name in ("LAYOUT", "SUBTRACT") if name in values}
+
+
+def _tables(system: Any) -> dict[str, Any]:
+    """Estimator and settings of a file that faintspot has written."""
+    if not any(item.key == "ORIGIN" and item.value == "faintspot" for item in system.metadata):
+        return {}
+    tables = json.loads(system.config)
+    return tables if isinstance(tables.get("settings", {}), dict) else {}

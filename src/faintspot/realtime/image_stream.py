@@ -1,0 +1,375 @@
+"""Streams of ImageStreamIO (milk, cacao) and dao in shared memory: frames in, slopes and commands out."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import mmap
+import os
+import secrets
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from faintspot.errors import InputError
+from faintspot.realtime.image_layout import (
+    COUNTER,
+    DAO,
+    ISIO,
+    KEYWORD,
+    MATH_DATA,
+    METADATA,
+    MOST_POSTED,
+    SEMAPHORES,
+    TRACES,
+    TYPES,
+    VERSION,
+    WRITING,
+    Places,
+    Unfit,
+    checked,
+    path_of,
+    places_of,
+)
+from faintspot.realtime.pixel_segment import identity_of
+from faintspot.realtime.processes import process_start
+from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
+from faintspot.realtime.semaphores import Semaphore
+from faintspot.realtime.stream import Publication
+
+_NAP_S = 5e-4
+_OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # of a pipe we want nothing
+
+
+class _Mapped:
+    """A file in memory, with its parts as arrays."""
+
+    def __init__(self, kind: str, memory: mmap.mmap, places: Places, shape: tuple[int, ...]) -> None:
+        self.fields = np.ndarray((), METADATA[kind], memory)
+        """Metadata; each an array that changes as others write."""
+        self.memory, self.places = memory, places
+        self.counter = np.ndarray((), np.uint64, memory, COUNTER[kind])
+        self.writing = np.ndarray((), np.uint8, memory, WRITING[kind])
+        dtype = np.dtype(TYPES[int(self.fields["datatype"])])
+        self.values: NDArray[Any] = np.ndarray(shape, dtype, memory, places.values)
+        self.address = np.frombuffer(memory, np.uint8).ctypes.data
+
+    def pids(self, offset: int) -> NDArray[np.int32]:
+        """Process numbers, one for each semaphore."""
+        return np.ndarray((int(self.fields["sem"]),), np.int32, self.memory, offset)
+
+    def semaphore(self, number: int) -> int:
+        """Address of one in memory."""
+        return self.address + self.places.semaphores + SEMAPHORE_BYTES * number
+
+
+class ImageStream:
+    """A stream that another program writes, followed as `faintspot.realtime.stream.Stream`.
+
+    While it waits, it takes a semaphore of ImageStreamIO that is nobody's; of dao, whose semaphores belong
+    to nobody, it only looks at the counter. A publication's number is the counter less one.
+
+    Parameters
+    ----------
+    kind : {"isio", "dao"}
+    name : str
+        See `path_of`.
+
+    Raises
+    ------
+    FileNotFoundError
+        When there is none.
+    Unfit
+        When there is something else.
+    InputError
+        For a name that cannot be one.
+    """
+
+    def __init__(self, kind: str, name: str) -> None:
+        self._path = path_of(kind, name)
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | _OPEN)
+            writable = True
+        except PermissionError:
+            descriptor, writable = os.open(self._path, os.O_RDONLY | _OPEN), False
+        try:
+            status = os.fstat(descriptor)
+            size, head = status.st_size, METADATA[kind]
+            if not stat.S_ISREG(status.st_mode) or size <= head.itemsize:
+                raise Unfit(f"{self._path} is no stream")
+            metadata = np.frombuffer(os.pread(descriptor, head.itemsize, 0), head)[0]
+            places, self.shape, self.dtype, self._circular = checked(kind, metadata, size)
+            access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+            memory = mmap.mmap(descriptor, size, access=access)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        self._descriptor, self._size, self._identity = descriptor, size, identity_of(status)
+        whole = (int(metadata["size"][2]), *self.shape) if self._circular else self.shape
+        self._mapped = _Mapped(kind, memory, places, whole)
+        self._maker = int(metadata["creatorPID"]) if kind == ISIO else 0
+        self._turn = self._claimed() if kind == ISIO and writable else None
+
+    @property
+    def count(self) -> int:
+        """How much was published."""
+        return int(self._mapped.counter)
+
+    @property
+    def number(self) -> int:
+        """Number of the newest."""
+        return max(self.count - 1, 0)
+
+    @property
+    def maker(self) -> str:
+        """Who made it."""
+        return f"pid {self._maker}" if self._maker else str(self._path)
+
+    def maker_lives(self) -> bool | None:
+        """Whether that process is there; None where it is not known."""
+        return process_start(self._maker) >= 0 if self._maker else None
+
+    def same(self) -> bool | None:
+        """Whether the name still leads here; None where it leads nowhere."""
+        try:
+            status = self._path.stat()
+        except OSError:
+            return None
+        return identity_of(status) == self._identity and status.st_size == self._size
+
+    def wait(self, after: int, limit_s: float) -> bool:
+        """Wait until more was published than `after`, at most so long; return whether there was.
+
+        The counter is looked at every half millisecond, too: not every program posts semaphores.
+        """
+        end = time.monotonic() + limit_s
+        while self.count == after:
+            if time.monotonic() >= end:
+                return False
+            if self._turn is None:
+                time.sleep(_NAP_S)
+            else:
+                Semaphore(self._mapped.semaphore(self._turn)).wait(_NAP_S)
+        return True
+
+    def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
+        """Return the newest publication, or None when none is whole within the time."""
+        mapped, end = self._mapped, time.monotonic() + limit_s
+        target = np.empty(self.shape, self.dtype) if out is None else out
+        while os.fstat(self._descriptor).st_size == self._size:  # memory beyond a file's end is none
+            count = self.count
+            if not mapped.writing:
+                newest = mapped.values[int(mapped.fields["cnt1"]) % len(mapped.values)]
+                np.copyto(target, newest if self._circular else mapped.values, casting="unsafe")
+                if not mapped.writing and self.count == count:
+                    return Publication(target, max(count - 1, 0), count)
+            if time.monotonic() >= end:
+                break
+        return None
+
+    def close(self) -> None:
+        """Give the semaphore back and let go."""
+        if self._turn is not None:
+            self._mapped.pids(self._mapped.places.readers)[self._turn] = 0
+            self._turn = None
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _claimed(self) -> int | None:
+        """Put this process down as the reader of a semaphore that nobody living has."""
+        readers = self._mapped.pids(self._mapped.places.readers)
+        for number, pid in enumerate(readers.tolist()):
+            if pid <= 0 or process_start(pid) < 0:
+                readers[number] = os.getpid()
+                return number
+        return None
+
+
+class ImageStreamWriter:
+    """A stream of ours for programs of ImageStreamIO or dao.
+
+    Each publication counts `cnt0` up and posts all semaphores; the keyword FRAME is the frame's number, the
+    times are when it was published (TAI, in dao Unix time). In dao a stream that is there, of the same size
+    and type, is written into, as its programs do; ImageStreamIO's is made anew.
+
+    Parameters
+    ----------
+    kind : {"isio", "dao"}
+    name : str
+        See `path_of`.
+    shape : (int,) or (int, int)
+        A vector is an image of one row.
+    dtype : dtype
+
+    Raises
+    ------
+    InputError
+        When a living process has made one of that name, something else is there, or it cannot be made.
+    """
+
+    def __init__(self, kind: str, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
+        self.kind, self.path = kind, path_of(kind, name)
+        self.shape = (1, *shape) if len(shape) == 1 else shape
+        head = self._head(np.dtype(dtype))
+        places = places_of(kind, head)
+        there = _there(kind, self.path)
+        if kind == DAO and there is not None:
+            memory = self._joined(head, there)
+            places = places_of(kind, np.ndarray((), METADATA[kind], memory))
+            self._mapped = _Mapped(kind, memory, places, self.shape)
+        else:
+            memory, hidden = _made(self.path, places.total, head)
+            self._mapped = _Mapped(kind, memory, places, self.shape)
+            if kind == ISIO:
+                for number in range(SEMAPHORES):
+                    Semaphore.made(self._mapped.semaphore(number))
+                Semaphore.made(self._mapped.address + places.log_semaphore)
+                self._mapped.pids(places.readers)[:] = -1
+                self._mapped.pids(places.writers)[:] = os.getpid()
+            os.replace(hidden, self.path)  # complete before it gets its name
+        self._identity = identity_of(self.path.stat())
+        self._keyword = self._keywords()
+        self._semaphores = self._posted()
+
+    def publish(self, values: NDArray[Any], number: int) -> None:
+        """Publish values of a frame."""
+        mapped, fields = self._mapped, self._mapped.fields
+        mapped.writing[...] = 1
+        mapped.values[...] = values.reshape(self.shape)
+        if self._keyword is not None:
+            self._keyword["value"] = number
+        if self.kind == ISIO:
+            self._keyword["cnt"] += 1
+            fields["atime"] = fields["writetime"] = _clock()
+        else:
+            fields["atime"][1] = time.time_ns()
+        mapped.counter[...] += 1
+        mapped.writing[...] = 0
+        for semaphore in self._semaphores:
+            semaphore.post(MOST_POSTED[self.kind])
+
+    def close(self) -> None:
+        """Remove the stream, unless it is somebody else's by now."""
+        with contextlib.suppress(OSError):
+            if identity_of(self.path.stat()) == self._identity:
+                self.path.unlink()
+                if self.kind == DAO:
+                    for name in self._names():
+                        Semaphore.unlink(name)
+
+    def _head(self, dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Metadata of a new stream."""
+        head = np.zeros((), METADATA[self.kind])
+        code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)
+        head["naxis"], head["size"] = 2, (*self.shape[::-1], 0)
+        head["nelement"], head["datatype"] = math.prod(self.shape), code
+        head["shared"], head["sem"], head["NBkw"] = 1, SEMAPHORES, 1
+        if self.kind == DAO:
+            head["name"] = str(self.path).encode()
+            return head
+        head["name"] = self.path.name.removesuffix(".im.shm").encode()
+        head["version"], head["imagetype"], head["location"] = VERSION, MATH_DATA, -1
+        head["NBproctrace"], head["creatorPID"] = TRACES, os.getpid()
+        head["imdatamemsize"] = math.prod(self.shape) * dtype.itemsize
+        head["creationtime"] = head["lastaccesstime"] = _clock()
+        return head
+
+    def _joined(self, wanted: NDArray[Any], there: NDArray[Any]) -> mmap.mmap:
+        """Map a stream that is there, where it is what is wanted."""
+        sizes = [each["size"][: int(each["naxis"])].tolist() for each in (wanted, there)]
+        if sizes[0] != sizes[1] or wanted["datatype"] != there["datatype"]:
+            raise InputError(
+                f"{self.kind}:{self.path}: expected a stream of {sizes[0]} float32 values, or none, found "
+                f"{sizes[1]} of type {TYPES[int(there['datatype'])]}; remove it or choose another name"
+            )
+        try:
+            with self.path.open("r+b") as file:
+                return mmap.mmap(file.fileno(), 0)
+        except OSError as error:
+            raise InputError(f"{self.kind}:{self.path}: cannot be opened ({error.strerror})") from None
+
+    def _keywords(self) -> Any:
+        """The keyword FRAME; None where somebody else's stream has no room for it."""
+        mapped = self._mapped
+        if not mapped.fields["NBkw"]:
+            return None
+        keyword = np.ndarray((), KEYWORD[self.kind], mapped.memory, mapped.places.keywords)
+        keyword["name"], keyword["type"] = b"FRAME", b"L"
+        return keyword
+
+    def _posted(self) -> list[Semaphore]:
+        """All semaphores that a publication posts."""
+        if self.kind == DAO:
+            found = [Semaphore.named(name) for name in self._names()]
+            return [each for each in found if each is not None]
+        mapped = self._mapped
+        numbers = range(int(mapped.fields["sem"]))
+        log = Semaphore(mapped.address + mapped.places.log_semaphore)
+        return [*(Semaphore(mapped.semaphore(number)) for number in numbers), log]
+
+    def _names(self) -> list[str]:
+        """Names of dao's semaphores."""
+        local = self.path.name.split(".")[0]
+        count = int(self._mapped.fields["sem"])
+        return [*(f"{local}_sem{number:02d}" for number in range(count)), f"{local}_semlog"]
+
+
+def _there(kind: str, path: Path) -> NDArray[Any] | None:
+    """Return the metadata of a stream of that name that may be replaced or joined; None where there is none.
+
+    Raises
+    ------
+    InputError
+        When it is something else, or its maker lives.
+    """
+    try:
+        content = path.read_bytes()[: METADATA[kind].itemsize]
+        size = path.stat().st_size
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise InputError(f"{kind}:{path}: cannot be opened ({error.strerror})") from None
+    try:
+        if len(content) < METADATA[kind].itemsize:
+            raise Unfit("is no stream")
+        head = np.frombuffer(content, METADATA[kind])[0]
+        checked(kind, head, size)
+    except Unfit as error:
+        raise InputError(f"{kind}:{path}: {error}; remove it or choose another name") from None
+    maker = int(head["creatorPID"]) if kind == ISIO else 0
+    if maker not in (0, os.getpid()) and process_start(maker) >= 0:
+        raise InputError(
+            f"{kind}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
+        )
+    return np.array(head)
+
+
+def _made(path: Path, size: int, head: NDArray[Any]) -> tuple[mmap.mmap, Path]:
+    """Make the file of a stream under a hidden name, with its metadata; return its memory and that name."""
+    hidden = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    try:
+        descriptor = os.open(hidden, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            os.posix_fallocate(descriptor, 0, size)
+            memory = mmap.mmap(descriptor, size)
+            if "inode" in (head.dtype.names or ()):
+                head["inode"] = os.fstat(descriptor).st_ino
+            memory[: head.nbytes] = head.tobytes()
+            return memory, hidden
+        except BaseException:
+            hidden.unlink(missing_ok=True)
+            raise
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise InputError(f"{path}: this stream cannot be made: {size} bytes ({error.strerror})") from None
+
+
+def _clock() -> tuple[int, int]:
+    """Seconds and nanoseconds by the clock of ImageStreamIO."""
+    return divmod(time.clock_gettime_ns(time.CLOCK_TAI), 10**9)

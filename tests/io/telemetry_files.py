@@ -1,0 +1,72 @@
+"""Telemetry of a small sensor, for the tests of its files."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+N, SHAPE, WINDOW = 8, (24, 24), (8, 8)
+ATTRIBUTES: dict[str, Any] = {
+    "name": "bench",
+    "layout": {
+        "frame_shape": SHAPE,
+        "window": WINDOW,
+        "corners": [[row, column] for row in (0, 8, 16) for column in (0, 8, 16) if (row, column) != (8, 8)],
+        "centres": [
+            [column + 3.75, row + 3.5]
+            for row in (0, 8, 16)
+            for column in (0, 8, 16)
+            if (row, column) != (8, 8)
+        ],
+        "cells": [[row, column] for row in range(3) for column in range(3) if (row, column) != (1, 1)],
+    },
+    "settings": '[estimator]\nname = "tv"\nnoise_std = 1.5\n[settings]\nflux_e = 30.0\n',
+    "arms": ["none", "tv"],
+    "dropped_records": 2,
+}
+CHANGES = [
+    {"frame": 12, "number": 1, "changes": {"noise_std": 2.5, "rule": "it's"}, "where": [1, 2]},
+    {"frame": 20, "number": 2, "changes": {"noise_std": [i / 7 for i in range(200)]}, "where": None},
+]
+RECORD = np.dtype(
+    [
+        *[(name, np.int64) for name in ("sequence", "frame", "arm", "change")],
+        *[(name, np.int64) for name in ("last_row_time_ns", "published_time_ns", "clock_offset_ns")],
+        *[(name, np.float32, (N,)) for name in ("x", "y", "flux", "standard_error_x", "standard_error_y")],
+        ("iterations", np.int32, (N,)),
+        ("flags", np.uint8, (N,)),
+    ]
+)
+IMAGE = np.dtype(
+    [
+        ("sequence", np.int64),
+        ("image_frame", np.int64),
+        ("raw", np.float32, SHAPE),
+        ("denoised", np.float32, (N, *WINDOW)),
+    ]
+)
+START_NS = 1_700_000_000_000_000_000
+
+
+def records_of(first: int, count: int) -> np.ndarray:
+    """Records of frames at 1 kHz, some 1000 s after the machine was started."""
+    rng = np.random.default_rng(first)
+    records = np.zeros(count, RECORD)
+    records["frame"] = np.arange(first, first + count)
+    records["arm"], records["change"] = records["frame"] % 2, first
+    records["last_row_time_ns"] = 10**12 + records["frame"] * 10**6
+    records["published_time_ns"] = records["last_row_time_ns"] + 50_000
+    records["clock_offset_ns"] = START_NS - 10**12
+    for name in ("x", "y", "flux", "standard_error_x", "standard_error_y"):
+        records[name] = rng.normal(size=(count, N))
+    records["flags"][:, 3] = 1
+    return records
+
+
+def images_of(*frames: int) -> np.ndarray:
+    images = np.zeros(len(frames), IMAGE)
+    images["image_frame"] = frames
+    images["raw"] = np.arange(24)[:, None] * 100 + np.arange(24) + np.array(frames)[:, None, None]
+    images["denoised"] = np.array(frames)[:, None, None, None]
+    return images
