@@ -37,9 +37,10 @@ def small_table() -> Table:
     """Time the controllers of the 4.2 m telescope."""
     configuration = load_loop("diffraction_limit")
     optics, control = prepare(configuration), configuration.control
-    covariances = slope_turbulence(configuration, optics.sensor.layout.cells).lagged_px2(
-        1 / control.frame_rate_hz
-    )
+    frame_s = 1 / control.frame_rate_hz
+    turbulence = slope_turbulence(configuration, optics.sensor.layout.cells)
+    covariances = turbulence.lagged_px2(frame_s)
+    layered = SlopeModel.of_covariances(np.array([each.lagged_px2(frame_s) for each in turbulence.layers()]))
     plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
     slopes = np.random.default_rng(1).standard_normal(len(optics.interaction))
     errors = np.full(len(slopes), _NOISE_PX)
@@ -51,6 +52,10 @@ def small_table() -> Table:
     def predictive(line: CommandLine, *, steady: bool) -> Controller:
         predictor = SlopePredictor(model, errors**2, steady=steady)
         return Predictive(line, plant.interaction, predictor, clean)
+
+    def compiled(model: SlopeModel) -> Controller:
+        matrix, predictor = plant.reconstructor.matrix, SlopePredictor(model, errors**2)
+        return CompiledKalman(line(), plant.interaction, matrix, predictor, clean, 0.3, control.leak)
 
     controllers: dict[str, Controller] = {
         "integrator": plant.integrator(0.4, line()),
@@ -68,15 +73,8 @@ def small_table() -> Table:
             partial(predictive, steady=False),
             partial(plant.integrator, 0.3),
         ),
-        "the same, compiled": CompiledKalman(
-            line(),
-            plant.interaction,
-            plant.reconstructor.matrix,
-            SlopePredictor(model, errors**2),
-            clean,
-            0.3,
-            control.leak,
-        ),
+        "the same, compiled": compiled(model),
+        "the same, compiled, with four layers": compiled(layered),
         "Kalman filter, constant gain": predictive(line(), steady=True),
     }
     with pinned():
@@ -90,9 +88,10 @@ def small_table() -> Table:
 def sizes_table() -> Table:
     """Time the compiled filter with more slopes; each goes on by itself, which does not change the time."""
     rng = np.random.default_rng(1)
-    controllers, bytes_read = {}, {}
+    controllers: dict[str, Candidate] = {}
+    bytes_read = {}
     for slopes, commands in _SIZES:
-        alone = np.eye(slopes)
+        alone = np.eye(slopes)[None]
         predictor = SlopePredictor(SlopeModel(1.5 * alone, -0.6 * alone, 0.1 * alone), np.ones(slopes))
         interaction = rng.standard_normal((slopes, commands)) / np.sqrt(slopes)
         line = CommandLine(commands, 2, 1.0)

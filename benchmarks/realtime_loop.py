@@ -133,7 +133,7 @@ def _large() -> Table:
     }
     with pinned():
         times = interleaved(candidates, fewest=3)
-    rows = [
+    found = [
         Row(
             name,
             {
@@ -143,7 +143,7 @@ def _large() -> Table:
         )
         for name in candidates
     ]
-    return Table("realtime-commands-elt", f"{_ELT_SLOPES} slopes, {_ELT_COMMANDS} commands, one core", rows)
+    return Table("realtime-commands-elt", f"{_ELT_SLOPES} slopes, {_ELT_COMMANDS} commands, one core", found)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.control.control_cases import INTERACTION, MODEL, PLANT, telemetry
+from tests.control.control_cases import INTERACTION, LAYERS, MODEL, PLANT, telemetry
 
 from faintspot.control.commands import CommandLine
 from faintspot.control.compiled_kalman import STEPS, CompiledKalman
@@ -43,19 +43,22 @@ def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, *
 
 def noise(rng: np.random.Generator, largest: float) -> np.ndarray:
     """Return errors that differ by a factor of four between slopes; a tenth was not measured."""
-    error = np.minimum(0.5 * rng.uniform(0.5, 2.0, M), largest)
+    error: np.ndarray = np.minimum(0.5 * rng.uniform(0.5, 2.0, M), largest)
     error[rng.random(M) < 0.1] = np.inf
     return error
 
 
 @pytest.mark.parametrize("prior", [None, np.full(M, 0.5)])
 @pytest.mark.parametrize(("steps", "tolerance"), [(STEPS, 1e-3), (30, 1e-7)])
-def test_it_is_the_filter_in_numpy(prior: np.ndarray | None, steps: int, tolerance: float) -> None:
+@pytest.mark.parametrize("model", [MODEL, LAYERS], ids=["one layer", "two layers"])
+def test_it_is_the_filter_in_numpy(
+    model: SlopeModel, prior: np.ndarray | None, steps: int, tolerance: float
+) -> None:
     """Commands, of up to 1.5, and what is expected: three steps of conjugate gradients leave 3e-4 where noise
     differs that much, 30 steps only rounding.
     """
     rng, largest = np.random.default_rng(2), 0.45
-    controllers = both(steps=steps, prior_std_px=prior, noise_factor=1.3)
+    controllers = both(model, steps=steps, prior_std_px=prior, noise_factor=1.3)
     for slopes in FRAMES.open_loop_px:
         error = noise(rng, 9.0 if prior is None else largest)
         expected = []
@@ -116,7 +119,7 @@ def test_nothing_measured_nothing_learnt() -> None:
 
 def test_a_filter_that_runs_away_says_so() -> None:
     """With a model that grows without end, in the end numbers do not suffice; no such command goes out."""
-    _, (fast, line) = both(replace(MODEL, first=1e30 * np.eye(M)), largest=1e3)
+    _, (fast, line) = both(replace(MODEL, first=1e30 * np.eye(M)[None]), largest=1e3)
     for slopes in FRAMES.open_loop_px:
         try:
             fast.update(slopes, np.full(M, 0.5))

@@ -23,7 +23,7 @@ FRAMES = telemetry(600, 0.3)
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, Learnt]:
-    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES}) for kind in KINDS}
+    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES[None]}) for kind in KINDS}
 
 
 def commands(controller: Any, line: CommandLine, frames: int = 60) -> np.ndarray:
@@ -100,8 +100,10 @@ def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
     Control(INTERACTION).check_errors(Calibration())
     refused('prediction = "stream"', ControlOptions(controller="kalman", prediction="stream"))
     arrays = dict(np.load(path))
-    np.savez(path, **{**arrays, "first": arrays["first"][:4]})
-    refused("first: expected shape (18, 18), got (4, 18)", kalman)
+    np.savez(path, **{**arrays, "first": arrays["first"][0]})
+    refused("first: expected shape (1, 18, 18), got (18, 18)", kalman)
+    np.savez(path, **{**arrays, "first": np.tile(arrays["first"], (2, 1, 1))})
+    refused("second: expected shape (2, 18, 18), got (1, 18, 18)", kalman)
     np.savez(path, **{**arrays, "variance_px2": np.full(18, np.nan)})
     refused("variance_px2: expected finite numbers", kalman)
     np.savez(path, **{**arrays, "kind": "pid"})

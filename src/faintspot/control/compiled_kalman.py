@@ -13,7 +13,7 @@ from faintspot.control.base import Expected
 from faintspot.control.commands import CommandLine
 from faintspot.control.compiled import add_products
 from faintspot.control.guarded import CORRELATED_FRAMES, FEWEST_FRAMES, MEMORY_FRAMES, STANDARD_ERRORS
-from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor
+from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor, shares
 from faintspot.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
 from faintspot.kernels.compiling import Direct, compiled_with
 
@@ -27,8 +27,8 @@ _NO_PRIOR = np.zeros(0)
 
 # Rows of memory: slopes; and commands, of which the first four are what is turned into slopes.
 _HELD, _HELD_LEARNT, _HELD_PLAIN, _LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
-_VARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE = range(7, 14)
-_SLOPE_ROWS = 14
+_VARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, _PREDICTED = range(7, 15)
+_SLOPE_ROWS = 15
 _WAVEFRONT = 4
 _COMMAND_ROWS = 7
 # Of the guard: 1 where the plain one's commands go out; frames; mean difference of late, and its mean square.
@@ -42,16 +42,18 @@ class _Matrices(NamedTuple):
     """(commands, m)"""
     reconstruct: Any
     """(m, commands)"""
-    covariance: Any
-    """(m, 2 m): of the state's error with the slopes' before a frame is measured."""
+    with_slopes: Any
+    """(m, states): covariance of the state's error with the slopes' before a frame is measured."""
+    predicted: Any
+    """(m, m): of the slopes' error."""
     usual_inverse: Any
     """(m, m): of the slopes' covariance with their usual noise."""
     usual_variance: Any
     """(m,): its diagonal, before it was inverted."""
     onward: Any
-    """(2 m, m)"""
+    """(layers, 2 m, m)"""
     command: Any
-    """(2 m, commands): from the state."""
+    """(states, commands): from the state."""
 
 
 class _Lines(NamedTuple):
@@ -67,7 +69,7 @@ class _Memory(NamedTuple):
     """What goes on from frame to frame, and what is made in between."""
 
     state: Any
-    """(2 m,): [z[k], z[k - 1]] as predicted."""
+    """(layers, 2, m): as predicted for the coming frame."""
     guard: Any
     """(4,)"""
     slopes: Any
@@ -77,9 +79,7 @@ class _Memory(NamedTuple):
 
 
 @_compiled
-def _take(
-    slopes: Any, errors: Any, prior_std: Any, noise_factor: Any, state: Any, rows: Any, chosen: Any
-) -> None:
+def _take(slopes: Any, errors: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any) -> None:
     """Write what both controllers make of slopes; see `Guarded.update` and `telemetry.without_prior`."""
     for s in range(slopes.shape[0]):
         held, of_learnt, of_plain = rows[_HELD, s], rows[_HELD_LEARNT, s], rows[_HELD_PLAIN, s]
@@ -88,7 +88,7 @@ def _take(
         variance = max(errors[s] * errors[s], LEAST_VARIANCE_PX2)
         alone, trust = slopes[s], 1.0 if measured else 0.0
         if prior_std.shape[0] > 0:
-            expected = held - latest if chosen else held + state[s]
+            expected = held - latest if chosen else held + rows[_PREDICTED, s]
             prior = prior_std[s] * prior_std[s]
             share = max(prior / variance - 1.0, LEAST_SHARE)
             alone = expected + (slopes[s] - expected) * (1.0 + share) / share
@@ -102,7 +102,7 @@ def _take(
         noise = noise_factor * variance
         measured = measured and noise < LARGEST_VARIANCE_PX2
         rows[_VARIANCE, s] = noise if measured else math.inf
-        rows[_SURPRISE, s] = open_loop - state[s] if measured else 0.0
+        rows[_SURPRISE, s] = open_loop - rows[_PREDICTED, s] if measured else 0.0
 
 
 @_compiled
@@ -117,7 +117,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     variance, scale, left = rows[_VARIANCE], rows[_SCALE], rows[_SURPRISE]
     solution, direction = rows[_SOLUTION], rows[_DIRECTION]
     for s in range(m):
-        own = matrices.covariance[s, s]
+        own = matrices.predicted[s, s]
         scale[s] = math.sqrt(matrices.usual_variance[s] / (own + variance[s]))  # 0: not measured
         solution[s] = direction[s] = 0.0
     before = 0.0
@@ -137,7 +137,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
         for s in range(m):
             direction[s] = rows[_IMAGE, s] + more * direction[s]
             rows[_IMAGE, s] = 0.0
-        add_products(matrices.covariance[:, :m], rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
+        add_products(matrices.predicted, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
         curvature = 0.0
         for s in range(m):
             if scale[s] > 0.0:
@@ -154,15 +154,19 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
 def _advance(matrices: Any, memory: Any) -> None:
     """Correct the state, write the command that follows into the first row, and go on to the next frame."""
     state, rows, commands = memory.state, memory.slopes, memory.commands
-    m, both = rows.shape[1], state.reshape(1, state.shape[0])
-    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], both)
+    m, whole = rows.shape[1], state.reshape(1, state.size)
+    add_products(matrices.with_slopes, rows[_SOLUTION : _SOLUTION + 1], whole)
     commands[0] = 0.0
-    rows[_IMAGE] = 0.0
-    add_products(matrices.command, both, commands[:1])
-    add_products(matrices.onward, both, rows[_IMAGE : _IMAGE + 1])
-    for s in range(m):
-        state[m + s] = state[s]
-        state[s] = rows[_IMAGE, s]
+    add_products(matrices.command, whole, commands[:1])
+    rows[_PREDICTED] = 0.0
+    for layer in range(state.shape[0]):
+        rows[_IMAGE] = 0.0
+        both = state[layer].reshape(1, 2 * m)
+        add_products(matrices.onward[layer], both, rows[_IMAGE : _IMAGE + 1])
+        for s in range(m):
+            state[layer, 1, s] = state[layer, 0, s]
+            state[layer, 0, s] = rows[_IMAGE, s]
+            rows[_PREDICTED, s] += rows[_IMAGE, s]
 
 
 @_compiled
@@ -222,7 +226,7 @@ def follow(
         commands[_LATEST_PLAIN, c] = lines.plain[(of_plain + length - 1) % length, c]
     rows[:_LEFT_LEARNT] = 0.0
     add_products(matrices.interaction, commands[:_WAVEFRONT], rows[:_LEFT_LEARNT])
-    _take(slopes, errors, prior_std, noise_factor, memory.state, rows, chosen)
+    _take(slopes, errors, prior_std, noise_factor, rows, chosen)
     commands[_WAVEFRONT:] = 0.0
     add_products(matrices.reconstruct, rows[_LEFT_LEARNT : _FOR_PLAIN + 1], commands[_WAVEFRONT:])
     left_learnt, left_plain = 0.0, 0.0
@@ -297,22 +301,23 @@ class CompiledKalman:
         self._matrices = _Matrices(
             np.ascontiguousarray(interaction.T),
             np.ascontiguousarray(reconstruct.T),
-            np.ascontiguousarray(predictor.covariance[:, :slopes].T),
+            np.ascontiguousarray(predictor.with_slopes.T),
+            predictor.predicted_px2,
             np.linalg.inv(usual),
             np.diag(usual).copy(),
-            np.ascontiguousarray(predictor.model.both.T),
+            np.ascontiguousarray(predictor.model.both.swapaxes(1, 2)),
             np.ascontiguousarray(ahead.T),
         )
         self._lines = _Lines(line.rows, self._learnt.rows, self._plain.rows)
         self._memory = _Memory(
-            np.zeros(2 * slopes),
+            np.zeros((predictor.model.layers, 2, slopes)),
             np.zeros(4),
             np.zeros((_SLOPE_ROWS, slopes)),
             np.zeros((_COMMAND_ROWS, commands)),
         )
         self._memory.guard[_CHOSEN] = prefers_plain
         self._numbers = float(noise_factor), float(plain_gain), 1.0 - leak, float(line.largest), steps
-        self._std_px = predictor.std_px
+        self._std_px, self._shares = predictor.std_px, shares(predictor.model)
 
     @property
     def chosen(self) -> int:
@@ -325,7 +330,7 @@ class CompiledKalman:
         if self.chosen:
             return Expected(self._interaction @ (line.acting - self._plain.latest), None)
         mean = self._interaction @ line.acting
-        mean += self._memory.state[: len(mean)]
+        mean += self._memory.slopes[_PREDICTED]
         return Expected(mean, self._std_px)
 
     def begin(self) -> None:
@@ -333,7 +338,9 @@ class CompiledKalman:
         latest = self._line.latest
         for own in (self._learnt, self._plain):
             own.hold(latest)
-        self._memory.state[:] = np.tile(-(self._interaction @ latest), 2)
+        open_loop = -(self._interaction @ latest)
+        self._memory.state[:] = self._shares[:, None, None] * open_loop
+        self._memory.slopes[_PREDICTED] = open_loop
         self._memory.guard[_FRAMES:] = 0.0
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from faintspot.control.commands import CommandLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
-from faintspot.control.kalman import SlopePredictor
+from faintspot.control.kalman import SlopePredictor, steady_covariance
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
@@ -42,7 +42,8 @@ _OF_KIND = {
     POLC: ("now_px2", "ahead_px2", "gain"),
     KALMAN: ("first", "second", "driving_px2", "variance_px2"),
 }
-_SQUARE = {"now_px2", "ahead_px2", "first", "second", "driving_px2"}
+_SQUARE = {"now_px2", "ahead_px2"}
+_OF_LAYERS = {"first", "second", "driving_px2"}
 _OF_ALL = ("plain_gain", "noise_factor", "left")
 
 
@@ -73,7 +74,7 @@ class Model:
     kind: str
     arrays: Mapping[str, Floats]
     """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
-    (m, m), variance_px2 (m,) of the slopes' noise."""
+    (layers, m, m), variance_px2 (m,) of the slopes' noise."""
     plain_gain: float
     """Of the integrator that is fallen back to."""
     noise_factor: float
@@ -101,8 +102,21 @@ class Model:
 
     def predictor(self) -> SlopePredictor:
         """Return the filter of what "kalman" has learnt."""
-        model = SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
-        return SlopePredictor(model, self.arrays["variance_px2"])
+        model, variance = self._slopes, self.arrays["variance_px2"]
+        return SlopePredictor(model, variance, covariance=self._covariance)
+
+    def with_noise(self, scale: float) -> Model:
+        """Return what "kalman" would have learnt with the variances of the noise so many times as large."""
+        arrays = {**self.arrays, "variance_px2": scale * self.arrays["variance_px2"]}
+        return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor)
+
+    @cached_property
+    def _slopes(self) -> SlopeModel:
+        return SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
+
+    @cached_property
+    def _covariance(self) -> Floats:
+        return steady_covariance(self._slopes, self.arrays["variance_px2"])
 
     def save(self, path: str | Path) -> None:
         """Write it to a NumPy file (.npz).
@@ -131,6 +145,8 @@ class Model:
         slopes, modes = len(plant.interaction), plant.reconstructor.modes.shape[1]
         shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
         shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
+        layers = len(numbers["first"]) if kind == KALMAN and numbers["first"].ndim == 3 else 1
+        shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
         for name, array in numbers.items():
             if array.shape != shapes.get(name, ()):
                 raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")

@@ -116,7 +116,7 @@ def theories_of(
     winds = np.column_stack([speeds, np.zeros_like(speeds)])
     scale = (layout.pixel_scale_arcsec or 1.0) * _ARCSEC
     turbulence = SlopeTurbulence(positions, side, scale, 0.15, OUTER_SCALE_M, np.ones(len(speeds)), winds)
-    return {"winds from anywhere": turbulence.from_anywhere().lagged_px2(1 / frame_rate_hz)}
+    return {"winds from anywhere": turbulence.from_anywhere().lagged_px2(1 / frame_rate_hz)[None]}
 
 
 def _longest(frame: NDArray[np.int64], closed: NDArray[np.bool_]) -> tuple[int, int]:

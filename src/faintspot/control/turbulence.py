@@ -77,6 +77,20 @@ class SlopeTurbulence:
         """Return (3, 2 n, 2 n): `covariance_px2` for 0, 1 and 2 frames."""
         return np.array([self.covariance_px2(lag * frame_s) for lag in range(3)])
 
+    def layers(self) -> list[Self]:
+        """Return each layer by itself, as strong as it is."""
+        part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
+        return [
+            replace(
+                self,
+                r0_m=self.r0_m * strength ** (-3 / 5),
+                fraction=np.ones(1),
+                wind_m_per_s=np.asarray(self.wind_m_per_s)[[number]],
+            )
+            for number, strength in enumerate(part)
+            if strength > 0
+        ]
+
     def from_anywhere(self) -> Self:
         """Return the same with winds of these speeds from all directions alike."""
         angles = 2 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
