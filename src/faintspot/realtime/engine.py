@@ -29,7 +29,7 @@ from faintspot.realtime.workers import Workers
 from faintspot.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher
-_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer
+_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether sources and streams are there takes longer
 DEADLINE_S = 1e-3
 IMAGES_EVERY = 100
 
@@ -349,6 +349,8 @@ class Engine:
         self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
         if self._light is not None:
             self._light.take(slopes.flux)
+        if self._streams.commands_lost:
+            counters.commands_renewed += self._streams.renew_commands()
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
@@ -409,6 +411,8 @@ class Engine:
             self.live.let_go()
             if self._prediction is not None:
                 self._prediction.look_after()
+            if looks % _LOOKS_BETWEEN_STALE == 0 and self._streams.commands_obstacle():
+                self._streams.commands_lost = True
             loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
