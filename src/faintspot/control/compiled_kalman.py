@@ -44,6 +44,8 @@ class _Matrices(NamedTuple):
     """(m, commands)"""
     covariance: Any
     """(m, 2 m): of the state's error with the slopes' before a frame is measured."""
+    uncertainty: Any
+    """(m, m): of these slopes alone, side by side for its own products."""
     usual_inverse: Any
     """(m, m): of the slopes' covariance with their usual noise."""
     usual_variance: Any
@@ -117,7 +119,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     variance, scale, left = rows[_VARIANCE], rows[_SCALE], rows[_SURPRISE]
     solution, direction = rows[_SOLUTION], rows[_DIRECTION]
     for s in range(m):
-        own = matrices.covariance[s, s]
+        own = matrices.uncertainty[s, s]
         scale[s] = math.sqrt(matrices.usual_variance[s] / (own + variance[s]))  # 0: not measured
         solution[s] = direction[s] = 0.0
     before = 0.0
@@ -137,7 +139,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
         for s in range(m):
             direction[s] = rows[_IMAGE, s] + more * direction[s]
             rows[_IMAGE, s] = 0.0
-        add_products(matrices.covariance[:, :m], rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
+        add_products(matrices.uncertainty, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
         curvature = 0.0
         for s in range(m):
             if scale[s] > 0.0:
@@ -347,6 +349,7 @@ class CompiledKalman:
             np.ascontiguousarray(interaction.T),
             np.ascontiguousarray(reconstruct.T),
             np.ascontiguousarray(predictor.covariance[:, :slopes].T),
+            np.ascontiguousarray(predictor.covariance[:slopes, :slopes]),
             np.linalg.inv(usual),
             np.diag(usual).copy(),
             np.ascontiguousarray(predictor.model.both.T),
