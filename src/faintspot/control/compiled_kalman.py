@@ -1,4 +1,7 @@
-"""The guarded Kalman filter in compiled code: from a frame's slopes to a command in one call."""
+"""The guarded Kalman filter in compiled code: from a frame's slopes to a command in one call.
+
+What it does is written in NumPy in `guarded`, `predictive`, `kalman` and `telemetry`.
+"""
 
 from __future__ import annotations
 
@@ -320,6 +323,8 @@ class CompiledKalman:
         What to multiply the variances of standard errors by.
     prefers_plain : bool
         Whether the integrator begins.
+    steps : int
+        Of conjugate gradients.
     """
 
     undoes_prior = False

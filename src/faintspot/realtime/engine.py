@@ -29,7 +29,7 @@ from faintspot.realtime.workers import Workers
 from faintspot.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher
-_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether sources and streams are there takes longer
+_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer
 DEADLINE_S = 1e-3
 IMAGES_EVERY = 100
 
@@ -411,8 +411,8 @@ class Engine:
             self.live.let_go()
             if self._prediction is not None:
                 self._prediction.look_after()
-            if looks % _LOOKS_BETWEEN_STALE == 0 and self._streams.commands_obstacle():
-                self._streams.commands_lost = True
+            if looks % _LOOKS_BETWEEN_STALE == 0:
+                self._streams.look_after_commands()
             loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):

@@ -99,6 +99,14 @@ def create_stream(
         raise InputError(f"{name}: this stream cannot be made ({text})") from None
 
 
+def generation(name: str) -> int | None:
+    """Return a number that changes when a stream is made anew, None where there is none; it takes some us."""
+    try:
+        return os.stat(FOLDER / _base(name)).st_ino
+    except OSError:
+        return None
+
+
 @contextmanager
 def held(*streams: Any) -> Iterator[None]:
     """Keep the locks of streams, which only writers need, while publishing: readers do not wait for them.

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.telemetry_rows import fill_telemetry_rows
-from faintspot.realtime.shared_streams import LOCK_LIMIT_S, create_stream, held, lock_file, pyshmem_module
+from faintspot.realtime.shared_streams import (
+    LOCK_LIMIT_S,
+    create_stream,
+    generation,
+    held,
+    lock_file,
+    pyshmem_module,
+)
 from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -62,9 +69,10 @@ class SlopeStreams:
             self._commands = create_stream(stream, (commands,)) if commands else None
             undo.pop_all()
         self._of_commands = stream, (commands,)
+        self._generation = generation(stream)
         self._commands_lock = ExitStack()
         self.commands_lost = False
-        """Whether to make the stream of commands anew; for any thread to set."""
+        """Whether to make the stream of commands anew."""
         self._n, self._closed = n, False
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
@@ -108,8 +116,13 @@ class SlopeStreams:
             self._commands_lock.enter_context(held(new))
         except InputError:
             return False
-        self._commands = new
+        self._commands, self._generation = new, generation(new.name)
         return True
+
+    def look_after_commands(self) -> None:
+        """Have the stream of commands made anew where it was removed; by any thread."""
+        if self._of_commands[1][0] and generation(self._of_commands[0]) != self._generation:
+            self.commands_lost = True
 
     def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int, int]:
         """Publish what else is known of each slope; by the thread that holds the streams.
