@@ -101,7 +101,7 @@ def sizes_table() -> Table:
         controllers[name] = partial(
             filtered.update, 0.1 * rng.standard_normal(slopes), rng.uniform(0.5, 1.5, slopes)
         )
-        bytes_read[name] = 8 * slopes * (10 * slopes + 4 * commands)
+        bytes_read[name] = 8 * slopes * (12 * slopes + 5 * commands)
     with pinned():
         times = interleaved(controllers)
     rows = [

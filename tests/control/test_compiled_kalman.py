@@ -49,12 +49,12 @@ def noise(rng: np.random.Generator, largest: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("prior", [None, np.full(M, 0.5)])
-@pytest.mark.parametrize(("steps", "tolerance"), [(STEPS, 1e-3), (30, 1e-7)])
+@pytest.mark.parametrize(("steps", "tolerance"), [(STEPS, 3e-4), (30, 1e-7)])
 @pytest.mark.parametrize("model", [MODEL, LAYERS], ids=["one layer", "two layers"])
 def test_it_is_the_filter_in_numpy(
     model: SlopeModel, prior: np.ndarray | None, steps: int, tolerance: float
 ) -> None:
-    """Commands, of up to 1.5, and what is expected: three steps of conjugate gradients leave 3e-4 where noise
+    """Commands, of up to 1.5, and what is expected: four steps of conjugate gradients leave 1e-4 where noise
     differs that much, 30 steps only rounding.
     """
     rng, largest = np.random.default_rng(2), 0.45
@@ -81,14 +81,15 @@ def test_nonsense_is_replaced_by_the_integrator() -> None:
     plain = PLANT.integrator(GAIN, line)
     took_over = 0
     for number, slopes in enumerate(FRAMES.open_loop_px[:300]):
+        plainly = fast.chosen
         for controller, own in ((slow, one), (fast, other), (plain, line)):
             controller.update(slopes + INTERACTION @ own.acting, np.full(M, 0.5))
-        assert fast.chosen == slow.chosen
-        took_over = took_over or (number if fast.chosen else 0)
-        if fast.chosen:
+        if plainly:
+            took_over = took_over or number
             np.testing.assert_allclose(other.latest, line.latest, rtol=0, atol=1e-9)
             assert fast.expected().std_px is None
-            np.testing.assert_allclose(fast.expected().mean_px, slow.expected().mean_px, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(fast.expected().mean_px, slow.expected().mean_px, rtol=0, atol=2e-3)
+        assert fast.chosen == slow.chosen
     assert 49 <= took_over < 200
     assert np.abs(line.latest).max() <= 0.8
 

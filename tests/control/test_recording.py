@@ -45,6 +45,7 @@ def recording(frames: int = 700) -> Any:
     slopes_px = np.array(slopes, np.float32)[kept]
     error = np.full((len(kept), 9), 0.3 * GAIN, np.float32)
     return SimpleNamespace(
+        attributes={"arms": ["set"]},
         frame=kept,
         loop=np.where(kept < 40, 1, 2),
         commands=np.array(sent, np.float32)[kept],
@@ -92,6 +93,10 @@ def test_what_is_refused() -> None:
     told = Control(INTERACTION, None, OPTIONS.replaced({"prediction": "stream"}))
     with pytest.raises(InputError, match="expected a loop closed with an integrator"):
         telemetry_of_recording(recording(), told, np.full(18, 0.3))
+    night = recording()
+    night.attributes["arms"] = ["window+integrator", "map+kalman"]
+    with pytest.raises(InputError, match="expected a loop closed with an integrator"):
+        telemetry_of_recording(night, CONTROL, np.full(18, 0.3))
     for changes, message in (
         ({"commands": np.zeros((699, 0))}, "expected 12 commands, as the interaction matrix has, got 0"),
         ({"loop": np.ones(699)}, "expected 202 frames in a row with a closed loop, got 0"),

@@ -98,6 +98,7 @@ def run(
     \b
     On sky, with and without, 50 frames each (NAME_marks says which):
       faintspot realtime run --interleave none,tv --every 50
+      faintspot realtime run --close-loop --interleave window+integrator,map+kalman --every 250
     """
     from faintspot import configuration
     from faintspot.control.configuration import load_control

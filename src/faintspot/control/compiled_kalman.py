@@ -1,4 +1,7 @@
-"""The guarded Kalman filter in compiled code: from a frame's slopes to a command in one call."""
+"""The guarded Kalman filter in compiled code: from a frame's slopes to a command in one call.
+
+What it does is written in NumPy in `guarded`, `predictive`, `kalman` and `telemetry`.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +24,15 @@ Floats = NDArray[np.float64]
 
 _compiled = partial(compiled_with, source=__file__)
 
-STEPS = 3
+STEPS = 4
 """Of conjugate gradients, for how much each slope corrects."""
 _NO_PRIOR = np.zeros(0)
 
-# Rows of memory: slopes; and commands, of which the first four are what is turned into slopes.
+# Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
 _HELD, _HELD_LEARNT, _HELD_PLAIN, _LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
 _VARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, _PREDICTED = range(7, 15)
 _SLOPE_ROWS = 15
-_WAVEFRONT = 4
+_MADE, _LEFT = 4, 5
 _COMMAND_ROWS = 7
 # Of the guard: 1 where the plain one's commands go out; frames; mean difference of late, and its mean square.
 _CHOSEN, _FRAMES, _MEAN, _SQUARE = range(4)
@@ -42,9 +45,9 @@ class _Matrices(NamedTuple):
     """(commands, m)"""
     reconstruct: Any
     """(m, commands)"""
-    with_slopes: Any
-    """(m, states): covariance of the state's error with the slopes' before a frame is measured."""
-    predicted: Any
+    covariance: Any
+    """(m, states): of the state's error with the slopes' before a frame is measured."""
+    uncertainty: Any
     """(m, m): of the slopes' error."""
     usual_inverse: Any
     """(m, m): of the slopes' covariance with their usual noise."""
@@ -117,7 +120,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
     variance, scale, left = rows[_VARIANCE], rows[_SCALE], rows[_SURPRISE]
     solution, direction = rows[_SOLUTION], rows[_DIRECTION]
     for s in range(m):
-        own = matrices.predicted[s, s]
+        own = matrices.uncertainty[s, s]
         scale[s] = math.sqrt(matrices.usual_variance[s] / (own + variance[s]))  # 0: not measured
         solution[s] = direction[s] = 0.0
     before = 0.0
@@ -137,7 +140,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
         for s in range(m):
             direction[s] = rows[_IMAGE, s] + more * direction[s]
             rows[_IMAGE, s] = 0.0
-        add_products(matrices.predicted, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
+        add_products(matrices.uncertainty, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
         curvature = 0.0
         for s in range(m):
             if scale[s] > 0.0:
@@ -151,22 +154,45 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
 
 
 @_compiled
+def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) -> float:
+    """Correct the state, and write the command that follows; return its sum before it is cut."""
+    rows = memory.slopes
+    whole = memory.state.reshape(1, memory.state.size)
+    _solve(matrices, rows, steps)
+    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], whole)
+    made, total = memory.commands[_MADE : _MADE + 1], 0.0
+    made[:] = 0.0
+    add_products(matrices.command, whole, made)
+    for c in range(command.shape[0]):
+        total += made[0, c]
+        command[c] = min(max(made[0, c], -largest), largest)
+    return total
+
+
+@_compiled
+def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> None:
+    """Write the integrator's command."""
+    made = memory.commands[_MADE : _MADE + 1]
+    made[:] = 0.0
+    add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], made)
+    for c in range(command.shape[0]):
+        wanted = keep * memory.commands[_LATEST_PLAIN, c] - gain * made[0, c]
+        command[c] = min(max(wanted, -largest), largest)
+
+
+@_compiled
 def _advance(matrices: Any, memory: Any) -> None:
-    """Correct the state, write the command that follows into the first row, and go on to the next frame."""
-    state, rows, commands = memory.state, memory.slopes, memory.commands
-    m, whole = rows.shape[1], state.reshape(1, state.size)
-    add_products(matrices.with_slopes, rows[_SOLUTION : _SOLUTION + 1], whole)
-    commands[0] = 0.0
-    add_products(matrices.command, whole, commands[:1])
+    """Take the filter's state on to the next frame."""
+    state, rows = memory.state, memory.slopes
+    now, m = rows[_SPARE : _SPARE + 1], rows.shape[1]
     rows[_PREDICTED] = 0.0
     for layer in range(state.shape[0]):
-        rows[_IMAGE] = 0.0
-        both = state[layer].reshape(1, 2 * m)
-        add_products(matrices.onward[layer], both, rows[_IMAGE : _IMAGE + 1])
+        now[:] = 0.0
+        add_products(matrices.onward[layer], state[layer].reshape(1, 2 * m), now)
         for s in range(m):
             state[layer, 1, s] = state[layer, 0, s]
-            state[layer, 0, s] = rows[_IMAGE, s]
-            rows[_PREDICTED, s] += rows[_IMAGE, s]
+            state[layer, 0, s] = now[0, s]
+            rows[_PREDICTED, s] += now[0, s]
 
 
 @_compiled
@@ -186,21 +212,41 @@ def _choose(guard: Any, learnt: Any, plain: Any) -> None:
 
 
 @_compiled
+def hold(matrices: Any, lines: Any, places: Any, memory: Any) -> None:
+    """Write what the commands that act in the coming frame add to slopes.
+
+    Parameters
+    ----------
+    matrices : _Matrices
+    lines : _Lines
+    places : (int, int, int)
+        Where the lines' next commands go.
+    memory : _Memory
+    """
+    rows, commands, length = memory.slopes, memory.commands, lines.true.shape[0]
+    here, of_learnt, of_plain = places
+    for c in range(commands.shape[1]):
+        commands[_HELD, c] = lines.true[(here + 1) % length, c]
+        commands[_HELD_LEARNT, c] = lines.learnt[(of_learnt + 1) % length, c]
+        commands[_HELD_PLAIN, c] = lines.plain[(of_plain + 1) % length, c]
+        commands[_LATEST_PLAIN, c] = lines.plain[(of_plain + length - 1) % length, c]
+    rows[: _LATEST_PLAIN + 1] = 0.0
+    add_products(matrices.interaction, commands[: _LATEST_PLAIN + 1], rows[: _LATEST_PLAIN + 1])
+
+
+@_compiled
 def follow(
     slopes: Any,
     errors: Any,
     prior_std: Any,
     noise_factor: Any,
-    gain: Any,
-    keep: Any,
-    largest: Any,
-    steps: Any,
+    numbers: Any,
     matrices: Any,
     lines: Any,
     places: Any,
     memory: Any,
 ) -> float:
-    """Write the next command of both controllers and of the mirror; return the sum of the filter's.
+    """Write the mirror's next command, which is that of one of the controllers; return the filter's sum.
 
     Parameters
     ----------
@@ -208,45 +254,47 @@ def follow(
         Finite; infinite error: not measured.
     prior_std : (m,) or (0,) float64 array
         Prior of the estimator; none.
-    noise_factor, gain, keep, largest : float
-        Of the errors' variances; the integrator's gain, and what it keeps of its command; stroke.
-    steps : int
-        Of conjugate gradients.
-    matrices, lines, memory
-    places : (int, int, int)
-        Where the lines' next commands go.
+    noise_factor : float
+        Of the errors' variances.
+    numbers : (float, float, float, int)
+        The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients.
+    matrices, lines, places, memory
+        As for `hold`, which was called before.
     """
-    rows, commands = memory.slopes, memory.commands
     here, of_learnt, of_plain = places
-    length, chosen = lines.true.shape[0], memory.guard[_CHOSEN] > 0.0
-    for c in range(commands.shape[1]):
-        commands[_HELD, c] = lines.true[(here + 1) % length, c]
-        commands[_HELD_LEARNT, c] = lines.learnt[(of_learnt + 1) % length, c]
-        commands[_HELD_PLAIN, c] = lines.plain[(of_plain + 1) % length, c]
-        commands[_LATEST_PLAIN, c] = lines.plain[(of_plain + length - 1) % length, c]
-    rows[:_LEFT_LEARNT] = 0.0
-    add_products(matrices.interaction, commands[:_WAVEFRONT], rows[:_LEFT_LEARNT])
-    _take(slopes, errors, prior_std, noise_factor, rows, chosen)
-    commands[_WAVEFRONT:] = 0.0
-    add_products(matrices.reconstruct, rows[_LEFT_LEARNT : _FOR_PLAIN + 1], commands[_WAVEFRONT:])
-    left_learnt, left_plain = 0.0, 0.0
-    for c in range(commands.shape[1]):
-        left_learnt += commands[_WAVEFRONT, c] * commands[_WAVEFRONT, c]
-        left_plain += commands[_WAVEFRONT + 1, c] * commands[_WAVEFRONT + 1, c]
-    _choose(memory.guard, left_learnt, left_plain)
-    _solve(matrices, rows, steps)
-    _advance(matrices, memory)
+    gain, keep, largest, steps = numbers
     plainly, total = memory.guard[_CHOSEN] > 0.0, 0.0
-    for c in range(commands.shape[1]):
-        own, other = commands[0, c], keep * commands[_LATEST_PLAIN, c] - gain * commands[_WAVEFRONT + 2, c]
-        total += own
-        own, other = min(max(own, -largest), largest), min(max(other, -largest), largest)
-        lines.learnt[of_learnt, c], lines.plain[of_plain, c] = own, other
-        lines.true[here, c] = other if plainly else own
+    _take(slopes, errors, prior_std, noise_factor, memory.slopes, plainly)
+    if plainly:
+        _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
+    else:
+        total = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
+    for c in range(lines.true.shape[1]):
+        lines.true[here, c] = lines.plain[of_plain, c] if plainly else lines.learnt[of_learnt, c]
     return total
 
 
-_FOLLOW = Direct(follow)
+@_compiled
+def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> None:
+    """Do what is left of a frame when the mirror's command is out: the other one's, the guard, the state."""
+    _, of_learnt, of_plain = places
+    gain, keep, largest, steps = numbers
+    if memory.guard[_CHOSEN] > 0.0:
+        _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
+    else:
+        _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
+    left = memory.commands[_LEFT : _LEFT + 2]
+    left[:] = 0.0
+    add_products(matrices.reconstruct, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
+    learnt, plain = 0.0, 0.0
+    for c in range(left.shape[1]):
+        learnt += left[0, c] * left[0, c]
+        plain += left[1, c] * left[1, c]
+    _choose(memory.guard, learnt, plain)
+    _advance(matrices, memory)
+
+
+_HOLD, _FOLLOW, _GO_ON = Direct(hold), Direct(follow), Direct(go_on)
 
 
 class CompiledKalman:
@@ -254,6 +302,9 @@ class CompiledKalman:
 
     How much each slope corrects follows the noise of each frame, as in `SlopePredictor`; in place of solving
     its equations to the end it takes `STEPS` steps of conjugate gradients, which is products with matrices.
+
+    Before a command goes out, only that is done which needs the frame's slopes: the rest when somebody asks
+    what is expected next, or with the next `update`.
 
     Parameters
     ----------
@@ -273,6 +324,8 @@ class CompiledKalman:
         What to multiply the variances of standard errors by.
     prefers_plain : bool
         Whether the integrator begins.
+    steps : int
+        Of conjugate gradients.
     """
 
     undoes_prior = False
@@ -316,22 +369,26 @@ class CompiledKalman:
             np.zeros((_COMMAND_ROWS, commands)),
         )
         self._memory.guard[_CHOSEN] = prefers_plain
-        self._numbers = float(noise_factor), float(plain_gain), 1.0 - leak, float(line.largest), steps
+        self._noise_factor = float(noise_factor)
+        self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
+        self._is_behind = False
+        self._held_at = -1
+        """Where the line was when what acts was turned into slopes."""
 
     @property
     def chosen(self) -> int:
         """0: the filter's commands go out; 1: the integrator's."""
+        self._catch_up()
         return int(self._memory.guard[_CHOSEN])
 
     def expected(self) -> Expected:
         """See `Controller`."""
-        line = self._line
-        if self.chosen:
-            return Expected(self._interaction @ (line.acting - self._plain.latest), None)
-        mean = self._interaction @ line.acting
-        mean += self._memory.slopes[_PREDICTED]
-        return Expected(mean, self._std_px)
+        self._catch_up()
+        rows = self._memory.slopes
+        if self._memory.guard[_CHOSEN]:
+            return Expected(rows[_HELD] - rows[_LATEST_PLAIN], None)
+        return Expected(rows[_HELD] + rows[_PREDICTED], self._std_px)
 
     def begin(self) -> None:
         """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
@@ -342,6 +399,7 @@ class CompiledKalman:
         self._memory.state[:] = self._shares[:, None, None] * open_loop
         self._memory.slopes[_PREDICTED] = open_loop
         self._memory.guard[_FRAMES:] = 0.0
+        self._is_behind, self._held_at = False, -1
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`.
@@ -351,18 +409,34 @@ class CompiledKalman:
         ArithmeticError
             When the filter's numbers have become too large.
         """
-        prior, places = self.prior_std_px, (self._line.place, self._learnt.place, self._plain.place)
+        self._catch_up()
+        prior = self.prior_std_px
         total = _FOLLOW(
             slopes_px,
             standard_error_px,
             _NO_PRIOR if prior is None else prior,
-            *self._numbers,
+            self._noise_factor,
+            self._numbers,
             self._matrices,
             self._lines,
-            places,
+            self._places(),
             self._memory,
         )
         if not math.isfinite(total):
             raise ArithmeticError("its commands were not finite")
-        for line in (self._line, self._learnt, self._plain):
-            line.sent()
+        self._line.sent()
+        self._is_behind = True
+
+    def _catch_up(self) -> None:
+        """Do what is left of the frame before."""
+        if self._is_behind:
+            _GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
+            self._learnt.sent()
+            self._plain.sent()
+            self._is_behind, self._held_at = False, -1
+        if self._held_at != self._line.place:
+            _HOLD(self._matrices, self._lines, self._places(), self._memory)
+            self._held_at = self._line.place
+
+    def _places(self) -> tuple[int, int, int]:
+        return self._line.place, self._learnt.place, self._plain.place

@@ -93,11 +93,11 @@ class Guarded:
             residual = open_loop + self._interaction @ line.acting
             left.append(float(np.square(self._reconstruct @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error)
-        self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
         self._line.put(self._lines[self.chosen].latest)
+        self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
 
     def _choose(self, difference: float) -> None:
-        """Change places where the mean difference of late, -1 to 1, is beyond its error."""
+        """Change places, from the next frame on, where the mean difference of late is beyond its error."""
         self._frames += 1
         share = 1 / min(self._frames, MEMORY_FRAMES)
         self._difference += share * (np.array([difference, difference**2]) - self._difference)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import numbers_between
 from faintspot.control.configuration import NONE, STREAM, Control
-from faintspot.control.learnt import INTEGRATOR, MODAL
+from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
 from faintspot.control.telemetry import Telemetry, make_telemetry
 from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
@@ -62,7 +62,9 @@ def telemetry_of_recording(
             f"{commands.shape[1]}"
         )
     predicted = prior_std_px is not None and control.prediction != NONE
-    if predicted and (control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM):
+    unknown = control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM
+    in_turn = any(str(arm).endswith(f"+{KALMAN}") for arm in recording.attributes.get("arms", []))
+    if (predicted and unknown) or (prior_std_px is not None and in_turn):
         raise InputError(
             "recording: expected a loop closed with an integrator, as what another controller or program has "
             "told the estimator to expect was not recorded"

@@ -206,8 +206,9 @@ class ControlLoop:
         if kind in self._ready:
             return
         control = self.control.with_controller(kind)
-        tried = control.controller(control.line())
-        tried.update(np.zeros(len(control.interaction)), np.ones(len(control.interaction)))  # compiled now
+        tried = control.controller(control.line())  # so that everything is compiled
+        tried.update(np.zeros(len(control.interaction)), np.ones(len(control.interaction)))
+        tried.expected()
         self._ready[kind] = _Ready.of(control, self._line)
 
     @property

@@ -349,6 +349,8 @@ class Engine:
         self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
         if self._light is not None:
             self._light.take(slopes.flux)
+        if self._streams.commands_lost:
+            counters.commands_renewed += self._streams.renew_commands()
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
@@ -409,6 +411,8 @@ class Engine:
             self.live.let_go()
             if self._prediction is not None:
                 self._prediction.look_after()
+            if looks % _LOOKS_BETWEEN_STALE == 0:
+                self._streams.look_after_commands()
             loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
