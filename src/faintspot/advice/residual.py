@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.advice.seen import Seen
-from faintspot.compare.statistics import Estimate
-from faintspot.recorded.telemetry_numbers import compared_arms
+from faintspot.compare.statistics import Estimate, paired_mean
+from faintspot.loop.statistics import neighbour_differences
 from faintspot.sensor.layout import Layout
 from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.wavefront.fit import fit_wavefront
 
 Floats = NDArray[np.float64]
 
+_FEWEST_TURNS = 4
 SETTLE_FRAMES = 20
 """Of a turn, in which the loop forgets the arm before."""
 
@@ -71,23 +72,32 @@ def residual_wavefront(seen: Seen, modes: Floats, gains: Sequence[float] | None 
 
 
 def compared_residual(seen: Seen, left: Floats, gain_errors: Sequence[float] = (0.0, 0.0)) -> Estimate:
-    """Return by how much the second of two arms leaves more than the first, turn by turn.
+    """Return by how much arm 1 leaves more than arm 0, in turn with it.
+
+    Each turn of arm 1 is compared with the straight line between the turns of arm 0 before and after it.
+    The interval is Student's t, as if these differences were independent: they nearly are, as the air's slow
+    changes cancel.
 
     Parameters
     ----------
     seen : Seen
-        With two arms in turn.
     left : (frames,) array
         See `residual_wavefront`.
     gain_errors : two floats
         Relative errors of the centroid gains that `left` rests on.
     """
-    numbers = np.unique(seen.arm)
-    first, second = compared_arms(seen.arm, [str(number) for number in numbers], left)
-    found = second.difference
-    assert found is not None
+    turns, first, of_frame = np.unique(seen.turn, return_index=True, return_inverse=True)
+    kept = np.isfinite(left)
+    count = np.bincount(of_frame, weights=kept, minlength=len(turns))
+    sums = np.bincount(of_frame, weights=np.where(kept, left, 0.0), minlength=len(turns))
+    full = count >= 0.5 * np.median(count)
+    means, arm = sums[full] / count[full], seen.arm[first][full]
+    if len(means) < _FEWEST_TURNS or len(set(arm.tolist())) < 2:
+        return Estimate(math.nan)
+    apart = neighbour_differences(means, np.arange(len(means), dtype=np.float64), arm == 0)
+    found = paired_mean(apart[np.isfinite(apart)])
     of_gains = math.hypot(
-        *(2 * error * each.mean.value for error, each in zip(gain_errors, (first, second), strict=True))
+        *(2 * error * means[arm == number].mean() for number, error in enumerate(gain_errors))
     )
     if not math.isfinite(found.standard_error) or of_gains == 0:
         return found

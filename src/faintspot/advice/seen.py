@@ -1,4 +1,4 @@
-"""What a closed loop has seen, from a recording of an engine or from a simulated run."""
+"""What a closed loop has seen, from telemetry."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from faintspot.control.learnt import INTEGRATOR, MODAL
 from faintspot.control.telemetry import without_prior
 from faintspot.errors import InputError
 from faintspot.io.telemetry import Telemetry
-from faintspot.loop.arms import LoopArm
-from faintspot.loop.control import prior_std_px
-from faintspot.loop.record import LoopRecord
 
 Floats = NDArray[np.float64]
 
@@ -126,28 +123,13 @@ def seen_in_telemetry(
     if not np.isfinite(error).any():
         raise InputError("telemetry: expected standard errors of slopes; give the calibration a read noise")
     gain, frame, arm = control.options.centroid_gain, telemetry.frame[rows], telemetry.arm[rows]
-    alone = _alone(telemetry.slopes[rows].astype(np.float64) / gain, error / gain, expected, arm, priors_px)
+    alone = without_priors(
+        telemetry.slopes[rows].astype(np.float64) / gain, error / gain, expected, arm, priors_px
+    )
     times = telemetry.last_row_time_ns[rows]
     rate = (frame[-1] - frame[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
     apart = (np.diff(arm) != 0) | (np.diff(frame) != 1)
     return Seen(arm, np.concatenate([[0], np.cumsum(apart)]), *alone, acting, float(rate))
-
-
-def seen_in_record(record: LoopRecord, arms: Sequence[LoopArm]) -> Seen:
-    """Return what a simulated loop has seen after settling; its slopes divided as the loop does it."""
-    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
-    later, arm = record.delay_frames - 1, record.arm.astype(np.int64)
-    expected = np.zeros_like(held)
-    expected[: len(held) - later] = held[: len(held) - later] - held[later:]
-    predicts = np.array([each.predict_prior for each in arms])[arm]
-    expected[~predicts] = 0.0
-    divisor = np.where(record.corrected, record.centroid_gain, 1.0)[arm][:, None]
-    priors = [prior_std_px(each, held.shape[1]) for each in arms]
-    slopes, error = (each / divisor for each in (record.slopes_px, record.standard_error_px))
-    alone = _alone(slopes.astype(np.float64), error.astype(np.float64), expected, arm, priors)
-    turn = np.concatenate([[0], np.cumsum(np.diff(arm) != 0)])
-    seen = Seen(arm, turn, *alone, held, record.frame_rate_hz)
-    return seen.chosen(record.scored & (np.arange(record.frames) < record.frames - later))
 
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
@@ -159,7 +141,7 @@ def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
     return np.flatnonzero(whole) + delay
 
 
-def _alone(
+def without_priors(
     slopes: Floats,
     error: Floats,
     expected: Floats,
