@@ -17,6 +17,7 @@ from faintspot.io.telemetry import Telemetry
 Floats = NDArray[np.float64]
 
 _CLOSED = 2
+_EVEN_TRUST = 0.2  # above it weights are equal: the best spots alone would tell of the best moments
 FEWEST_FRAMES = 200
 
 
@@ -73,8 +74,9 @@ class Seen:
         residual, open_loop = np.empty_like(self.slopes_px), np.empty_like(self.slopes_px)
         for arm in np.unique(self.arm):
             rows = self.arm == arm
-            mean = self.trust[rows].mean(axis=0)
-            weight = self.trust[rows] / np.where(mean > 0, mean, 1.0)
+            trust = np.minimum(self.trust[rows], _EVEN_TRUST)
+            mean = trust.mean(axis=0)
+            weight = trust / np.where(mean > 0, mean, 1.0)
             gain = 1.0 if gains is None else gains[arm]
             residual[rows] = weight * self.slopes_px[rows] / gain
             open_loop[rows] = residual[rows] - weight * self.held_px[rows]
