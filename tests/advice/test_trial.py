@@ -124,6 +124,9 @@ def test_advice_from_the_command_line(
     assert lines[0].endswith("frames with brightest")
     for name in ("light", "read noise", "width of the spots", "centroid gain", "r0", "wind", "vibrations"):
         assert any(line.startswith(f"  {name}") for line in lines), told.out
+    assert loop.ask("status")["advice"] == lines[:-1]
+    with pytest.raises(InputError, match="lines = 3: expected a list of texts"):
+        loop.ask("advice", lines=3)
     journal = json.loads(path.with_suffix(".advice.json").read_text())
     assert journal[-1]["name"] == loop.name
     known = {each["name"]: each for each in journal[-1]["known"]}

@@ -12,6 +12,7 @@ from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.errors import InputError
 
 if TYPE_CHECKING:
+    from faintspot.advice.advising import Advice
     from faintspot.advice.trial import Loop
     from faintspot.settings import Settings
 
@@ -70,19 +71,35 @@ def advise(config: str, name: str, seconds: float, store: Path | None, tries: bo
             return
         with progress_bar("planner", "steps") as advance:
             advice = advised(loop, telemetry, settings, gain, advance)
-        click.echo(f"{advice.frames} frames with {settings.estimator.name}")
-        for known in advice.known:
-            click.echo(f"  {known.in_words()}")
-        if not advice.proposals:
-            click.echo("nothing to propose")
-        for proposal in advice.proposals:
-            click.echo(f"{proposal.text}: {proposal.promise}")
+        said = _said(advice, settings)
+        click.echo("\n".join(said))
+        told = store is None and _tell(loop, said)
         try:
             if tries:
                 apply(loop, advice, 3 * seconds, stop, click.echo)
         finally:
+            if told:
+                tried = zip(advice.proposals, advice.verdicts, strict=False)
+                _tell(loop, [*said, *(f"{each.text}: {how.in_words(loop.unit)}" for each, how in tried)])
             place = write_journal(config, advice.entry(name, loop.unit))
             click.echo(f"{place} written")
+
+
+def _said(advice: Advice, settings: Settings) -> list[str]:
+    """Return the advice as lines."""
+    lines = [f"{advice.frames} frames with {settings.estimator.name}"]
+    lines += [f"  {known.in_words()}" for known in advice.known]
+    lines += [f"{proposal.text}: {proposal.promise}" for proposal in advice.proposals]
+    return lines if advice.proposals else [*lines, "nothing to propose"]
+
+
+def _tell(loop: Loop, lines: list[str]) -> bool:
+    """Have the engine say the advice to whoever watches it; return whether it could be asked."""
+    try:
+        loop.ask("advice", lines=lines)
+    except InputError:  # it has ended: that is said elsewhere
+        return False
+    return True
 
 
 def _running(loop: Loop, seconds: float, stop: Any) -> tuple[Any, Settings, float | None]:
