@@ -132,7 +132,9 @@ def tuned_night(
         if number % PLANNER_EVERY == 1 and not waiting:
             waiting = planned(start, seen, sensor, present)
         elif not waiting:
-            found = new_gain(seen, plant, modes, gain, unit)
+            images = frames_of_record(start, range(SETTLE, LEARN, IMAGES_EVERY))
+            answers = shifted_gain(sensor.pipeline(present.settings), images)
+            found = new_gain(seen, plant, modes, gain, unit, answers.value if answers is not None else 1.0)
             waiting = [] if found is None else [found]
         if not waiting:
             strehl.append(fixed_strehl((settings, gain), loop, frames, offset + number))

@@ -138,7 +138,7 @@ def advise(
     if math.isfinite(light.value):
         proposals.append(new_light(settings, light.value, light.error))
     if gain is not None and loop.control.options.controller == INTEGRATOR:
-        proposals.append(new_gain(seen, loop.control.plant, loop.modes, gain, loop.unit))
+        proposals.append(new_gain(seen, loop.control.plant, loop.modes, gain, loop.unit, gains[0]))
     if math.isfinite(light.value):
         residual, _ = seen.weighted(gains)
         rms = float(np.sqrt(np.median(np.square(residual).mean(axis=1))))

@@ -15,7 +15,7 @@ from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gai
 from faintspot.advice.seen import Seen
 from faintspot.compare.statistics import Estimate, paired_mean
 from faintspot.control.learnt import Plant
-from faintspot.control.telemetry import Telemetry
+from faintspot.control.telemetry import Telemetry, replayed
 from faintspot.errors import InputError
 from faintspot.estimators.base import Need
 from faintspot.estimators.window import Window
@@ -35,6 +35,7 @@ GAINS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 """Loop gains that are tried on telemetry."""
 _PARTS = 5  # of telemetry, whose scatter says an error
 _FEWEST_OF_PART = 150  # frames
+_SETTLE = 30  # of them, in which the loop closes
 _LIGHT_TOLERANCE = 0.1  # of the light, within which it need not be told anew
 _SPOTS, _FLUX_STEPS = 1024, 1  # of the planner's simulation
 _RANGES_PX = (1.0, 4.0)  # of spots in a closed loop
@@ -90,7 +91,9 @@ def new_light(settings: Settings, light: float, error: float) -> Proposal | None
     return Proposal({"flux_e": float(f"{light:.3g}")}, None, f"the light is {light:.3g} +- {error:.2g} e-")
 
 
-def new_gain(seen: Seen, plant: Plant, modes: Floats, gain: float, unit: str) -> Proposal | None:
+def new_gain(
+    seen: Seen, plant: Plant, modes: Floats, gain: float, unit: str, centroid_gain: float = 1.0
+) -> Proposal | None:
     """Propose the loop gain that would have left least of what was seen, if it is another one.
 
     The recorded open-loop slopes, noise included, are sent through an integrator of every gain; what is left
@@ -106,18 +109,22 @@ def new_gain(seen: Seen, plant: Plant, modes: Floats, gain: float, unit: str) ->
         Of the loop that was seen.
     unit : str
         Of the modes.
+    centroid_gain : float
+        By which slopes grow with the spots' motion.
     """
-    parts = _parts_without_gaps(seen)
+    parts = _parts_without_gaps(seen, centroid_gain)
     if len(parts) < 2:
         return None
     tried = sorted({*GAINS, gain})
-    left = np.array([[_left(plant, each, part, modes) for part in parts] for each in tried])  # (gains, parts)
+    left = np.array(
+        [[_left(plant, each * centroid_gain, part, modes) for part in parts] for each in tried]
+    )  # (gains, parts)
     best = int(np.argmin(left.mean(axis=1)))
     present = tried.index(gain)
     if best == present:
         return None
     gained = paired_mean(left[present] - left[best])
-    if not gained.value > 0:
+    if not gained.value > gained.standard_error:
         return None
     return Proposal(
         {},
@@ -128,14 +135,12 @@ def new_gain(seen: Seen, plant: Plant, modes: Floats, gain: float, unit: str) ->
 
 def _left(plant: Plant, gain: float, part: Telemetry, modes: Floats) -> float:
     """Return the mean square wavefront that an integrator would have left."""
-    from faintspot.control.telemetry import replayed
-
     make = partial(plant.integrator, gain)
-    return len(modes) * replayed(make, part, plant.interaction, modes, plant.delay_frames, 30)
+    return len(modes) * replayed(make, part, plant.interaction, modes, plant.delay_frames, _SETTLE)
 
 
-def _parts_without_gaps(seen: Seen) -> list[Telemetry]:
-    """Return stretches of equal length, each from one turn."""
+def _parts_without_gaps(seen: Seen, centroid_gain: float) -> list[Telemetry]:
+    """Return stretches of equal length, each from one turn, in true pixels."""
     lengths = np.bincount(seen.turn - seen.turn.min())
     length = max(_FEWEST_OF_PART, int(lengths.max()) // _PARTS)
     parts = []
@@ -143,8 +148,8 @@ def _parts_without_gaps(seen: Seen) -> list[Telemetry]:
         rows = np.flatnonzero(seen.turn == turn)
         for start in range(0, len(rows) - length + 1, length):
             part = rows[start : start + length]
-            air = seen.slopes_px[part] - seen.held_px[part]
-            parts.append(Telemetry(air, seen.variance_px2[part], seen.trust[part]))
+            air = seen.slopes_px[part] / centroid_gain - seen.held_px[part]
+            parts.append(Telemetry(air, seen.variance_px2[part] / centroid_gain**2, seen.trust[part]))
     return parts
 
 
