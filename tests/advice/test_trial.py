@@ -172,7 +172,7 @@ def test_what_cannot_be_compared_is_taken_back() -> None:
     seen, _ = seen_with_truth(extra_px=(0.1, 0.0))
     assert compared(seen, modes, [None, None], same_gain=True).kept
     assert compared(seen, modes, [Estimate(1.0, 0.01)] * 2).kept
-    little, _ = seen_with_truth(extra_px=(0.1, 0.093), frames=7200)
+    little, _ = seen_with_truth(extra_px=(0.1, 0.08), frames=7200)
     assert compared(little, modes, [None, None], same_gain=True).kept
     hardly = compared(little, modes, [Estimate(1.0, 1e-6)] * 2)
     assert not hardly.kept
