@@ -170,7 +170,8 @@ def verdict(record: Any, arms: list[LoopArm], loop: LoopConfiguration, modes: An
         own = [k for k in range(LEARN, record.frames, IMAGES_EVERY) if turns[k] == number]
         pipeline = sensor_of(loop, each.settings).pipeline(each.settings)
         gains.append(shifted_gain(pipeline, frames_of_record(record, own)))
-    return compared(seen, modes, gains, same_gain=arms[0].settings == arms[1].settings)
+    same = arms[0].settings == arms[1].settings
+    return compared(seen, modes, gains, same_settings=same)
 
 
 def main() -> None:

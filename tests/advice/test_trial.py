@@ -170,14 +170,15 @@ def test_what_cannot_be_compared_is_taken_back() -> None:
 
     modes, _ = wavefront_modes(LAYOUT)
     seen, _ = seen_with_truth(extra_px=(0.1, 0.0))
-    assert compared(seen, modes, [None, None], same_gain=True).kept
+    assert compared(seen, modes, [None, None], same_settings=True).kept
     assert compared(seen, modes, [Estimate(1.0, 0.01)] * 2).kept
     little, _ = seen_with_truth(extra_px=(0.1, 0.08), frames=7200)
-    assert compared(little, modes, [None, None], same_gain=True).kept
+    assert compared(little, modes, [None, None], same_settings=True).kept
     hardly = compared(little, modes, [Estimate(1.0, 1e-6)] * 2)
     assert not hardly.kept
     assert hardly.difference.decided == -1
     assert "less than estimators may seem to differ" in hardly.remark
+    assert compared(little, modes, [Estimate(1.0, 1e-6)] * 2, same_estimator=True).kept
     unsure = compared(seen, modes, [Estimate(1.0, 0.01), None])
     assert not unsure.kept
     assert "centroid gains" in unsure.remark

@@ -234,11 +234,17 @@ def _compared(loop: Loop, telemetry: Telemetry, settings: Sequence[Settings]) ->
     for arm, each in enumerate(settings):
         own = frames if settings[0] == settings[1] else frames[of_image == arm]
         gains.append(loop.centroid_gain(each, own))
-    return compared(seen, loop.modes, gains, same_gain=settings[0] == settings[1])
+    same = settings[0].estimator.name == settings[1].estimator.name
+    return compared(seen, loop.modes, gains, same_settings=settings[0] == settings[1], same_estimator=same)
 
 
 def compared(
-    seen: Seen, modes: Floats, gains: Sequence[Estimate | None], *, same_gain: bool = False
+    seen: Seen,
+    modes: Floats,
+    gains: Sequence[Estimate | None],
+    *,
+    same_settings: bool = False,
+    same_estimator: bool = False,
 ) -> Verdict:
     """Return which of two arms in turn leaves less of the wavefront.
 
@@ -249,22 +255,23 @@ def compared(
     modes : (k, m) array
     gains : sequence of Estimate
         Centroid gains of both; None where they are not known.
-    same_gain : bool
-        Whether both arms have the same estimator: then an error of its gain counts for both alike. Another
-        estimator must leave a fifth less, too: so far the figure was off the truth in simulations.
+    same_settings : bool
+        Whether the arms differ in the loop gain alone: an error of the centroid gain counts for both alike.
+    same_estimator : bool
+        Another one must leave a fifth less, too: so far the figure was off the truth in simulations.
     """
-    if same_gain:
+    if same_settings:
         gains = [gains[0] or Estimate(1.0, 0.0)] * 2
     known = [gain for gain in gains if gain is not None and gain.value > 0]
     if len(known) < 2:
         remark = "too few images to know the centroid gains; taken back"
         return Verdict(Estimate(np.nan), np.nan, False, remark)
     left = residual_wavefront(seen, modes, [gain.value for gain in known])
-    errors = [0.0 if same_gain else gain.standard_error / gain.value for gain in known]
+    errors = [0.0 if same_settings else gain.standard_error / gain.value for gain in known]
     difference = compared_residual(seen, left, errors)
     present = left[seen.arm == 0]
     mean = float(np.nanmean(present)) if np.isfinite(present).any() else np.nan
     better = difference.decided == -1
-    if better and not same_gain and not difference.value < -_UNEVEN * mean:
+    if better and not (same_settings or same_estimator) and not difference.value < -_UNEVEN * mean:
         return Verdict(difference, mean, False, "less than estimators may seem to differ; taken back")
     return Verdict(difference, mean, better)
