@@ -10,7 +10,7 @@ night and comes back, the seeing goes from 0.6 to 1.2 arcsec and back three time
 
 The trials count. Light is followed by all of them (mean light). Some ten minutes on two processors:
 
-    python examples/night.py [--stretches 12] [--frames 1200] [--nights 2]
+    python examples/night.py [--stretches 10] [--frames 1000] [--nights 2]
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from faintspot.loop.configuration import ARCSEC
 from faintspot.loop.observatory import prepare
 from faintspot.settings import Settings
 
-BRIGHTEST_E, FADES_BY = 400.0, 3.0  # photo-electrons of a sub-aperture in a frame; magnitudes
+BRIGHTEST_E, FADES_BY = 1600.0, 3.0  # photo-electrons of a sub-aperture in a frame; magnitudes
 SEEING_ARCSEC = 0.6, 1.2
-GAINS = (0.1, 0.2, 0.4, 0.6)
-SETTLE, LEARN, TURN, IMAGES_EVERY = 60, 400, 60, 12  # frames
-PLANNER_EVERY = 4  # stretches; the loop gain is looked at in all others
+GAINS = (0.2, 0.4, 0.6)
+SETTLE, LEARN, TURN, IMAGES_EVERY = 60, 300, 60, 12  # frames
+PLANNER_EVERY = 3  # stretches; the loop gain is looked at in all others
 OTHER_AIR = 1200  # first realisation of the air on which the first settings are chosen
 
 
@@ -177,8 +177,8 @@ def verdict(record: Any, arms: list[LoopArm], loop: LoopConfiguration, modes: An
 def main() -> None:
     """Observe the nights and print what each way has had."""
     options = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    options.add_argument("--stretches", type=int, default=12)
-    options.add_argument("--frames", type=int, default=1200)
+    options.add_argument("--stretches", type=int, default=10)
+    options.add_argument("--frames", type=int, default=1000)
     options.add_argument("--nights", type=int, default=2)
     options.add_argument("--processes", type=int, default=2)
     given = options.parse_args()

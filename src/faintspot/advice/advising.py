@@ -118,6 +118,8 @@ def advise(
         For telemetry that tells nothing of a closed loop.
     """
     arms = np.unique(telemetry.arm)
+    if not len(arms):
+        raise InputError(f"{loop.name}: expected frames of a closed loop, none came")
     if len(arms) != 1:
         raise InputError(f"telemetry: expected one state of the settings, found {len(arms)} in turn")
     sensor, layout = loop.sensor, loop.sensor.layout

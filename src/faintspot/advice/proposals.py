@@ -163,7 +163,7 @@ def new_estimators(
     centroid_gain: float = 1.0,
     progress: Progress | None = None,
 ) -> list[Proposal]:
-    """Propose the estimator that the planner finds best for this light, and the fixed window.
+    """Propose the fixed window, and the estimator that the planner finds best for this light.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def new_estimators(
     present = settings.estimator.name
     before = next((each for each in answer.results if each.arm.name == present), None)
     proposals = []
-    for name in dict.fromkeys((*answer.equal[:1], Window.name)):
+    for name in dict.fromkeys((Window.name, *answer.equal[:1])):
         if name == present:
             continue
         found = answer[name]
