@@ -107,6 +107,8 @@ class Engine:
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
         """What of the real-time scheduling was not permitted."""
+        self.advice: list[str] = []
+        """What was last said to be better, for whoever asks for the status."""
         self._source, self._unfit = source, ""
         self._path: MeasuringPath | None = None
         self._waiting = False
@@ -171,6 +173,7 @@ class Engine:
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
+            "advice": self.advice,
             "loop": self.loop_status(),
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
