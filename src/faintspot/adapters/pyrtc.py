@@ -200,12 +200,13 @@ class _Measuring:
     def maps(self, process: Any, image: Any, open_stream: Any) -> NDArray[np.float32]:
         """Measure an image; only sub-apertures that pyRTC counts as valid are."""
         n = int(process.num_regions)
-        valid = np.asarray(process.valid_sub_aps, bool)
+        valid = _mapped("valid_sub_aps", process.valid_sub_aps, n).astype(bool)
+        references = _mapped("ref_slopes", process.ref_slopes, n).astype(np.float64)
         used = np.flatnonzero(valid[:n] | valid[n:])
         if self._tool is None or not np.array_equal(used, self._places):
             self._tool, self._places = self._made(process, image.shape, used), used
         at = np.concatenate([used, used + n * n])
-        reference = np.asarray(process.ref_slopes, np.float64).ravel()[at].reshape(2, -1)
+        reference = references.ravel()[at].reshape(2, -1)
         prior = self._predicted(valid, open_stream)
         prior = None if prior is None else (prior.ravel()[at].reshape(2, -1) + reference).ravel()
         if not image.any():  # pyRTC's first frame, with which kernels are compiled, is no light of a star's
@@ -216,23 +217,28 @@ class _Measuring:
         slopes.ravel()[at] = np.where(self._tool.last.valid, found - reference, 0.0).ravel()
         return slopes
 
-    def _made(self, process: Any, shape: tuple[int, int], used: NDArray[np.int64]) -> ToolSlopes:
+    def _made(self, process: Any, shape: tuple[int, ...], used: NDArray[np.int64]) -> ToolSlopes:
         """Make the pipeline for pyRTC's sub-apertures."""
+        if not used.size:
+            raise InputError("slopes.valid_sub_aps: expected at least one valid sub-aperture, got none")
         side, spacing, n = int(process.region_size), float(process.sub_ap_spacing), int(process.num_regions)
         first = np.array([round(spacing * i) for i in range(n)])
         rows, columns = first[used // n] + process.offset_y, first[used % n] + process.offset_x
         corners = np.column_stack([columns, rows])
-        outside = (corners < 0).any(axis=1) | (corners + side > np.array(shape)[::-1]).any(axis=1)
+        if len(shape) != 2:
+            raise InputError(f"frame: expected rows and columns, got shape {shape}")
+        height, width = shape
+        outside = (corners < 0).any(axis=1) | (corners + side > [width, height]).any(axis=1)
         if outside.any():
             where = int(used[np.argmax(outside)])
             raise InputError(
-                f"slopes.valid_sub_aps: expected sub-apertures of {side} px on the frame of {shape[0]} x "
-                f"{shape[1]}, got {np.count_nonzero(outside)} that leave it, first row {where // n}, column "
+                f"slopes.valid_sub_aps: expected sub-apertures of {side} px on the frame of {height} x "
+                f"{width}, got {np.count_nonzero(outside)} that leave it, first row {where // n}, column "
                 f"{where % n}; leave them out, or change sub_ap_offset_x and _y"
             )
         settings, calibration, psf, score = self.parts
         return ToolSlopes(
-            layout_around(corners + 0.5 * (side - 1), shape, side),
+            layout_around(corners + 0.5 * (side - 1), (height, width), side),
             settings,
             calibration,
             psf=psf,
@@ -259,3 +265,19 @@ class _Measuring:
         maps = np.zeros(valid.shape)
         maps[valid] = values.ravel()
         return maps
+
+
+def _mapped(name: str, values: Any, n: int) -> NDArray[Any]:
+    """Return a map of pyRTC's for n x n sub-apertures, x above y."""
+    array = np.asarray(values)
+    if array.shape != (2 * n, n):
+        raise InputError(
+            f"slopes.{name}: expected shape {(2 * n, n)} for {n} x {n} sub-apertures, got {array.shape}; "
+            "make it anew for this sub_ap_spacing"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(
+            f"slopes.{name}: expected finite numbers, got {np.count_nonzero(~np.isfinite(array))} NaN or "
+            "infinite; take it anew, with light in every valid sub-aperture"
+        )
+    return array
