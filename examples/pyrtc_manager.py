@@ -24,6 +24,8 @@ import yaml
 from pyrtc import clear_shms, open_stream
 from pyrtc.manager import RTCManager
 
+from faintspot.adapters.checks import check_matrix
+
 BENCH, COMMANDS, RATE_HZ = Path("bench"), 54, 100
 TELESCOPE, ENGINE = "telescope", "engine"
 STREAMS = ("wfs", "wfs_raw", "signal", "signal_2d", "wfc", "wfc_2d", "faintspot_commands")
@@ -87,6 +89,7 @@ def calibrate(manager: RTCManager) -> None:
         sensor.modal_amplitudes[:] = 0.0
         loop.compute_im()
         sensor.modal_amplitudes[:] = moving
+        check_matrix("interaction matrix", loop.im)
         return
     matrix, reference = (
         np.load(BENCH / f"{name}.npy") for name in ("interaction_matrix", "reference_slopes")

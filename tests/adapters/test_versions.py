@@ -17,6 +17,8 @@ from faintspot import InputError
 from faintspot.adapters import oopao, pyrtc, soapy
 from faintspot.adapters.checks import UntestedVersionWarning, check_version
 
+pytestmark = pytest.mark.filterwarnings("ignore")
+
 
 @pytest.fixture(params=["0.0.9", "99.0"])
 def version(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
@@ -50,7 +52,6 @@ def test_soapy_version(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @needs("pyrtc", "pyrtc")
-@pytest.mark.filterwarnings("ignore")
 def test_pyrtc_version(version: str) -> None:
     def make() -> None:
         pyrtc.slopes_process.cache_clear()
