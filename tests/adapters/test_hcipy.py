@@ -238,8 +238,10 @@ def test_images_that_do_not_fit(optics: Any) -> None:
 
 
 def test_the_loop_of_the_manual_closes(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (Path(__file__).resolve().parents[2] / "docs" / "adapters.md").read_text(encoding="utf-8")
-    script = re.search(r"```python\n(.*?)```", text[text.index("\n## HCIPy") :], re.DOTALL)
+    text = (Path(__file__).resolve().parents[2] / "docs" / "adapters" / "hcipy.md").read_text(
+        encoding="utf-8"
+    )
+    script = re.search(r"```python\n(.*?)```", text, re.DOTALL)
     assert script is not None
     np.random.seed(1)  # noqa: NPY002 - HCIPy's detectors draw from this one
     names: dict[str, Any] = {}

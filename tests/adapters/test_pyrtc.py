@@ -106,6 +106,42 @@ def test_refused_in_one_line() -> None:
         measuring().maps(process(offset_y=1), frame_of(images()), no_stream)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"valid_sub_aps": np.ones((6, 4), bool)},
+            r"valid_sub_aps: expected shape \(6, 3\) for 3 x 3 sub-ap",
+        ),
+        (
+            {"valid_sub_aps": np.zeros((6, 3), bool)},
+            "valid_sub_aps: expected at least one valid sub-aperture",
+        ),
+        (
+            {"ref_slopes": np.zeros((4, 2))},
+            r"ref_slopes: expected shape \(6, 3\) .* got \(4, 2\); make it anew",
+        ),
+        (
+            {"ref_slopes": np.full((6, 3), np.nan)},
+            "ref_slopes: expected finite numbers, got 18 NaN or infinite",
+        ),
+    ],
+)
+def test_maps_of_another_system(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        measuring().maps(process(**change), frame_of(images()), no_stream)
+    assert "\n" not in str(error.value)
+
+
+def test_frames_of_another_size() -> None:
+    own = measuring()
+    with pytest.raises(InputError, match=r"frame: expected rows and columns, got shape \(2, 30, 30\)"):
+        own.maps(process(), np.ones((2, 30, 30)), no_stream)
+    own.maps(process(), frame_of(images()), no_stream)
+    with pytest.raises(InputError, match=r"frame: expected shape \(30, 30\) .* got \(40, 30\)"):
+        own.maps(process(), np.ones((40, 30)), no_stream)
+
+
 def test_a_missing_pyrtc_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrtc", None)
     pyrtc.slopes_process.cache_clear()

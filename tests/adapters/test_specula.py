@@ -140,6 +140,26 @@ class TestRealTool:
         with pytest.raises(InputError, match="measured first"):
             _ = self.made(subapertures).measured
 
+    def test_another_system_than_was_calibrated(self, subapertures: Any, specula: Any) -> None:
+        from specula.data_objects.slopes import Slopes
+
+        frame = frame_of(images())
+        computer = self.made(subapertures)
+        self.slopes(computer, frame)
+        with pytest.raises(InputError, match=r"in_pixels: expected shape \(30, 30\), got \(30, 40\)"):
+            self.slopes(computer, np.ones((30, 40)), time=2)
+        with pytest.raises(
+            InputError, match="sn: expected slopes of 9 sub-apertures, got 4 x and 4 y; calibr"
+        ):
+            self.slopes(self.made(subapertures, sn=Slopes(slopes=np.zeros(8))), frame)
+        broken = Slopes(slopes=np.full(2 * N, np.nan))
+        with pytest.raises(InputError, match="sn: expected finite numbers, got 18 NaN or infinite of 18"):
+            self.slopes(self.made(subapertures, sn=broken), frame)
+        with pytest.raises(
+            InputError, match=r"filtmat: expected finite numbers .* got 36 NaN or infinite of 36"
+        ):
+            self.made(subapertures, filtmat=np.full((2, 2, 2 * N), np.nan))
+
 
 @needs("specula", "specula")
 def test_a_parameter_file_finds_the_class() -> None:

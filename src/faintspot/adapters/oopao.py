@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.adapters.base import Options, ToolSlopes
-from faintspot.adapters.checks import check_version, predicted
+from faintspot.adapters.checks import check_version
+from faintspot.adapters.spots import Spots
 from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 
 TESTED = "1.0.0", "1.0.0"
@@ -92,12 +92,17 @@ class Attached:
         self._current = self._sources[0]
         self._own = wfs.wfs_integrate
         wfs.wfs_integrate, wfs.centroid = self._integrate, self._centroid
-        wfs.initialize_wfs()
-        if not abs(float(wfs.slopes_units)) > _LEAST_UNIT:  # NaN is not, either
-            raise InputError(
-                f"wfs.slopes_units: expected about 1 from OOPAO's tilt, got {float(wfs.slopes_units):g}; "
-                "check search_range_px, or give another calibration_light_e"
-            )
+        try:
+            wfs.initialize_wfs()
+            unit = float(wfs.slopes_units)
+            if not abs(unit) > _LEAST_UNIT:  # NaN is not, either
+                raise InputError(
+                    f"wfs.slopes_units: expected about 1 from OOPAO's tilt, got {unit:g}; check "
+                    "search_range_px, or give another calibration_light_e"
+                )
+        except InputError:
+            del wfs.wfs_integrate, wfs.centroid
+            raise
 
     def detach(self) -> None:
         """Put OOPAO's own centroiding back, calibrated."""
@@ -142,39 +147,30 @@ class _Source:
         predict: Any,
         options: Options,
     ) -> None:
-        self.wfs, self.data, self._predict = wfs, data, predict
-        self._n, self._side = int(data.nValidSubaperture), int(wfs.n_pix_subap)
-        layout = Layout.stacked(self._n, (self._side, self._side))
-        self.slopes = ToolSlopes(layout, settings, calibration, **options)
-        self._signal: NDArray[np.float64] | None = None
+        self.wfs, self.data = wfs, data
+        self._n, side = int(data.nValidSubaperture), int(wfs.n_pix_subap)
+        self._first = 0.5 * (side - 1)
+        self._spots = Spots(
+            "OOPAO", self._n, side, settings, calibration, predict, rows_first=True, **options
+        )
+
+    @property
+    def slopes(self) -> ToolSlopes:
+        """What measures."""
+        return self._spots.measured
 
     def positions(self, image: Any) -> NDArray[np.float64]:
         """See `Attached._centroid`."""
-        images = np.asarray(image)
-        shape = self._n, self._side, self._side
-        if images.shape != shape:
-            raise InputError(f"OOPAO's images: expected shape {shape}, got {images.shape}")
-        camera, first = self.wfs.cam, 0.5 * (self._side - 1)
-        switched_off = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)
-        noise_free = switched_off or self.slopes.noise_free
-        reference, unit = self._reference(), float(self.wfs.slopes_units)
-        prior = None
-        if not noise_free:
-            signal = predicted(self._predict, self._signal, (2 * self._n,))
-            if signal is not None:
-                rows, columns = (signal * unit + reference).reshape(2, -1) - first
-                prior = np.concatenate([columns, rows])
-        found = self.slopes.measure(images.reshape(-1, self._side), prior_px=prior, noise_free=noise_free)
-        places = found[::-1].ravel() + first  # along rows, which is y, before along columns
-        places = np.where(np.tile(self.slopes.last.valid, 2), places, reference)
-        if not noise_free:
-            self._signal = (places - reference) / unit
-        return np.ascontiguousarray(places.reshape(2, -1).T)
+        images, camera = self._spots.checked(image), self.wfs.cam
+        noise_free = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)
+        reference, unit = self._reference() - self._first, float(self.wfs.slopes_units)
+        found = self._spots.places(images, reference, unit, noise_free=noise_free)
+        return np.ascontiguousarray((found + self._first).T)
 
     def _reference(self) -> NDArray[np.float64]:
-        """OOPAO's reference positions, (2 n,); the middle before it has any."""
+        """OOPAO's reference positions, (2, n); the middle before it has any."""
         reference = np.asarray(self.data.reference_signal_2D, np.float64)
         if reference.ndim < 2:
-            return np.full(2 * self._n, 0.5 * (self._side - 1))
+            return np.full((2, self._n), self._first)
         found: NDArray[np.float64] = reference[self.data.valid_signal_2D]
-        return found
+        return found.reshape(2, self._n)

@@ -1,4 +1,4 @@
-"""The slope pipeline in pyRTC: `FaintspotSlopes`, a slopes process of its own.
+"""The slope pipeline in pyRTC: `FaintspotSlopes`, a slopes process, and `FaintspotCamera`, a sensor.
 
 ::
 
@@ -6,12 +6,14 @@
       class_name: faintspot.adapters.pyrtc.FaintspotSlopes
       faintspot: faintspot.toml
 
-`FaintspotSlopes` is made when it is first asked for: pyRTC is imported then, not before.
+The classes are made when they are first asked for: pyRTC is imported then, not before.
 """
 
 from __future__ import annotations
 
 import functools
+import logging
+import time
 from typing import Any
 
 import numpy as np
@@ -20,15 +22,19 @@ from numpy.typing import NDArray
 from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, ToolSlopes, layout_around, parts_of
 from faintspot.adapters.checks import check_version
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.realtime.stream import Follower
 
 TESTED = "2.1.0", "2.1.0"
+_MOMENT_S = 0.1
+_logger = logging.getLogger(__name__)
 PREDICTED = "predicted"
 """Name of the input stream of predicted slopes."""
 
 
 def __getattr__(name: str) -> Any:
-    if name == "FaintspotSlopes":
-        return slopes_process()
+    made = {"FaintspotSlopes": slopes_process, "FaintspotCamera": camera}
+    if name in made:
+        return made[name]()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
@@ -77,6 +83,91 @@ def slopes_process() -> Any:
     return FaintspotSlopes
 
 
+@functools.cache
+def camera() -> Any:
+    """Return the class `FaintspotCamera`, a `WavefrontSensor` of pyRTC's with the frames of a stream.
+
+    Its configuration is that of a `WavefrontSensor`, with the function `expose`, and
+
+    frames : str
+        Stream of the frames: of pyshmem, such as NAME_frames of `faintspot realtime telescope`, isio:NAME or
+        dao:FILE. They become uint16, as pyRTC's raw frames are. It need not exist yet.
+
+    Raises
+    ------
+    MissingExtraError
+        When pyRTC is not installed.
+    """
+    try:
+        from pyrtc import WavefrontSensor
+    except ImportError:
+        raise MissingExtraError("pyrtc", "pyrtc", "faintspot.adapters.pyrtc") from None
+    check_version("pyRTC", "pyrtcao", *TESTED)
+
+    class FaintspotCamera(WavefrontSensor):  # type: ignore[misc]
+        """A sensor of pyRTC's whose frames come by a stream."""
+
+        EXTRA_CONFIG_KEYS = ("frames",)
+
+        def __init__(self, conf: Any) -> None:
+            self.following = _Frames(conf)
+            super().__init__(conf)
+
+        def expose(self) -> None:
+            """Publish the next frame, if there is one within a moment."""
+            if self.following.next_into(self.data):
+                super().expose()
+
+        def close(self, *arguments: Any, **options: Any) -> None:
+            """Let go of the stream, too."""
+            super().close(*arguments, **options)
+            self.following.close()
+
+    FaintspotCamera.__module__, FaintspotCamera.__qualname__ = __name__, "FaintspotCamera"
+    return FaintspotCamera
+
+
+class _Frames:
+    """The frames of a stream, one after the other."""
+
+    def __init__(self, conf: Any) -> None:
+        name = conf.get("frames")
+        if not isinstance(name, str):
+            raise InputError(f"wfs.frames: expected the name of a stream, got {name!r}")
+        self._shape = int(conf["height"]), int(conf["width"])
+        self._follower = Follower(name, _logger.warning, self._unfit, lambda: "waiting")
+        self._seen = 0
+
+    def next_into(self, frame: NDArray[Any]) -> bool:
+        """Wait a moment for a frame that is new; return whether there was one."""
+        follower = self._follower
+        if follower.source is None:
+            if follower.open() is None:
+                time.sleep(_MOMENT_S)
+                return False
+            self._seen = 0
+        source = follower.source
+        assert source is not None
+        if not source.wait(self._seen, _MOMENT_S):
+            happened = follower.lost()
+            if happened:
+                follower.say(happened)
+            return False
+        publication = source.read(None, _MOMENT_S)
+        self._seen = source.count if publication is None else publication.total
+        if publication is not None:
+            np.clip(publication.values, 0, np.iinfo(frame.dtype).max, out=frame, casting="unsafe")
+        return publication is not None
+
+    def close(self) -> None:
+        """Let go of the stream."""
+        self._follower.close()
+
+    def _unfit(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+        fits = shape == self._shape and dtype.kind in "iuf"
+        return "" if fits else f"frames of {self._shape[0]} x {self._shape[1]} (wfs.height, wfs.width)"
+
+
 class _Measuring:
     """What a slopes process measures with; made when its geometry is known."""
 
@@ -109,12 +200,13 @@ class _Measuring:
     def maps(self, process: Any, image: Any, open_stream: Any) -> NDArray[np.float32]:
         """Measure an image; only sub-apertures that pyRTC counts as valid are."""
         n = int(process.num_regions)
-        valid = np.asarray(process.valid_sub_aps, bool)
+        valid = _mapped("valid_sub_aps", process.valid_sub_aps, n).astype(bool)
+        references = _mapped("ref_slopes", process.ref_slopes, n).astype(np.float64)
         used = np.flatnonzero(valid[:n] | valid[n:])
         if self._tool is None or not np.array_equal(used, self._places):
             self._tool, self._places = self._made(process, image.shape, used), used
         at = np.concatenate([used, used + n * n])
-        reference = np.asarray(process.ref_slopes, np.float64).ravel()[at].reshape(2, -1)
+        reference = references.ravel()[at].reshape(2, -1)
         prior = self._predicted(valid, open_stream)
         prior = None if prior is None else (prior.ravel()[at].reshape(2, -1) + reference).ravel()
         if not image.any():  # pyRTC's first frame, with which kernels are compiled, is no light of a star's
@@ -125,23 +217,28 @@ class _Measuring:
         slopes.ravel()[at] = np.where(self._tool.last.valid, found - reference, 0.0).ravel()
         return slopes
 
-    def _made(self, process: Any, shape: tuple[int, int], used: NDArray[np.int64]) -> ToolSlopes:
+    def _made(self, process: Any, shape: tuple[int, ...], used: NDArray[np.int64]) -> ToolSlopes:
         """Make the pipeline for pyRTC's sub-apertures."""
+        if not used.size:
+            raise InputError("slopes.valid_sub_aps: expected at least one valid sub-aperture, got none")
         side, spacing, n = int(process.region_size), float(process.sub_ap_spacing), int(process.num_regions)
         first = np.array([round(spacing * i) for i in range(n)])
         rows, columns = first[used // n] + process.offset_y, first[used % n] + process.offset_x
         corners = np.column_stack([columns, rows])
-        outside = (corners < 0).any(axis=1) | (corners + side > np.array(shape)[::-1]).any(axis=1)
+        if len(shape) != 2:
+            raise InputError(f"frame: expected rows and columns, got shape {shape}")
+        height, width = shape
+        outside = (corners < 0).any(axis=1) | (corners + side > [width, height]).any(axis=1)
         if outside.any():
             where = int(used[np.argmax(outside)])
             raise InputError(
-                f"slopes.valid_sub_aps: expected sub-apertures of {side} px on the frame of {shape[0]} x "
-                f"{shape[1]}, got {np.count_nonzero(outside)} that leave it, first row {where // n}, column "
+                f"slopes.valid_sub_aps: expected sub-apertures of {side} px on the frame of {height} x "
+                f"{width}, got {np.count_nonzero(outside)} that leave it, first row {where // n}, column "
                 f"{where % n}; leave them out, or change sub_ap_offset_x and _y"
             )
         settings, calibration, psf, score = self.parts
         return ToolSlopes(
-            layout_around(corners + 0.5 * (side - 1), shape, side),
+            layout_around(corners + 0.5 * (side - 1), (height, width), side),
             settings,
             calibration,
             psf=psf,
@@ -168,3 +265,19 @@ class _Measuring:
         maps = np.zeros(valid.shape)
         maps[valid] = values.ravel()
         return maps
+
+
+def _mapped(name: str, values: Any, n: int) -> NDArray[Any]:
+    """Return a map of pyRTC's for n x n sub-apertures, x above y."""
+    array = np.asarray(values)
+    if array.shape != (2 * n, n):
+        raise InputError(
+            f"slopes.{name}: expected shape {(2 * n, n)} for {n} x {n} sub-apertures, got {array.shape}; "
+            "make it anew for this sub_ap_spacing"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(
+            f"slopes.{name}: expected finite numbers, got {np.count_nonzero(~np.isfinite(array))} NaN or "
+            "infinite; take it anew, with light in every valid sub-aperture"
+        )
+    return array

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.adapters.base import Options, ToolSlopes
-from faintspot.adapters.checks import check_version, predicted
+from faintspot.adapters.checks import check_version
+from faintspot.adapters.spots import Spots
 from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 
 TESTED = "0.15.0", "0.15.0"
@@ -71,23 +71,34 @@ class Attached:
         if centroiders is None or not hasattr(wfs, "centSubapArrays"):
             raise InputError(f"wfs: expected a ShackHartmann of soapy's, got {type(wfs).__name__}")
         check_version("soapy", "soapy", *TESTED)
-        self.wfs, self._predict, self._centroiders = wfs, predict, centroiders
-        self._n, self._side = int(wfs.n_subaps), int(wfs.nx_subap_pixels)
-        layout = Layout.stacked(self._n, (self._side, self._side))
-        self.measured = ToolSlopes(layout, settings, calibration, **options)
-        self._slopes: NDArray[np.float64] | None = None
+        self.wfs, self._centroiders = wfs, centroiders
+        self._n, side = int(wfs.n_subaps), int(wfs.nx_subap_pixels)
+        self._first = 0.5 * (side - 1)
+        self._spots = Spots("soapy", self._n, side, settings, calibration, predict, **options)
         self._former = wfs.config.centMethod
         # soapy finds its centroiders by name in the module that it takes them from.
         self._name = f"faintspot_{id(self)}"
         setattr(centroiders, self._name, self._centroid)
         wfs.config.centMethod = self._name
-        wfs.getStatic()
+        try:
+            wfs.getStatic()
+        except InputError:
+            self._put_back()
+            raise
 
     def detach(self) -> None:
         """Put the former centroider back, and make the static slopes with it."""
+        self._put_back()
+        self.wfs.getStatic()
+
+    def _put_back(self) -> None:
         self.wfs.config.centMethod = self._former
         delattr(self._centroiders, self._name)
-        self.wfs.getStatic()
+
+    @property
+    def measured(self) -> ToolSlopes:
+        """What measures, with `last` slopes (px), `standard_errors` and `light`."""
+        return self._spots.measured
 
     def calibrating(self, light_e: float | None = None) -> Any:
         """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`.
@@ -98,23 +109,11 @@ class Attached:
 
     def _centroid(self, images: Any, threshold: Any = None, ref: Any = None, **_: Any) -> NDArray[np.float64]:
         """Positions as soapy's centroiders give them: (2, n) px from the first pixel."""
-        shape = self._n, self._side, self._side
-        if np.shape(images) != shape:
-            raise InputError(f"soapy's images: expected shape {shape}, got {np.shape(images)}")
-        config = self.wfs.config
-        switched_off = bool(self.wfs.iMat) or not (config.photonNoise or config.eReadNoise)
-        noise_free = switched_off or self.measured.noise_free
-        static = self.wfs.staticData
-        static = np.zeros((2, self._n)) if static is None else np.asarray(static, np.float64)
+        checked = self._spots.checked(images)
+        config, static = self.wfs.config, self.wfs.staticData
+        noise_free = bool(self.wfs.iMat) or not (config.photonNoise or config.eReadNoise)
         # soapy takes half a window off, so that a spot in the middle has -1/2, which is static, too.
-        first, half = 0.5 * (self._side - 1), 0.5 * self._side
-        prior = None
-        if not noise_free:
-            slopes = predicted(self._predict, self._slopes, (2, self._n))
-            prior = None if slopes is None else (slopes + static + half - first).ravel()
-        frame = np.reshape(images, (-1, self._side))
-        found = self.measured.measure(frame, prior_px=prior, noise_free=noise_free) + first
-        found = np.where(self.measured.last.valid, found, static + half)
-        if not noise_free:
-            self._slopes = (found - half - static).ravel()
-        return found
+        reference = np.full((2, self._n), 0.5)
+        if static is not None:
+            reference += static
+        return self._spots.places(checked, reference, noise_free=noise_free) + self._first

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, Options, ToolSlopes, parts_of
-from faintspot.adapters.checks import check_version
+from faintspot.adapters.checks import check_matrix, check_version
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.sensor.layout import Layout
 
@@ -68,6 +68,8 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         precision: int | None = None,
     ) -> None:
         check_version("SPECULA", "specula", *TESTED)
+        for part in () if filtmat is None else filtmat:
+            check_matrix("filtmat", cpuArray(part))
         self.subapdata = subapdata  # the base class asks for the number of sub-apertures
         super().__init__(
             sn=sn,
@@ -85,7 +87,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         }
         self._noise_free = bool(calibrating)
         self._tool: ToolSlopes | None = None
-        self._idxs = np.empty((0, 0), np.int64)
+        self._idxs, self._frame_shape = np.empty((0, 0), np.int64), (0, 0)
         self.slopes.single_mask, self.slopes.display_map = subapdata.single_mask(), subapdata.display_map
         self.inputs["in_predicted"] = InputValue(type=Slopes, optional=True)
         self.outputs["out_subapdata"] = subapdata
@@ -129,11 +131,14 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         pixels = np.asarray(cpuArray(self.local_inputs["in_pixels"].pixels))
         if self._tool is None:
             self._tool, self._idxs = self._prepared((int(pixels.shape[0]), int(pixels.shape[1])))
-        images = pixels.ravel()[self._idxs]
-        null = np.zeros((2, self.nsubaps())) if self.sn is None else _two_rows(self.sn)
+            self._frame_shape = pixels.shape
+        if pixels.shape != self._frame_shape:
+            raise InputError(f"in_pixels: expected shape {self._frame_shape}, got {pixels.shape}")
+        images, n = pixels.ravel()[self._idxs], self.nsubaps()
+        null = np.zeros((2, n)) if self.sn is None else _two_rows("sn", self.sn, n)
         prior, predicted = None, self.local_inputs.get("in_predicted")
         if predicted is not None and predicted.generation_time > 0:
-            prior = ((_two_rows(predicted) + null) / self._tool.unit_per_px).ravel()
+            prior = ((_two_rows("in_predicted", predicted, n) + null) / self._tool.unit_per_px).ravel()
         found = self._tool.measure(images, prior_px=prior, noise_free=self._noise_free)
         last = self._tool.last
         found = np.where(last.valid, found, null)
@@ -188,6 +193,18 @@ def checked_squares(idxs: NDArray[Any], frame_shape: tuple[int, int]) -> NDArray
     return idxs.astype(np.int64)
 
 
-def _two_rows(slopes: Any) -> NDArray[np.float64]:
+def _two_rows(name: str, slopes: Any, n: int) -> NDArray[np.float64]:
     """X and y slopes of a Slopes object, (2, n)."""
-    return np.stack([np.asarray(cpuArray(part), np.float64) for part in (slopes.xslopes, slopes.yslopes)])
+    rows = [np.asarray(cpuArray(part), np.float64).ravel() for part in (slopes.xslopes, slopes.yslopes)]
+    if rows[0].size != n or rows[1].size != n:
+        raise InputError(
+            f"{name}: expected slopes of {n} sub-apertures, got {rows[0].size} x and {rows[1].size} y; "
+            "calibrate with these sub-apertures"
+        )
+    bad = sum(int(np.count_nonzero(~np.isfinite(row))) for row in rows)
+    if bad:
+        raise InputError(
+            f"{name}: expected finite numbers, got {bad} NaN or infinite of {2 * n}; make it anew, with "
+            "light in every sub-aperture"
+        )
+    return np.stack(rows)

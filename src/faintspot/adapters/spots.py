@@ -1,0 +1,105 @@
+"""For tools that cut the windows themselves and ask where the spots are in them."""
+
+from __future__ import annotations
+
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.adapters.base import Options, ToolSlopes
+from faintspot.adapters.checks import predicted
+from faintspot.errors import InputError
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.settings import Settings
+
+
+class Spots:
+    """Where spots are in a tool's windows, with the tool's references and predictions.
+
+    Parameters
+    ----------
+    tool : str
+        What people call it, for errors.
+    n, side : int
+        Windows, and their pixels along a side.
+    settings, calibration
+        See `ToolSlopes`.
+    predict : callable or object with `predict`, optional
+        See `faintspot.adapters.checks.predicted`: slopes in the tool's order and unit.
+    rows_first : bool
+        Whether the tool has what is along rows (y) before what is along columns (x).
+    **options
+        See `ToolSlopes`.
+    """
+
+    def __init__(
+        self,
+        tool: str,
+        n: int,
+        side: int,
+        settings: Settings,
+        calibration: Calibration | None,
+        predict: Any,
+        *,
+        rows_first: bool = False,
+        **options: Unpack[Options],
+    ) -> None:
+        self._tool, self._shape, self._predict = tool, (n, side, side), predict
+        self._order = slice(None, None, -1 if rows_first else 1)
+        layout = Layout.stacked(n, (side, side))
+        self.measured = ToolSlopes(layout, settings, calibration, **options)
+        self._slopes: NDArray[np.float64] | None = None
+
+    def checked(self, images: Any) -> NDArray[Any]:
+        """Return a tool's images when they are of the windows that there were.
+
+        Raises
+        ------
+        InputError
+            For another number or size.
+        """
+        array = np.asarray(images)
+        if array.shape != self._shape:
+            raise InputError(
+                f"{self._tool}'s images: expected shape {self._shape}, got {array.shape}; attach faintspot "
+                "again when the sensor has changed"
+            )
+        return array
+
+    def places(
+        self, images: NDArray[Any], reference: NDArray[np.float64], unit: float = 1.0, *, noise_free: bool
+    ) -> NDArray[np.float64]:
+        """Return where the spots are, in pixels from the windows' middle, in the tool's order: (2, n).
+
+        Parameters
+        ----------
+        images : (n, side, side) array
+            As `checked` returned them.
+        reference : (2, n) array
+            The tool's reference places, in the same coordinates. Invalid spots are there, too.
+        unit : float
+            Pixels in the tool's unit of slopes.
+        noise_free : bool
+            Whether the tool says that these images have no noise: a calibration's.
+
+        Raises
+        ------
+        InputError
+            As for `ToolSlopes.measure`.
+        """
+        n, side = self._shape[:2]
+        noise_free = noise_free or self.measured.noise_free
+        prior = None
+        if not noise_free:
+            slopes = predicted(self._predict, self._slopes, (2 * n,))
+            if slopes is not None:
+                prior = (slopes.reshape(2, n) * unit + reference)[self._order].ravel()
+        found = self.measured.measure(images.reshape(-1, side), prior_px=prior, noise_free=noise_free)[
+            self._order
+        ]
+        found = np.where(self.measured.last.valid, found, reference)
+        if not noise_free:
+            self._slopes = ((found - reference) / unit).ravel()
+        return found
