@@ -116,6 +116,24 @@ class SlopeTurbulence:
         return np.block([[xx, xy], [xy, yy]])
 
 
+def phase_covariance_rad2(positions_m: Floats, r0_m: float, outer_scale_m: float) -> Floats:
+    """Return the covariance of the phase at 500 nm between points, (n, n) rad^2, without an infinite piston.
+
+    Parameters
+    ----------
+    positions_m : (n, 2) array
+        x and y of points in the pupil.
+    r0_m : float
+        Fried parameter at 500 nm.
+    outer_scale_m : float
+        Of von Karman's spectrum; finite.
+    """
+    structure = _structure(outer_scale_m)
+    x, y = (line[:, None] - line for line in positions_m.T)
+    far = structure(np.array([(1e3 * outer_scale_m) ** 2]))
+    return np.asarray(0.5 * r0_m ** (-5 / 3) * (far - structure(x * x + y * y)))
+
+
 class _Structure:
     """The structure function of the phase, rad^2, at the square of a separation, for r0 = 1 m."""
 
