@@ -90,7 +90,8 @@ def small_table() -> Table:
 def sizes_table() -> Table:
     """Time the compiled filter with more slopes; each goes on by itself, which does not change the time."""
     rng = np.random.default_rng(1)
-    controllers, bytes_read = {}, {}
+    controllers: dict[str, Candidate] = {}
+    bytes_read: dict[str, int] = {}
     for slopes, commands in _SIZES:
         alone = np.eye(slopes)
         predictor = SlopePredictor(SlopeModel(1.5 * alone, -0.6 * alone, 0.1 * alone), np.ones(slopes))

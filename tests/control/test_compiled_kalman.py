@@ -43,7 +43,7 @@ def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, *
 
 def noise(rng: np.random.Generator, largest: float) -> np.ndarray:
     """Return errors that differ by a factor of four between slopes; a tenth was not measured."""
-    error = np.minimum(0.5 * rng.uniform(0.5, 2.0, M), largest)
+    error: np.ndarray = np.minimum(0.5 * rng.uniform(0.5, 2.0, M), largest)
     error[rng.random(M) < 0.1] = np.inf
     return error
 

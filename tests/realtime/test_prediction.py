@@ -89,7 +89,7 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
     stream = pyshmem.create(f"{sky.name}_prediction", shape=(4 * n + 1,), dtype=np.float64)
     sky.until(lambda: not prediction.obstacle)
     rng = np.random.default_rng(3)
-    priors, widths, frames = [np.zeros(2 * n)], [1.0], [sky.pixels]
+    priors, widths, frames = [np.zeros(2 * n)], [np.ones(n)], [sky.pixels]
     variance = np.zeros(2 * n)
     for number, value in ((1, 0.0), (2, 0.0), (4, 0.0), (4, 1e9), (5, np.nan)):
         mean = rng.standard_normal(2 * n)
@@ -103,7 +103,7 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
         priors.append(mean if taken else np.zeros(2 * n))
         width = np.full(n, 0.2 * np.sqrt(number))
         width[:3] = 1.0  # as the settings say
-        widths.append(width if taken else 1.0)
+        widths.append(width if taken else np.ones(n))
     layout, settings, calibration, psf, _ = configuration_file.load_all(path)
     for record, frame, prior, width in zip(sky.records, frames, priors, widths, strict=True):
         wide = settings.replace(prior_std_px=width)
