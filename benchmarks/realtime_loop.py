@@ -126,11 +126,11 @@ def _large() -> Table:
     """Time the integrator's product of an extremely large telescope, ms."""
     rng = np.random.default_rng(1)
     columns = rng.standard_normal((_ELT_SLOPES, _ELT_COMMANDS))
-    slopes, rows = rng.standard_normal(_ELT_SLOPES), np.zeros((2, _ELT_COMMANDS))
+    slopes, line = rng.standard_normal(_ELT_SLOPES), np.zeros((2, _ELT_COMMANDS))
     single = columns.astype(np.float32)
     few = slopes.astype(np.float32)
     candidates: dict[str, Candidate] = {
-        "compiled, float64": partial(Direct(integrate), slopes, columns, 0.4, 0.99, 1e30, rows, 0),
+        "compiled, float64": partial(Direct(integrate), slopes, columns, 0.4, 0.99, 1e30, line, 0),
         "BLAS, float64": lambda: slopes @ columns,
         "BLAS, float32": lambda: few @ single,
     }
