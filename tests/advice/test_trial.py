@@ -101,14 +101,18 @@ def test_refused_interrupted_and_opened(running: tuple[Loop, Sky, Path]) -> None
         assert try_on(loop, proposal, 60.0, stopped).remark == "interrupted; taken back"
         assert (loop.settings().keep_brightest, sky.loop.gain) != (25, 0.3)
         assert sky.loop.gain == gain
-    opens = threading.Timer(0.3, sky.loop.open)
-    opens.start()
-    opened = try_on(loop, Proposal({"keep_brightest": 25}, None, ""), 20.0, threading.Event())
-    opens.join(PATIENCE_S)
-    assert "the loop was opened" in opened.remark
-    assert sky.loop.closed
-    assert loop.ask("status")["arms"] == ["set"]
-    sky.loop.open()
+
+    def diverges() -> None:
+        sky.loop.closed, sky.loop.opened_because = False, "diverged: so"
+
+    for opening, closed in ((diverges, True), (sky.loop.open, False)):
+        opens = threading.Timer(0.3, opening)
+        opens.start()
+        opened = try_on(loop, Proposal({"keep_brightest": 25}, None, ""), 20.0, threading.Event())
+        opens.join(PATIENCE_S)
+        assert "the loop was opened" in opened.remark
+        assert ("closed again" in opened.remark) == closed == sky.loop.closed
+        assert loop.ask("status")["arms"] == ["set"]
     with pytest.raises(InputError, match="expected a closed loop, it is open: asked to"):
         try_on(loop, Proposal({}, 0.3, ""), 1.0, threading.Event())
     sky.loop.close()

@@ -21,11 +21,11 @@ from faintspot.control.configuration import Control, prior_std_px
 from faintspot.errors import InputError
 from faintspot.io.telemetry import Telemetry
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
+from faintspot.realtime.control_loop import BY_REQUEST, CLOSED
 from faintspot.realtime.private_socket import socket_path
 from faintspot.settings import Settings
 
 Floats = NDArray[np.float64]
-_CLOSED = "closed"
 _TURN_FRAMES = 100
 _UNEVEN = 0.2  # of what is left: so far may the figure be off between estimators that answer differently
 _PRESENT = "set"
@@ -97,7 +97,7 @@ class Loop:
             When it is not; it says why.
         """
         status = self.ask("loop", action="status")["loop"]
-        if status["state"] != _CLOSED:
+        if status["state"] != CLOSED:
             why = status.get("opened_because") or "this engine makes no commands"
             raise InputError(f"{self.name}: expected a closed loop, it is {status['state']}: {why}")
 
@@ -111,8 +111,8 @@ def settings_of(values: dict[str, Any]) -> Settings:
 def try_on(loop: Loop, proposal: Proposal, seconds: float, stop: threading.Event) -> Verdict:
     """Have a proposal take turns with the present settings, and keep it where it is better.
 
-    Whatever happens, no arms take turns afterwards; a proposal that is not better, that opens the loop, or
-    that is interrupted leaves everything as it was.
+    Whatever happens, no arms take turns afterwards; a proposal that is not better, that has the guard open
+    the loop, or that is interrupted leaves everything as it was. A loop that somebody opens stays open.
 
     Raises
     ------
@@ -125,12 +125,15 @@ def try_on(loop: Loop, proposal: Proposal, seconds: float, stop: threading.Event
             return _settings_in_turn(loop, proposal, seconds, stop)
         return _gains_in_turn(loop, proposal.gain, seconds, stop)
     except _OpenedError as error:
-        loop.ask("loop", action="close")
-        return Verdict(Estimate(np.nan), np.nan, False, f"the loop was opened: {error}; taken back, closed")
+        words = f"the loop was opened: {error}; taken back"
+        if str(error) != BY_REQUEST:
+            loop.ask("loop", action="close")
+            words += ", closed again"
+        return Verdict(Estimate(np.nan), np.nan, False, words)
 
 
 class _OpenedError(Exception):
-    """The guard has opened the loop."""
+    """The loop is not closed any more."""
 
 
 def _settings_in_turn(loop: Loop, proposal: Proposal, seconds: float, stop: threading.Event) -> Verdict:
@@ -213,7 +216,7 @@ def _guarded(loop: Loop) -> Callable[[], None]:
             return
         looked = time.monotonic()
         status = loop.ask("loop", action="status")["loop"]
-        if status["state"] != _CLOSED:
+        if status["state"] != CLOSED:
             raise _OpenedError(str(status["opened_because"]))
 
     return look

@@ -26,7 +26,8 @@ NONE, OPEN, CLOSED = "none", "open", "closed"
 STATES = (NONE, OPEN, CLOSED)
 """Of a loop; telemetry has their places."""
 _AT_START = "not closed since the engine began"
-_BY_REQUEST = "asked to"
+BY_REQUEST = "asked to"
+"""Why a loop is open that somebody has opened."""
 _BEYOND_OPEN = 1.25  # times the open loop's slopes: a loop that leaves more than that does harm
 _LARGEST_RESIDUAL = 0.25  # of a window's side, where the open loop's are not known
 
@@ -228,7 +229,7 @@ class ControlLoop:
     def open(self) -> None:
         """Open the loop: the mirror keeps what it has."""
         if self.closed:
-            self.opened_because = _BY_REQUEST
+            self.opened_because = BY_REQUEST
             self.guard.end()
         self.closed = False
 
