@@ -88,8 +88,8 @@ def run(
     """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
 
     Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row, or
-    whole from another program's stream; the engine waits for it, and for its return. Each group of sub-
-    apertures is measured as soon as its last row is there. Slopes go out as the pyshmem streams
+    whole from another program's stream; the engine waits for it, and for its return. Each group of
+    sub-apertures is measured as soon as its last row is there. Slopes go out as the pyshmem streams
     NAME_slopes (all x, then all y, px), NAME_details and NAME_marks, each stamped with the frame's
     number; `faintspot realtime record` keeps them. Where the configuration has [control], commands follow
     from them as NAME_commands.
