@@ -188,7 +188,10 @@ def _given(
     """Return the configuration, what of it is that of an AOT file, in words, and that file's references."""
     if isinstance(frames, str | Path) or not frames or configuration.has(path, "layout"):
         return configuration.load_all(path), "", None
-    first, own = split_location(frames[0])
+    try:
+        first, own = split_location(frames[0])
+    except InputError:  # whoever opens it says so, after what is wrong with the configuration
+        return configuration.load_all(path), "", None
     if not is_aot(first):
         return configuration.load_all(path), "", None
     sensor = read_aot(first, own or key)
