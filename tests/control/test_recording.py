@@ -123,6 +123,14 @@ def test_theory_of_a_layout() -> None:
     assert by_side.shape == (3, 18, 18)
     assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0
     assert len(CELLS) == 9
+    told = theories_of(layouts[0], 250.0, layers=[(12.6, 18.0, 0.6), (20.0, 104.0, 0.2)])["winds as told"]
+    assert told.shape == (2, 3, 18, 18)
+    assert np.trace(told[0, 0]) == pytest.approx(3 * np.trace(told[1, 0]))
+    # The wind goes along +x: what one sub-aperture has seen, the next one in this direction sees.
+    along = theories_of(layouts[0], 250.0, layers=[(30.0, 0.0, 1.0)])["winds as told"][0, 2]
+    assert along[1, 0] > 1.2 * along[0, 1]
+    with pytest.raises(InputError, match="layers: strength"):
+        theories_of(layouts[0], 250.0, layers=[(12.0, 18.0, 0.0)])
 
 
 def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
