@@ -77,6 +77,9 @@ def small_table() -> Table:
         "the same, compiled, with four layers": compiled(layered),
         "Kalman filter, constant gain": predictive(line(), steady=True),
     }
+    for each in controllers.values():  # compile
+        each.update(slopes, errors)
+        each.expected()
     with pinned():
         times = interleaved(
             {name: partial(each.update, slopes, errors) for name, each in controllers.items()}
