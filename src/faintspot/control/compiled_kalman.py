@@ -1,300 +1,36 @@
-"""The guarded Kalman filter in compiled code: from a frame's slopes to a command in one call.
-
-What it does is written in NumPy in `guarded`, `predictive`, `kalman` and `telemetry`.
-"""
+"""The guarded Kalman filter in compiled code, as a controller."""
 
 from __future__ import annotations
 
 import math
-from functools import partial
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Expected
 from faintspot.control.commands import CommandLine
-from faintspot.control.compiled import add_products
-from faintspot.control.guarded import CORRELATED_FRAMES, FEWEST_FRAMES, MEMORY_FRAMES, STANDARD_ERRORS
-from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor, shares
-from faintspot.control.telemetry import LEAST_SHARE, LEAST_VARIANCE_PX2
-from faintspot.kernels.compiling import Direct, compiled_with
+from faintspot.control.kalman import SlopePredictor, shares
+from faintspot.control.kalman_kernels import (
+    CHOSEN,
+    COMMAND_ROWS,
+    FOLLOW,
+    FRAMES,
+    GO_ON,
+    HELD,
+    HOLD,
+    LATEST_PLAIN,
+    PREDICTED,
+    SLOPE_ROWS,
+    Lines,
+    Matrices,
+    Memory,
+)
 
 Floats = NDArray[np.float64]
-
-_compiled = partial(compiled_with, source=__file__)
 
 STEPS = 4
 """Of conjugate gradients, for how much each slope corrects."""
 _NO_PRIOR = np.zeros(0)
-
-# Rows of memory: of slopes, and of commands; the first four are commands and what they add to slopes.
-_HELD, _HELD_LEARNT, _HELD_PLAIN, _LATEST_PLAIN, _LEFT_LEARNT, _LEFT_PLAIN, _FOR_PLAIN = range(7)
-_VARIANCE, _SCALE, _SURPRISE, _SOLUTION, _DIRECTION, _IMAGE, _SPARE, _PREDICTED = range(7, 15)
-_SLOPE_ROWS = 15
-_MADE, _LEFT = 4, 5
-_COMMAND_ROWS = 7
-# Of the guard: 1 where the plain one's commands go out; frames; mean difference of late, and its mean square.
-_CHOSEN, _FRAMES, _MEAN, _SQUARE = range(4)
-
-
-class _Matrices(NamedTuple):
-    """What does not change, each transposed: what a product adds up lies side by side."""
-
-    interaction: Any
-    """(commands, m)"""
-    reconstruct: Any
-    """(m, commands)"""
-    covariance: Any
-    """(m, states): of the state's error with the slopes' before a frame is measured."""
-    uncertainty: Any
-    """(m, m): of the slopes' error."""
-    usual_inverse: Any
-    """(m, m): of the slopes' covariance with their usual noise."""
-    usual_variance: Any
-    """(m,): its diagonal, before it was inverted."""
-    onward: Any
-    """(layers, 2 m, m)"""
-    command: Any
-    """(states, commands): from the state."""
-
-
-class _Lines(NamedTuple):
-    """Commands on their way: to the mirror, and those of the two controllers."""
-
-    true: Any
-    """(delay + 1, commands)"""
-    learnt: Any
-    plain: Any
-
-
-class _Memory(NamedTuple):
-    """What goes on from frame to frame, and what is made in between."""
-
-    state: Any
-    """(layers, 2, m): as predicted for the coming frame."""
-    guard: Any
-    """(4,)"""
-    slopes: Any
-    """(_SLOPE_ROWS, m)"""
-    commands: Any
-    """(_COMMAND_ROWS, commands)"""
-
-
-@_compiled
-def _take(slopes: Any, errors: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any) -> None:
-    """Write what both controllers make of slopes; see `Guarded.update` and `telemetry.without_prior`."""
-    for s in range(slopes.shape[0]):
-        held, of_learnt, of_plain = rows[_HELD, s], rows[_HELD_LEARNT, s], rows[_HELD_PLAIN, s]
-        latest = rows[_LATEST_PLAIN, s]
-        measured = errors[s] < math.inf
-        variance = max(errors[s] * errors[s], LEAST_VARIANCE_PX2)
-        alone, trust = slopes[s], 1.0 if measured else 0.0
-        if prior_std.shape[0] > 0:
-            expected = held - latest if chosen else held + rows[_PREDICTED, s]
-            prior = prior_std[s] * prior_std[s]
-            share = max(prior / variance - 1.0, LEAST_SHARE)
-            alone = expected + (slopes[s] - expected) * (1.0 + share) / share
-            variance = prior / share
-            trust = trust * share / (1.0 + share)
-        open_loop = alone - held
-        rows[_LEFT_LEARNT, s] = trust * (open_loop + of_learnt)
-        residual, expects = open_loop + of_plain, of_plain - latest
-        rows[_LEFT_PLAIN, s] = trust * residual
-        rows[_FOR_PLAIN, s] = expects + trust * (residual - expects)
-        noise = noise_factor * variance
-        measured = measured and noise < LARGEST_VARIANCE_PX2
-        rows[_VARIANCE, s] = noise if measured else math.inf
-        rows[_SURPRISE, s] = open_loop - rows[_PREDICTED, s] if measured else 0.0
-
-
-@_compiled
-def _solve(matrices: Any, rows: Any, steps: Any) -> None:
-    """Write x with (S + V) x = surprise: S of the predicted slopes' error, V of this frame's noise.
-
-    Conjugate gradients among the slopes that were measured. What they are preconditioned by is the inverse
-    for the usual noise, scaled to this frame's variances: nearly the solution, where noise is not much other
-    than usual.
-    """
-    m = rows.shape[1]
-    variance, scale, left = rows[_VARIANCE], rows[_SCALE], rows[_SURPRISE]
-    solution, direction = rows[_SOLUTION], rows[_DIRECTION]
-    for s in range(m):
-        own = matrices.uncertainty[s, s]
-        scale[s] = math.sqrt(matrices.usual_variance[s] / (own + variance[s]))  # 0: not measured
-        solution[s] = direction[s] = 0.0
-    before = 0.0
-    for _ in range(steps):
-        for s in range(m):
-            rows[_SPARE, s] = scale[s] * left[s]
-            rows[_IMAGE, s] = 0.0
-        add_products(matrices.usual_inverse, rows[_SPARE : _SPARE + 1], rows[_IMAGE : _IMAGE + 1])
-        descent = 0.0
-        for s in range(m):
-            rows[_IMAGE, s] *= scale[s]
-            descent += rows[_IMAGE, s] * left[s]
-        if not descent > 0.0:
-            return
-        more = descent / before if before > 0.0 else 0.0
-        before = descent
-        for s in range(m):
-            direction[s] = rows[_IMAGE, s] + more * direction[s]
-            rows[_IMAGE, s] = 0.0
-        add_products(matrices.uncertainty, rows[_DIRECTION : _DIRECTION + 1], rows[_IMAGE : _IMAGE + 1])
-        curvature = 0.0
-        for s in range(m):
-            if scale[s] > 0.0:
-                rows[_IMAGE, s] += variance[s] * direction[s]
-                curvature += direction[s] * rows[_IMAGE, s]
-        step = descent / curvature
-        for s in range(m):
-            if scale[s] > 0.0:
-                solution[s] += step * direction[s]
-                left[s] -= step * rows[_IMAGE, s]
-
-
-@_compiled
-def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) -> float:
-    """Correct the state, and write the command that follows; return its sum before it is cut."""
-    rows = memory.slopes
-    whole = memory.state.reshape(1, memory.state.size)
-    _solve(matrices, rows, steps)
-    add_products(matrices.covariance, rows[_SOLUTION : _SOLUTION + 1], whole)
-    made, total = memory.commands[_MADE : _MADE + 1], 0.0
-    made[:] = 0.0
-    add_products(matrices.command, whole, made)
-    for c in range(command.shape[0]):
-        total += made[0, c]
-        command[c] = min(max(made[0, c], -largest), largest)
-    return total
-
-
-@_compiled
-def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> None:
-    """Write the integrator's command."""
-    made = memory.commands[_MADE : _MADE + 1]
-    made[:] = 0.0
-    add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], made)
-    for c in range(command.shape[0]):
-        wanted = keep * memory.commands[_LATEST_PLAIN, c] - gain * made[0, c]
-        command[c] = min(max(wanted, -largest), largest)
-
-
-@_compiled
-def _advance(matrices: Any, memory: Any) -> None:
-    """Take the filter's state on to the next frame."""
-    state, rows = memory.state, memory.slopes
-    now, m = rows[_SPARE : _SPARE + 1], rows.shape[1]
-    rows[_PREDICTED] = 0.0
-    for layer in range(state.shape[0]):
-        now[:] = 0.0
-        add_products(matrices.onward[layer], state[layer].reshape(1, 2 * m), now)
-        for s in range(m):
-            state[layer, 1, s] = state[layer, 0, s]
-            state[layer, 0, s] = now[0, s]
-            rows[_PREDICTED, s] += now[0, s]
-
-
-@_compiled
-def _choose(guard: Any, learnt: Any, plain: Any) -> None:
-    """Let the one that leaves less have the mirror; see `Guarded`."""
-    difference = (learnt - plain) / max(learnt + plain, 1e-30)
-    guard[_FRAMES] += 1.0
-    share = 1.0 / min(guard[_FRAMES], MEMORY_FRAMES)
-    guard[_MEAN] += share * (difference - guard[_MEAN])
-    guard[_SQUARE] += share * (difference * difference - guard[_SQUARE])
-    if guard[_FRAMES] < FEWEST_FRAMES:
-        return
-    values = min(guard[_FRAMES], 2 * MEMORY_FRAMES) / CORRELATED_FRAMES
-    variance = max(0.0, guard[_SQUARE] - guard[_MEAN] * guard[_MEAN]) / values
-    if abs(guard[_MEAN]) > STANDARD_ERRORS * math.sqrt(variance):
-        guard[_CHOSEN] = 1.0 if guard[_MEAN] > 0.0 else 0.0
-
-
-@_compiled
-def hold(matrices: Any, lines: Any, places: Any, memory: Any) -> None:
-    """Write what the commands that act in the coming frame add to slopes.
-
-    Parameters
-    ----------
-    matrices : _Matrices
-    lines : _Lines
-    places : (int, int, int)
-        Where the lines' next commands go.
-    memory : _Memory
-    """
-    rows, commands, length = memory.slopes, memory.commands, lines.true.shape[0]
-    here, of_learnt, of_plain = places
-    for c in range(commands.shape[1]):
-        commands[_HELD, c] = lines.true[(here + 1) % length, c]
-        commands[_HELD_LEARNT, c] = lines.learnt[(of_learnt + 1) % length, c]
-        commands[_HELD_PLAIN, c] = lines.plain[(of_plain + 1) % length, c]
-        commands[_LATEST_PLAIN, c] = lines.plain[(of_plain + length - 1) % length, c]
-    rows[: _LATEST_PLAIN + 1] = 0.0
-    add_products(matrices.interaction, commands[: _LATEST_PLAIN + 1], rows[: _LATEST_PLAIN + 1])
-
-
-@_compiled
-def follow(
-    slopes: Any,
-    errors: Any,
-    prior_std: Any,
-    noise_factor: Any,
-    numbers: Any,
-    matrices: Any,
-    lines: Any,
-    places: Any,
-    memory: Any,
-) -> float:
-    """Write the mirror's next command, which is that of one of the controllers; return the filter's sum.
-
-    Parameters
-    ----------
-    slopes, errors : (m,) float64 arrays
-        Finite; infinite error: not measured.
-    prior_std : (m,) or (0,) float64 array
-        Prior of the estimator; none.
-    noise_factor : float
-        Of the errors' variances.
-    numbers : (float, float, float, int)
-        The integrator's gain, what it keeps of its command, stroke, steps of conjugate gradients.
-    matrices, lines, places, memory
-        As for `hold`, which was called before.
-    """
-    here, of_learnt, of_plain = places
-    gain, keep, largest, steps = numbers
-    plainly, total = memory.guard[_CHOSEN] > 0.0, 0.0
-    _take(slopes, errors, prior_std, noise_factor, memory.slopes, plainly)
-    if plainly:
-        _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
-    else:
-        total = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
-    for c in range(lines.true.shape[1]):
-        lines.true[here, c] = lines.plain[of_plain, c] if plainly else lines.learnt[of_learnt, c]
-    return total
-
-
-@_compiled
-def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> None:
-    """Do what is left of a frame when the mirror's command is out: the other one's, the guard, the state."""
-    _, of_learnt, of_plain = places
-    gain, keep, largest, steps = numbers
-    if memory.guard[_CHOSEN] > 0.0:
-        _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
-    else:
-        _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
-    left = memory.commands[_LEFT : _LEFT + 2]
-    left[:] = 0.0
-    add_products(matrices.reconstruct, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
-    learnt, plain = 0.0, 0.0
-    for c in range(left.shape[1]):
-        learnt += left[0, c] * left[0, c]
-        plain += left[1, c] * left[1, c]
-    _choose(memory.guard, learnt, plain)
-    _advance(matrices, memory)
-
-
-_HOLD, _FOLLOW, _GO_ON = Direct(hold), Direct(follow), Direct(go_on)
 
 
 class CompiledKalman:
@@ -351,7 +87,7 @@ class CompiledKalman:
         self.prior_std_px = prior_std_px
         ahead = -clean @ predictor.model.ahead(line.delay_frames)
         usual = predictor.usual_px2
-        self._matrices = _Matrices(
+        self._matrices = Matrices(
             np.ascontiguousarray(interaction.T),
             np.ascontiguousarray(reconstruct.T),
             np.ascontiguousarray(predictor.with_slopes.T),
@@ -361,14 +97,14 @@ class CompiledKalman:
             np.ascontiguousarray(predictor.model.both.swapaxes(1, 2)),
             np.ascontiguousarray(ahead.T),
         )
-        self._lines = _Lines(line.rows, self._learnt.rows, self._plain.rows)
-        self._memory = _Memory(
+        self._lines = Lines(line.rows, self._learnt.rows, self._plain.rows)
+        self._memory = Memory(
             np.zeros((predictor.model.layers, 2, slopes)),
             np.zeros(4),
-            np.zeros((_SLOPE_ROWS, slopes)),
-            np.zeros((_COMMAND_ROWS, commands)),
+            np.zeros((SLOPE_ROWS, slopes)),
+            np.zeros((COMMAND_ROWS, commands)),
         )
-        self._memory.guard[_CHOSEN] = prefers_plain
+        self._memory.guard[CHOSEN] = prefers_plain
         self._noise_factor = float(noise_factor)
         self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
@@ -380,15 +116,15 @@ class CompiledKalman:
     def chosen(self) -> int:
         """0: the filter's commands go out; 1: the integrator's."""
         self._catch_up()
-        return int(self._memory.guard[_CHOSEN])
+        return int(self._memory.guard[CHOSEN])
 
     def expected(self) -> Expected:
         """See `Controller`."""
         self._catch_up()
         rows = self._memory.slopes
-        if self._memory.guard[_CHOSEN]:
-            return Expected(rows[_HELD] - rows[_LATEST_PLAIN], None)
-        return Expected(rows[_HELD] + rows[_PREDICTED], self._std_px)
+        if self._memory.guard[CHOSEN]:
+            return Expected(rows[HELD] - rows[LATEST_PLAIN], None)
+        return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
 
     def begin(self) -> None:
         """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
@@ -397,8 +133,8 @@ class CompiledKalman:
             own.hold(latest)
         open_loop = -(self._interaction @ latest)
         self._memory.state[:] = self._shares[:, None, None] * open_loop
-        self._memory.slopes[_PREDICTED] = open_loop
-        self._memory.guard[_FRAMES:] = 0.0
+        self._memory.slopes[PREDICTED] = open_loop
+        self._memory.guard[FRAMES:] = 0.0
         self._is_behind, self._held_at = False, -1
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
@@ -411,7 +147,7 @@ class CompiledKalman:
         """
         self._catch_up()
         prior = self.prior_std_px
-        total = _FOLLOW(
+        total = FOLLOW(
             slopes_px,
             standard_error_px,
             _NO_PRIOR if prior is None else prior,
@@ -430,12 +166,12 @@ class CompiledKalman:
     def _catch_up(self) -> None:
         """Do what is left of the frame before."""
         if self._is_behind:
-            _GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
+            GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
             self._learnt.sent()
             self._plain.sent()
             self._is_behind, self._held_at = False, -1
         if self._held_at != self._line.place:
-            _HOLD(self._matrices, self._lines, self._places(), self._memory)
+            HOLD(self._matrices, self._lines, self._places(), self._memory)
             self._held_at = self._line.place
 
     def _places(self) -> tuple[int, int, int]:
