@@ -108,7 +108,8 @@ class Model:
     def with_noise(self, scale: float) -> Model:
         """Return what "kalman" would have learnt with the variances of the noise so many times as large."""
         arrays = {**self.arrays, "variance_px2": scale * self.arrays["variance_px2"]}
-        return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor)
+        text = f"{self.description}, and {scale:g} of that"
+        return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor, description=text)
 
     @cached_property
     def _slopes(self) -> SlopeModel:
