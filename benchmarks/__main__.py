@@ -28,6 +28,7 @@ _ORDER = (
     "breakdown",
     "realtime",
     "realtime_loop",
+    "advice",
     "live_page",
     "latency",
     "realtime_sustained",

@@ -1,9 +1,10 @@
 """Control: microseconds a frame, from slopes to commands.
 
-Of the 4.2 m telescope, 72 slopes, every controller as it is. Of an extremely large telescope, 9,232 slopes
-and 4,600 commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and
-sparse ones of which each slope knows its neighbours within four sub-apertures (filled with random numbers:
-what they hold does not change the time).
+Of the 4.2 m telescope, 72 slopes, every controller as it is; for more slopes the compiled Kalman filter with
+its guard, as the engine and the simulation run it. Of an extremely large telescope, 9,232 slopes and 4,600
+commands, the products that a Kalman filter with a constant gain consists of: whole matrices, and sparse ones
+of which each slope knows its neighbours within four sub-apertures. They are filled with random numbers: what
+they hold does not change the time.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from scipy import sparse
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
+from faintspot.control.compiled_kalman import CompiledKalman
+from faintspot.control.guarded import Guarded
 from faintspot.control.kalman import SlopePredictor
 from faintspot.control.learning import Plant
 from faintspot.control.models import SlopeModel
@@ -26,6 +29,7 @@ from faintspot.loop.control import slope_turbulence
 from faintspot.loop.observatory import prepare
 
 _NOISE_PX = 0.5
+_SIZES = (72, 54), (160, 97), (640, 400)
 _LARGE, _LARGE_COMMANDS, _ACROSS, _REACH = 9232, 4600, 68, 4
 
 
@@ -33,9 +37,10 @@ def small_table() -> Table:
     """Time the controllers of the 4.2 m telescope."""
     configuration = load_loop("diffraction_limit")
     optics, control = prepare(configuration), configuration.control
-    covariances = slope_turbulence(configuration, optics.sensor.layout.cells).lagged_px2(
-        1 / control.frame_rate_hz
-    )
+    frame_s = 1 / control.frame_rate_hz
+    turbulence = slope_turbulence(configuration, optics.sensor.layout.cells)
+    covariances = turbulence.lagged_px2(frame_s)
+    layered = SlopeModel.of_covariances(np.array([each.lagged_px2(frame_s) for each in turbulence.layers()]))
     plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
     slopes = np.random.default_rng(1).standard_normal(len(optics.interaction))
     errors = np.full(len(slopes), _NOISE_PX)
@@ -48,6 +53,10 @@ def small_table() -> Table:
         predictor = SlopePredictor(model, errors**2, steady=steady)
         return Predictive(line, plant.interaction, predictor, clean)
 
+    def compiled(model: SlopeModel) -> Controller:
+        matrix, predictor = plant.reconstructor.matrix, SlopePredictor(model, errors**2)
+        return CompiledKalman(line(), plant.interaction, matrix, predictor, clean, 0.3, control.leak)
+
     controllers: dict[str, Controller] = {
         "integrator": plant.integrator(0.4, line()),
         "integrator, a gain for each mode": plant.integrator(
@@ -57,14 +66,52 @@ def small_table() -> Table:
             line(), plant.interaction, covariances[0], covariances[2], clean, 0.3
         ),
         "Kalman filter, gain of each frame": predictive(line(), steady=False),
+        "the same with its guard": Guarded(
+            line(),
+            plant.interaction,
+            plant.reconstructor.matrix,
+            partial(predictive, steady=False),
+            partial(plant.integrator, 0.3),
+        ),
+        "the same, compiled": compiled(model),
+        "the same, compiled, with four layers": compiled(layered),
         "Kalman filter, constant gain": predictive(line(), steady=True),
     }
+    for each in controllers.values():  # compile
+        each.update(slopes, errors)
+        each.expected()
     with pinned():
         times = interleaved(
             {name: partial(each.update, slopes, errors) for name, each in controllers.items()}
         )
     rows = [Row(name, {"us a frame": best(times, name) * 1e6}) for name in controllers]
     return Table("control", f"Control with {len(slopes)} slopes, one core", rows)
+
+
+def sizes_table() -> Table:
+    """Time the compiled filter with more slopes; each goes on by itself, which does not change the time."""
+    rng = np.random.default_rng(1)
+    controllers: dict[str, Candidate] = {}
+    bytes_read = {}
+    for slopes, commands in _SIZES:
+        alone = np.eye(slopes)[None]
+        predictor = SlopePredictor(SlopeModel(1.5 * alone, -0.6 * alone, 0.1 * alone), np.ones(slopes))
+        interaction = rng.standard_normal((slopes, commands)) / np.sqrt(slopes)
+        line = CommandLine(commands, 2, 1.0)
+        name = f"{slopes} slopes, {commands} commands"
+        of_mirror = interaction, interaction.T
+        filtered = CompiledKalman(line, *of_mirror, predictor, interaction.T, 0.3, 0.01)
+        controllers[name] = partial(
+            filtered.update, 0.1 * rng.standard_normal(slopes), rng.uniform(0.5, 1.5, slopes)
+        )
+        bytes_read[name] = 8 * slopes * (12 * slopes + 5 * commands)
+    with pinned():
+        times = interleaved(controllers)
+    rows = [
+        Row(name, {"us a frame": best(times, name) * 1e6, "GB/s": bytes_read[name] / best(times, name) / 1e9})
+        for name in controllers
+    ]
+    return Table("control-sizes", "Compiled Kalman filter with its guard, one core", rows)
 
 
 def large_table() -> Table:
@@ -102,4 +149,4 @@ def _neighbours() -> Any:
 
 def run() -> list[Table]:
     """Time control."""
-    return [small_table(), large_table()]
+    return [small_table(), sizes_table(), large_table()]

@@ -7,6 +7,8 @@ from tests.cli.cli_cases import Commands
 from tests.loop.experiment_cases import PLAN, SEARCH, small
 
 import faintspot.cli
+from faintspot import configuration
+from faintspot.control.configuration import load_control
 from faintspot.loop import budget, interleaved, magnitude
 from faintspot.loop.configuration import LoopConfiguration, load_loop, shipped_loops
 
@@ -65,11 +67,26 @@ def test_budget(run: Commands) -> None:
     assert lines[-1] == "small-quick/report.html: open it in a browser"
 
 
+def test_engine_files_close_the_loop(run: Commands) -> None:
+    """What `tune --loop` has chosen stays, and an engine has all that it needs."""
+    Path("bench").mkdir()
+    Path("bench/faintspot.toml").write_text('[estimator]\nname = "centroid"\n', encoding="utf-8")
+    result = run("loop", "engine", "small.toml", "-o", "bench", "--rate", 100)
+    assert result.out.endswith("next: faintspot realtime run --config bench/faintspot.toml --close-loop\n")
+    settings = configuration.load_all("bench/faintspot.toml").settings
+    control = load_control("bench/faintspot.toml")
+    assert settings.estimator.name == "centroid"
+    assert control is not None
+    assert control.options.gain == load_loop("small.toml").control.gain
+    assert control.reference is not None
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["run", "nowhere.toml"], "nowhere.toml: no such file; none of the shipped configurations"),
         (["show", "nowhere"], "nowhere: no such file"),
+        (["engine", "small.toml", "--rate", "0"], "frame_rate_hz"),
         (["magnitude", "small.toml", "--arms", "kog"], "arm = 'kog': expected one of"),
         (["magnitude", "small.toml", "--photons", "1,x"], "--photons: expected numbers with commas, got 'x'"),
         (["magnitude", "small.toml", "--photons", "-1"], "photons"),

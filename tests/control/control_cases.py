@@ -23,19 +23,29 @@ TURBULENCE = SlopeTurbulence(
 )
 COVARIANCES = TURBULENCE.lagged_px2(FRAME_S)
 MODEL = SlopeModel.of_covariances(COVARIANCES)
+LAYERS = SlopeModel.of_covariances(np.array([layer.lagged_px2(FRAME_S) for layer in TURBULENCE.layers()]))
 INTERACTION = np.random.default_rng(1).standard_normal((18, 12))
 ERRORS = np.full(18, 0.3)
 PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
 
 
-def telemetry(frames: int = 2000, noise_px: float = 0.5, seed: int = 5, said: float = 1.0) -> Telemetry:
-    """Return slopes as `MODEL` makes them, with noise; errors are said to be so many times the true ones."""
+def telemetry(
+    frames: int = 2000, noise_px: float = 0.5, seed: int = 5, said: float = 1.0, model: SlopeModel = MODEL
+) -> Telemetry:
+    """Return slopes as a model makes them, with noise; errors are said to be so many times the true ones."""
     rng = np.random.default_rng(seed)
-    driving = np.linalg.cholesky(MODEL.driving)
-    state, slopes = np.zeros((2, 18)), []
+    driving = np.linalg.cholesky(model.driving)
+    now = before = np.zeros((model.layers, 18))
+    slopes = []
     for _ in range(frames + 300):
-        new = MODEL.first @ state[0] + MODEL.second @ state[1] + driving @ rng.standard_normal(18)
-        state = np.stack([new, state[0]])
-        slopes.append(new)
+        chance = rng.standard_normal((model.layers, 18))
+        new = [
+            first @ one + second @ two + each @ random
+            for first, second, each, one, two, random in zip(
+                model.first, model.second, driving, now, before, chance, strict=True
+            )
+        ]
+        now, before = np.array(new), now
+        slopes.append(now.sum(axis=0))
     noisy = np.array(slopes[300:]) + noise_px * rng.standard_normal((frames, 18))
     return Telemetry(noisy, np.full(noisy.shape, (said * noise_px) ** 2), np.ones(noisy.shape))

@@ -2,20 +2,26 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are
-from tests.control.control_cases import COVARIANCES, ERRORS, MODEL, telemetry
+from scipy.linalg import block_diag, solve_discrete_are
+from tests.control.control_cases import COVARIANCES, ERRORS, LAYERS, MODEL, telemetry
 
 from faintspot.control.kalman import SlopePredictor, steady_covariance
 from faintspot.control.models import SlopeModel
 
+MODELS = pytest.mark.parametrize("model", [MODEL, LAYERS], ids=["one layer", "two layers"])
 
-def _textbook() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return transition, driving noise and observation of the state [z[k], z[k - 1]]."""
-    m = MODEL.slopes
-    onward = np.block([[MODEL.first, MODEL.second], [np.eye(m), np.zeros((m, m))]])
-    driving = np.zeros((2 * m, 2 * m))
-    driving[:m, :m] = MODEL.driving
-    return onward, driving, np.eye(m, 2 * m)
+
+def _textbook(model: SlopeModel = MODEL) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return transition, driving noise and observation of the state [y[k], y[k - 1]] of all layers."""
+    m = model.slopes
+    zero = np.zeros((m, m))
+    layers = zip(model.first, model.second, model.driving, strict=True)
+    parts = [
+        (np.block([[first, second], [np.eye(m), zero]]), np.block([[driving, zero], [zero, zero]]))
+        for first, second, driving in layers
+    ]
+    onward, driving = (block_diag(*each) for each in zip(*parts, strict=True))
+    return onward, driving, np.hstack([np.eye(m), zero] * len(parts))
 
 
 def test_yule_walker_gives_back_a_model() -> None:
@@ -28,32 +34,35 @@ def test_yule_walker_gives_back_a_model() -> None:
         state = onward @ state @ onward.T + driving
     m = MODEL.slopes
     again = SlopeModel.of_covariances(np.array([state[:m, :m], state[:m, m:], (onward @ state)[:m, m:]]))
-    wrong = (again.both - MODEL.both) @ state @ (again.both - MODEL.both).T
-    assert wrong.trace() < 0.05 * MODEL.driving.trace()
-    assert again.driving.trace() == pytest.approx(MODEL.driving.trace(), rel=0.1)
-    assert MODEL.driving.trace() < 0.05 * COVARIANCES[0].trace()
+    wrong = (again.both - MODEL.both)[0] @ state @ (again.both - MODEL.both)[0].T
+    assert wrong.trace() < 0.05 * MODEL.driving[0].trace()
+    assert again.driving[0].trace() == pytest.approx(MODEL.driving[0].trace(), rel=0.1)
+    assert MODEL.driving[0].trace() < 0.05 * COVARIANCES[0].trace()
 
 
-def test_ahead_repeats_the_recursion() -> None:
-    onward, _, seen = _textbook()
-    np.testing.assert_allclose(MODEL.ahead(0), seen)
-    np.testing.assert_allclose(MODEL.ahead(3), seen @ onward @ onward @ onward, atol=1e-12)
+@MODELS
+def test_ahead_repeats_the_recursion(model: SlopeModel) -> None:
+    onward, _, seen = _textbook(model)
+    np.testing.assert_allclose(model.ahead(0), seen)
+    np.testing.assert_allclose(model.ahead(3), seen @ onward @ onward @ onward, atol=1e-12)
 
 
-def test_the_steady_error_solves_the_riccati_equation() -> None:
-    onward, driving, seen = _textbook()
-    variance = np.linspace(0.05, 0.5, MODEL.slopes)
+@MODELS
+def test_the_steady_error_solves_the_riccati_equation(model: SlopeModel) -> None:
+    onward, driving, seen = _textbook(model)
+    variance = np.linspace(0.05, 0.5, model.slopes)
     expected = solve_discrete_are(onward.T, seen.T, driving, np.diag(variance))
-    np.testing.assert_allclose(steady_covariance(MODEL, variance), expected, atol=1e-8)
+    np.testing.assert_allclose(steady_covariance(model, variance), expected, atol=1e-8)
 
 
+@MODELS
 @pytest.mark.parametrize("steady", [True, False])
-def test_the_filter_is_the_textbook_s(steady: bool) -> None:
+def test_the_filter_is_the_textbook_s(model: SlopeModel, steady: bool) -> None:
     """With equal noise in all frames, a Kalman filter written out that starts with the steady error."""
-    onward, driving, seen = _textbook()
+    onward, driving, seen = _textbook(model)
     variance = ERRORS**2
-    predictor = SlopePredictor(MODEL, variance, steady=steady)
-    state, error = np.zeros(2 * MODEL.slopes), predictor.covariance
+    predictor = SlopePredictor(model, variance, steady=steady)
+    state, error = np.zeros(model.states), predictor.covariance
     for slopes in telemetry(60).open_loop_px:
         predictor.correct(slopes.copy(), variance)
         gain = error @ seen.T @ np.linalg.inv(seen @ error @ seen.T + np.diag(variance))
@@ -63,6 +72,7 @@ def test_the_filter_is_the_textbook_s(steady: bool) -> None:
         predictor.advance()
         state, error = onward @ state, onward @ error @ onward.T + driving
         np.testing.assert_allclose(predictor.state, state, atol=1e-7)
+        np.testing.assert_allclose(predictor.mean_px, seen @ state, atol=1e-7)
 
 
 def test_predictions_are_as_far_off_as_they_say() -> None:

@@ -10,12 +10,12 @@ import pytest
 from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
 
 from faintspot.control.commands import CommandLine
+from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import Control, ControlOptions
 from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
 from faintspot.control.learnt import Learnt, Model
 from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
-from faintspot.settings import Settings
 
 KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
 FRAMES = telemetry(600, 0.3)
@@ -23,7 +23,7 @@ FRAMES = telemetry(600, 0.3)
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, Learnt]:
-    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES}) for kind in KINDS}
+    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES[None]}) for kind in KINDS}
 
 
 def commands(controller: Any, line: CommandLine, frames: int = 60) -> np.ndarray:
@@ -69,16 +69,16 @@ def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Lear
     assert np.linalg.norm(line.latest - held) < 0.35 * np.linalg.norm(held)
 
 
-def test_the_prior_is_as_wide_as_the_filter_is_sure(learnt: dict[str, Learnt]) -> None:
-    model = learnt["kalman"].model
-    control = Control(INTERACTION, None, ControlOptions(controller="kalman"), model)
-    assert control.prediction == "controller"
-    std = model.expected_std_px
-    assert std is not None
-    found = control.settings(Settings("map")).prior_std_px
-    np.testing.assert_allclose(found, np.sqrt((std[:9] ** 2 + std[9:] ** 2) / 2))
-    assert control.settings(Settings("brightest")) == Settings("brightest")
-    assert Control(INTERACTION).settings(Settings("map")) == Settings("map")
+def test_another_controller_of_the_same_loop(learnt: dict[str, Learnt]) -> None:
+    """The integrator needs no model; only the filter tells estimators what it expects, if nothing is said."""
+    control = Control(INTERACTION, None, ControlOptions(gain=0.3), learnt["kalman"].model)
+    filtered = control.with_controller("kalman")
+    assert isinstance(filtered.controller(filtered.line()), CompiledKalman)
+    assert (control.prediction, filtered.prediction) == ("none", "controller")
+    assert filtered.with_controller("integrator").options == control.options
+    assert control.with_controller("integrator") is control
+    with pytest.raises(InputError, match="expected what 'modal' has learnt, got that of 'kalman'"):
+        control.with_controller("modal")
 
 
 def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
@@ -100,8 +100,10 @@ def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
     Control(INTERACTION).check_errors(Calibration())
     refused('prediction = "stream"', ControlOptions(controller="kalman", prediction="stream"))
     arrays = dict(np.load(path))
-    np.savez(path, **{**arrays, "first": arrays["first"][:4]})
-    refused("first: expected shape (18, 18), got (4, 18)", kalman)
+    np.savez(path, **{**arrays, "first": arrays["first"][0]})
+    refused("first: expected shape (1, 18, 18), got (18, 18)", kalman)
+    np.savez(path, **{**arrays, "first": np.tile(arrays["first"], (2, 1, 1))})
+    refused("second: expected shape (2, 18, 18), got (1, 18, 18)", kalman)
     np.savez(path, **{**arrays, "variance_px2": np.full(18, np.nan)})
     refused("variance_px2: expected finite numbers", kalman)
     np.savez(path, **{**arrays, "kind": "pid"})

@@ -45,6 +45,7 @@ def recording(frames: int = 700) -> Any:
     slopes_px = np.array(slopes, np.float32)[kept]
     error = np.full((len(kept), 9), 0.3 * GAIN, np.float32)
     return SimpleNamespace(
+        attributes={"arms": ["set"]},
         frame=kept,
         loop=np.where(kept < 40, 1, 2),
         commands=np.array(sent, np.float32)[kept],
@@ -92,6 +93,10 @@ def test_what_is_refused() -> None:
     told = Control(INTERACTION, None, OPTIONS.replaced({"prediction": "stream"}))
     with pytest.raises(InputError, match="expected a loop closed with an integrator"):
         telemetry_of_recording(recording(), told, np.full(18, 0.3))
+    night = recording()
+    night.attributes["arms"] = ["window+integrator", "map+kalman"]
+    with pytest.raises(InputError, match="expected a loop closed with an integrator"):
+        telemetry_of_recording(night, CONTROL, np.full(18, 0.3))
     for changes, message in (
         ({"commands": np.zeros((699, 0))}, "expected 12 commands, as the interaction matrix has, got 0"),
         ({"loop": np.ones(699)}, "expected 202 frames in a row with a closed loop, got 0"),
@@ -113,11 +118,19 @@ def test_theory_of_a_layout() -> None:
         Layout.grid((3, 3), pixels=8, subaperture_m=0.6),
         Layout.grid((3, 3), pixels=8, diameter_m=1.8),
     )
-    by_side, by_diameter = (theories_of(each, 250.0)["winds from anywhere"] for each in layouts)
+    by_side, by_diameter = (theories_of(each, 250.0)["winds from anywhere"][0] for each in layouts)
     np.testing.assert_allclose(by_side, by_diameter)
     assert by_side.shape == (3, 18, 18)
     assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0
     assert len(CELLS) == 9
+    told = theories_of(layouts[0], 250.0, layers=[(12.6, 18.0, 0.6), (20.0, 104.0, 0.2)])["winds as told"]
+    assert told.shape == (2, 3, 18, 18)
+    assert np.trace(told[0, 0]) == pytest.approx(3 * np.trace(told[1, 0]))
+    # The wind goes along +x: what one sub-aperture has seen, the next one in this direction sees.
+    along = theories_of(layouts[0], 250.0, layers=[(30.0, 0.0, 1.0)])["winds as told"][0, 2]
+    assert along[1, 0] > 1.2 * along[0, 1]
+    with pytest.raises(InputError, match="layers: strength"):
+        theories_of(layouts[0], 250.0, layers=[(12.0, 18.0, 0.0)])
 
 
 def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

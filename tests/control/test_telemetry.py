@@ -4,7 +4,16 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, MODEL, PLANT, TURBULENCE, telemetry
+from tests.control.control_cases import (
+    COVARIANCES,
+    FRAME_S,
+    INTERACTION,
+    LAYERS,
+    MODEL,
+    PLANT,
+    TURBULENCE,
+    telemetry,
+)
 
 from faintspot.control.identification import Strengths, identify
 from faintspot.control.kalman import SlopePredictor
@@ -15,7 +24,8 @@ from faintspot.control.predictive import Predictive
 from faintspot.control.smoothing import smoothed_moments
 from faintspot.control.telemetry import Telemetry, usual_variance, without_prior
 
-AGAINST = TURBULENCE.turned(3.0, 180.0).lagged_px2(FRAME_S)
+AGAINST = TURBULENCE.turned(3.0, 180.0).lagged_px2(FRAME_S)[None]
+RIGHT = COVARIANCES[None]
 
 
 def test_a_prior_is_taken_out_again() -> None:
@@ -63,12 +73,23 @@ def _score(model: SlopeModel, frames: Telemetry) -> float:
 
 def test_the_right_theory_is_chosen_and_a_wrong_one_is_mended() -> None:
     frames = telemetry(1500, 0.5)
-    both = identify(frames, {"against": AGAINST, "right": COVARIANCES}, _score)
-    assert both.theory == "right"
+    both = identify(frames, {"against": AGAINST, "right": RIGHT}, _score)
+    assert both.source.startswith("right")
     wrong_only = identify(frames, {"against": AGAINST}, _score)
-    assert wrong_only.measured_share > 0
+    assert "measured moments" in wrong_only.source
     unmended = identify(frames, {"against": AGAINST}, _score, shares=())
     assert both.score < wrong_only.score < unmended.score
+
+
+def test_layers_are_told_apart_where_that_leaves_less() -> None:
+    """Slopes of two layers, each of which goes on by itself; telemetry has only their sum."""
+    layers = np.array([layer.lagged_px2(FRAME_S) for layer in TURBULENCE.layers()])
+    np.testing.assert_allclose(layers.sum(axis=0), COVARIANCES, rtol=1e-9)
+    frames = telemetry(1500, 0.5, model=LAYERS)
+    found = identify(frames, {"told": layers, "against": AGAINST}, _score)
+    assert found.source == "told, 2 layers"
+    assert found.model.layers == 2
+    assert found.score < identify(frames, {"told": RIGHT}, _score, shares=()).score
 
 
 def test_shares_go_from_theory_to_measured() -> None:
@@ -79,7 +100,7 @@ def test_shares_go_from_theory_to_measured() -> None:
 @pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])
 def test_what_has_learnt_leaves_less(kind: str) -> None:
     """On other frames of the same air, than the integrator with the gain that is best there."""
-    theories = {"told": COVARIANCES}
+    theories = {"told": RIGHT}
     learnt = learn(kind, PLANT, telemetry(1200, 0.5), theories)
     other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
     plain = min(PLANT.left(partial(PLANT.integrator, gain), other) for gain in (0.1, 0.2, 0.3, 0.4, 0.5))

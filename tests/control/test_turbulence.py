@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.control.control_cases import COVARIANCES, TURBULENCE
 
-from faintspot.control.turbulence import SlopeTurbulence
+from faintspot.control.turbulence import SlopeTurbulence, phase_covariance_rad2
 from faintspot.loop import LoopConfiguration
 from faintspot.loop.atmosphere import make_atmosphere
 from faintspot.loop.control import slope_turbulence
@@ -87,3 +87,22 @@ def test_winds_can_be_turned() -> None:
     around: SlopeTurbulence = TURBULENCE.from_anywhere()
     later = around.covariance_px2(0.05)
     np.testing.assert_allclose(later, later.T, atol=1e-12)
+
+
+def test_layers_add_up() -> None:
+    """Each layer alone, as strong as it is in the whole."""
+    layers = TURBULENCE.layers()
+    assert len(layers) == 2
+    np.testing.assert_allclose(
+        sum(each.covariance_px2(0.01) for each in layers), TURBULENCE.covariance_px2(0.01), rtol=1e-9
+    )
+
+
+def test_slopes_are_differences_of_the_phase() -> None:
+    """The variance of a mean gradient, from the phase along two edges: 60 points each, to 1 %."""
+    side, line = 0.6, (np.arange(60) + 0.5) / 60 * 0.6
+    edges = np.concatenate([np.column_stack([np.full(60, x), line]) for x in (0.0, side)])
+    phase = phase_covariance_rad2(edges, 0.15, 25.0)
+    weight = np.repeat([-1.0, 1.0], 60) / 60 / side
+    slope = weight @ phase @ weight * (500e-9 / (2 * math.pi) / 9e-7) ** 2
+    assert slope == pytest.approx(TURBULENCE.covariance_px2()[0, 0], rel=0.01)

@@ -329,7 +329,7 @@ def test_engine_that_is_not_there_is_waited_for(open_page: Any, tmp_path: Path) 
 
 def test_recording_is_played(open_page: Any, engine: Running, tmp_path: Path) -> None:
     path = tmp_path / "night.zarr"
-    Recorder(engine.name, path).run(n_frames=200)
+    assert Recorder(engine.name, path).run(n_frames=200, seconds=60).ended_because == "frames"
     night = read_telemetry(path)
     with served(serve_recording, path) as server:
         page = open_page(server.url)

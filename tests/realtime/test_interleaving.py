@@ -27,6 +27,14 @@ def test_texts() -> None:
     assert found.labels == ["none", "tv", "ml", "noise_std=2+keep_brightest=20", "set"]
 
 
+def test_controllers() -> None:
+    found = Interleaving.parse("window+integrator,set+kalman,none,noise_std=2+keep_brightest=20+modal")
+    assert [arm.control for arm in found.arms] == ["integrator", "kalman", None, "modal"]
+    assert [arm.changes for arm in found.arms[:2]] == [{"estimator": "window"}, {}]
+    assert found.arms[3].changes == {"noise_std": 2, "keep_brightest": 20}
+    assert found.labels[0] == "window+integrator"
+
+
 def test_what_arms_make_of_the_settings() -> None:
     settings = fs.Settings("tv", noise_std=2.0, keep_brightest=9, search_range_px=3.0)
     arms = Interleaving.parse("none,tv,ml,noise_std=3,set").arms
@@ -50,7 +58,9 @@ def test_turns() -> None:
     assert [found.arm_of(count) for count in range(8)] == [0, 0, 1, 1, 2, 2, 0, 0]
 
 
-@pytest.mark.parametrize("text", ["", "tvv", "none,,tv", "strength=2", "noise_std="])
+@pytest.mark.parametrize(
+    "text", ["", "tvv", "none,,tv", "strength=2", "noise_std=", "kalman", "tv+", "tv+kalman+polc", "tv+none"]
+)
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(fs.InputError):
         Interleaving.parse(text)

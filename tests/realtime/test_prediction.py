@@ -18,6 +18,7 @@ from faintspot.loop import LoopArm, simulate_loop
 from faintspot.loop.control import learnt_control
 from faintspot.loop.engine_files import write_engine_files
 from faintspot.realtime.prediction_stream import PredictionStream
+from faintspot.realtime.prior import Prior
 
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
@@ -55,11 +56,9 @@ def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path)
     assert control is not None
     assert (control.prediction, control.options.centroid_gain) == ("controller", 1.0)
     arm = LoopArm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
-    told, _ = learnt_control(run, arm, run.run.seed)
-    settings = control.settings(SETTINGS)
-    np.testing.assert_allclose(settings.prior_std_px, told.settings.prior_std_px, rtol=1e-6)
+    told, _ = learnt_control(run, arm, run.run.seed)  # the first frame's prior, too, is as wide
     record = simulate_loop(run, [arm])
-    sky.start(make_engine(sky.name, path, control, settings=settings))
+    sky.start(make_engine(sky.name, path, control, settings=told.settings))
     sky.loop.close()
     strehl = sky.frames(FRAMES)
     records = sky.records
@@ -70,7 +69,10 @@ def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path)
 
 
 def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> None:
-    """Slopes are those of the pipeline with that prior; late, missing, impossible ones are counted, as 0."""
+    """Slopes are those of the pipeline with that prior, as wide as its variances say, if they say anything.
+
+    Late, missing and impossible ones are counted, and nothing is expected.
+    """
     path, known = files
     control = replace(known, options=known.options.replaced({"prediction": "stream"}))
     engine = make_engine(sky.name, path, control)
@@ -87,17 +89,25 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
     stream = pyshmem.create(f"{sky.name}_prediction", shape=(4 * n + 1,), dtype=np.float64)
     sky.until(lambda: not prediction.obstacle)
     rng = np.random.default_rng(3)
-    priors, frames = [np.zeros(2 * n)], [sky.pixels]
+    priors, widths, frames = [np.zeros(2 * n)], [np.ones(n)], [sky.pixels]
+    variance = np.zeros(2 * n)
     for number, value in ((1, 0.0), (2, 0.0), (4, 0.0), (4, 1e9), (5, np.nan)):
         mean = rng.standard_normal(2 * n)
         mean[3] += value
-        stream.write(np.concatenate([mean, np.ones(2 * n), [number]]), frame_id=number)
+        variance[:] = 0.04 * number
+        variance[0], variance[n + 1], variance[2] = np.nan, -1.0, np.inf
+        stream.write(np.concatenate([mean, variance, [number]]), frame_id=number)
         seen.append(sky.frame())
         frames.append(sky.pixels)
-        priors.append(mean if number == len(seen) - 1 and value == 0 else np.zeros(2 * n))
+        taken = number == len(seen) - 1 and value == 0
+        priors.append(mean if taken else np.zeros(2 * n))
+        width = np.full(n, 0.2 * np.sqrt(number) if taken else 1.0)
+        width[:3] = 1.0  # as the settings say
+        widths.append(width)
     layout, settings, calibration, psf, _ = configuration_file.load_all(path)
-    pipeline = fs.SlopePipeline(layout, settings, calibration, control.reference, psf=psf)
-    for record, frame, prior in zip(sky.records, frames, priors, strict=True):
+    for record, frame, prior, width in zip(sky.records, frames, priors, widths, strict=True):
+        wide = settings.replace(prior_std_px=width)
+        pipeline = fs.SlopePipeline(layout, wide, calibration, control.reference, psf=psf)
         expected = pipeline(frame, prior.astype(np.float32))
         np.testing.assert_array_equal(np.concatenate([record["x"], record["y"]]), expected.vector)
     counters = engine.status()["prediction"]
@@ -108,21 +118,23 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
 def test_a_prediction_s_writer_may_die() -> None:
     """It looks for the stream again, and never raises."""
     name = f"fs_test_{uuid4().hex[:12]}"
-    prior = np.ones((1, 2, 2), np.float32)
-    reader = PredictionStream(name, prior, 10.0)
+    prior = Prior(2, 10.0)
+    reader = PredictionStream(name, prior)
     reader.fill(0)
-    assert not prior.any()
+    assert not prior.mean_px.any()
     for _ in range(2):
         stream = pyshmem.create(f"{name}_prediction", shape=(9,), dtype=np.float32)
         reader.look_after()
         reader.fill(0)  # nothing was written yet
         stream.write(np.arange(9.0, dtype=np.float32), frame_id=8)
         reader.fill(8)
-        np.testing.assert_array_equal(prior.reshape(-1), [0.0, 1.0, 2.0, 3.0])
+        np.testing.assert_array_equal(prior.mean_px.reshape(-1), [0.0, 1.0, 2.0, 3.0])
+        np.testing.assert_allclose(prior.std_px, np.sqrt([5.0, 6.0]))  # of variances 4 and 6, 5 and 7
         stream.unlink()
         reader.look_after()
         reader.fill(8)
-        assert not prior.any()
+        assert not prior.mean_px.any()
+        assert np.isnan(prior.std_px).all()
     assert reader.counters.restarts == 2
     reader.close()
 

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
+from click.core import ParameterSource
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from faintspot import configuration
+from faintspot.cli import demo_live
 from faintspot.cli.needs import can_make
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
@@ -33,7 +35,9 @@ if TYPE_CHECKING:
     "--frames", type=click.IntRange(20), default=600, show_default=True, help="Frames at each flux."
 )
 @click.option("--seed", type=click.IntRange(0), default=2015, show_default=True, help="Of the simulation.")
-def command(output: str, frames: int, seed: int) -> None:
+@demo_live.live_options
+@click.pass_context
+def command(context: click.Context, /, live: bool, output: str, frames: int, seed: int, **_: Any) -> None:
     """Simulate a faint star, measure it with and without denoising, and write a report.
 
     A CANARY-like sensor: 7 x 7 sub-apertures of which 36 are lit, 16 x 16 pixels, Nyquist-sampled diffraction
@@ -44,10 +48,19 @@ def command(output: str, frames: int, seed: int) -> None:
     The folder then holds the frames of one flux, their configuration, the slopes of both arms and the report
     page, made by the same commands that you would use on frames of your own. The page needs the extra `web`.
 
+    With --live a simulated telescope, the real-time engine and its web page run together: the loop is closed
+    on a faint star, estimators take turns, and at the end a table says what each was worth. Needs the extras
+    `realtime`, `live` and `loop`; Linux.
+
     \b
-    Example:
+    Examples:
       faintspot demo -o /tmp/demo --frames 2000
+      faintspot demo --live
     """
+    _check_kind(context)
+    if live:
+        demo_live.show_live(context.params)
+        return
     folder = Path(output)
     with_report = can_make("report page", "web", "matplotlib", "jinja2")
     try:
@@ -66,7 +79,22 @@ def command(output: str, frames: int, seed: int) -> None:
         click.echo(f"{folder / 'report.html'}: open it in a browser")
     else:
         click.echo(f"{folder}: frames, configurations and slopes")
-    click.echo("With frames of your own: faintspot layout --help")
+    click.echo(
+        "With frames of your own: faintspot layout --help; in real time, on a page: faintspot demo --live"
+    )
+
+
+def _check_kind(context: click.Context) -> None:
+    """Refuse options of the other demonstration."""
+    given = {
+        name for name in context.params if context.get_parameter_source(name) == ParameterSource.COMMANDLINE
+    }
+    if "live" in given:
+        wrong, why = given - {"live", *demo_live.NAMES, *demo_live.SHARED}, "without --live"
+    else:
+        wrong, why = given & set(demo_live.NAMES), "with --live"
+    if wrong:
+        raise InputError(f"{', '.join(f'--{name}' for name in sorted(wrong))}: expected only {why}")
 
 
 def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:

@@ -189,6 +189,47 @@ def budget(
     _report(folder)
 
 
+@needs("loop", "hcipy")
+@command.command(short_help="Write what a real-time engine needs, [control] included.")
+@click.argument("configuration", metavar="[CONFIG]", default="canary")
+@click.option(
+    "--folder",
+    "-o",
+    default=".",
+    show_default=True,
+    metavar="FOLDER",
+    help="Gets faintspot.toml and matrices.",
+)
+@click.option(
+    "--control",
+    type=click.Choice(["integrator", "modal", "polc", "kalman"]),
+    default="integrator",
+    show_default=True,
+    help="All but the integrator learn from the simulated loop for up to a minute.",
+)
+@click.option("--rate", type=float, metavar="HZ", help="Frames a second. Default: the configuration's.")
+def engine(configuration: str, folder: str, control: str, rate: float | None) -> None:
+    """Write faintspot.toml with which `faintspot realtime run --close-loop` closes this loop.
+
+    Layout, calibration, PSF and [control] with interaction matrix, reference slopes and centroid gain, from
+    the simulation. Estimator, settings and whatever else faintspot.toml says already stay, such as what
+    `faintspot tune --loop` has chosen; without an estimator it gets the 20 brightest pixels.
+
+    \b
+    Examples:
+      faintspot loop engine canary -o bench
+      faintspot loop engine faintspot-loop.toml --control kalman
+    """
+    from faintspot.loop.configuration import load_loop
+    from faintspot.loop.engine_files import write_engine_files
+
+    loop = load_loop(configuration)
+    if rate is not None:
+        loop = loop.replace("control", frame_rate_hz=rate)
+    path = write_engine_files(loop, folder, control)
+    click.echo(f"{path} written; next: faintspot realtime run --config {shlex.quote(str(path))} --close-loop")
+
+
 @contextmanager
 def _workplace(workers: int | None, scheduler: str | None) -> Iterator[Workplace]:
     """Yield where the work is done, with a progress bar."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from faintspot.cli import (
+    realtime_advise,
     realtime_calibrate,
     realtime_camera,
     realtime_control,
@@ -47,6 +48,7 @@ for each in (
     realtime_loop.loop,
     realtime_calibrate.calibrate,
     realtime_learn.learn,
+    realtime_advise.advise,
     realtime_modules.modules,
     realtime_modules.load,
     realtime_modules.swap,

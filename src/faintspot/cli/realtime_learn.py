@@ -27,7 +27,17 @@ from faintspot.errors import InputError
 @click.option(
     "--wind-speeds", default="5,10,20", show_default=True, metavar="LIST", help="Of the theory's layers, m/s."
 )
-def learn(store: Path, config: str, kind: str, wind_speeds: str) -> None:
+@click.option(
+    "--layer",
+    "layers",
+    type=(float, float, float),
+    multiple=True,
+    metavar="SPEED DIRECTION STRENGTH",
+    help="A layer of the air, where its wind is known, m/s and degrees from +x to +y; as often as needed.",
+)
+def learn(
+    store: Path, config: str, kind: str, wind_speeds: str, layers: tuple[tuple[float, float, float], ...]
+) -> None:
     """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
 
     STORE is what `faintspot realtime record` wrote while the engine ran with TOML, at least 200 frames
@@ -38,6 +48,7 @@ def learn(store: Path, config: str, kind: str, wind_speeds: str) -> None:
     Example:
       faintspot realtime record night.zarr --seconds 10
       faintspot realtime learn night.zarr --control kalman
+      faintspot realtime learn night.zarr --layer 6 20 0.6 --layer 14 150 0.4
     """
     from faintspot.control.configuration import load_control, prior_std_px, save_control
     from faintspot.control.learning import learn as learnt_by
@@ -56,7 +67,7 @@ def learn(store: Path, config: str, kind: str, wind_speeds: str) -> None:
     layout, night = Layout.load(config), read_telemetry(store, images=False)
     prior = prior_std_px(Settings.load(config), layout)
     telemetry, rate_hz = telemetry_of_recording(night, control, prior)
-    learnt = learnt_by(kind, control.plant, telemetry, theories_of(layout, rate_hz, speeds))
+    learnt = learnt_by(kind, control.plant, telemetry, theories_of(layout, rate_hz, speeds, layers))
     path = Path(config).with_suffix(".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)

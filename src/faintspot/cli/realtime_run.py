@@ -37,7 +37,9 @@ from faintspot.realtime.private_socket import socket_path
     help="Of SCHED_FIFO, with locked memory. Default: the ordinary scheduler.",
 )
 @click.option(
-    "--interleave", metavar="ARMS", help="Settings that take turns, such as none,tv or ml,noise_std=2."
+    "--interleave",
+    metavar="ARMS",
+    help="Settings, and controllers, that take turns, such as none,tv or ml+integrator,map+kalman.",
 )
 @click.option(
     "--every", type=click.IntRange(1), default=50, show_default=True, help="Frames until the next one's turn."
@@ -87,16 +89,16 @@ def run(
 ) -> None:
     """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
 
-    Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row, or
-    whole from another program's stream; the engine waits for it, and for its return. Each group of
-    sub-apertures is measured as soon as its last row is there. Slopes go out as the pyshmem streams
-    NAME_slopes (all x, then all y, px), NAME_details and NAME_marks, each stamped with the frame's
-    number; `faintspot realtime record` keeps them. Where the configuration has [control], commands follow
-    from them as NAME_commands.
+    Frames come from the shared-memory pixel ring NAME, which a camera's process writes row by row, or whole
+    from another program's stream; the engine waits for it, and for its return. Each group of sub-apertures
+    is measured as soon as its last row is there. Slopes go out as the pyshmem streams NAME_slopes (all x,
+    then all y, px), NAME_details and NAME_marks, each stamped with the frame's number; `faintspot realtime
+    record` keeps them. Where the configuration has [control], commands follow from them as NAME_commands.
 
     \b
     On sky, with and without, 50 frames each (NAME_marks says which):
       faintspot realtime run --interleave none,tv --every 50
+      faintspot realtime run --close-loop --interleave window+integrator,map+kalman --every 250
     """
     from faintspot import configuration
     from faintspot.control.configuration import load_control
@@ -115,7 +117,6 @@ def run(
     processors = parse_subapertures(cpus) if cpus else None
     if control is not None:
         control.check_fits(len(layout))
-        settings = control.settings(settings)
     engine = Engine(
         name,
         partial(_pipeline, layout, calibration, psf, score, None if control is None else control.reference),

@@ -71,6 +71,7 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
     picture = picture_file(target, options["picture"])
     question = _question(config, options)
     from faintspot.compare.running import Workplace
+    from faintspot.loop.engine_files import CONFIGURATION as ENGINE_FILE
     from faintspot.planner.loop_tuning import tune_loop
 
     folder = options["folder"] or f"{question.configuration.name}-tune"
@@ -84,6 +85,10 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
     best, photons = answer.best.name, f"{answer.photons[answer.at_star]:g}"
     command = shlex.join(["faintspot", "loop", "magnitude", str(loop), "--arms", f"brightest,window,{best}"])
     click.echo(f"Next, a long search and long runs: {command} --photons {photons}")
+    if target.name == ENGINE_FILE:
+        folder, control = str(target.parent), answer.best.kind.control
+        command = shlex.join(["faintspot", "loop", "engine", str(loop), "-o", folder, "--control", control])
+        click.echo(f"In real time: {command}")
 
 
 def show(answer: LoopAnswer) -> None:

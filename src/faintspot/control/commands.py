@@ -27,24 +27,26 @@ class CommandLine:
 
     def __init__(self, commands: int, delay_frames: int, largest: float = math.inf) -> None:
         self.delay_frames, self.largest = delay_frames, largest
-        self._rows = [np.zeros(commands) for _ in range(delay_frames + 1)]
-        self._next = 0
-        """Where the next command goes; the oldest of the others acts."""
+        self.rows = np.zeros((delay_frames + 1, commands))
+        """All of them."""
+        self.place = 0
+        """Of which row the next command goes to; the oldest of the others acts."""
+        self._rows = list(self.rows)
 
     @property
     def acting(self) -> Floats:
         """What the mirror holds during this frame."""
-        return self._rows[(self._next + 1) % len(self._rows)]
+        return self._rows[(self.place + 1) % len(self._rows)]
 
     @property
     def latest(self) -> Floats:
         """The last command computed, which still may be on its way."""
-        return self._rows[self._next - 1]
+        return self._rows[self.place - 1]
 
     @property
     def spare(self) -> Floats:
         """Where the next command may be written, for `sent`."""
-        return self._rows[self._next]
+        return self._rows[self.place]
 
     def put(self, command: Floats) -> None:
         """Send a command, and go on to the next frame."""
@@ -53,7 +55,7 @@ class CommandLine:
 
     def sent(self) -> None:
         """Send what was written into `spare`, which is within the stroke, and go on to the next frame."""
-        self._next = (self._next + 1) % len(self._rows)
+        self.place = (self.place + 1) % len(self._rows)
 
     def hold(self, command: Floats) -> None:
         """Begin anew, with a mirror that holds a command and with no other on its way."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -125,7 +125,7 @@ class Control:
         Reference slopes, px from each sub-aperture's centre. Default: 0.
     options : ControlOptions
     model : path, optional
-        What the controller has learnt, a file of `Model.save`; not for the plain integrator.
+        What the controller has learnt, a file of `Model.save`; the plain integrator has no use for it.
 
     Raises
     ------
@@ -161,14 +161,14 @@ class Control:
         assert self.reconstructor  # which refuses what is no interaction matrix
         object.__setattr__(self, "model", self._checked_model())
 
-    def _checked_model(self) -> Model | None:
+    def _checked_model(self) -> Any:
         kind = self.options.controller
         if kind == KALMAN and self.options.prediction == STREAM:
             raise InputError(
                 'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
             )
         if kind == INTEGRATOR:
-            return None
+            return self.model  # of no use to it: for `with_controller`
         if self.model is None:
             raise InputError(f"{MODEL}: expected a file with what {CONTROLS[kind]} has learnt, got none")
         model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
@@ -193,13 +193,17 @@ class Control:
         usual = CONTROLLER if self.options.controller == KALMAN else NONE
         return self.options.prediction or usual
 
-    def settings(self, settings: Settings) -> Settings:
-        """Return settings whose prior is as wide as the controller is sure, where both know of one."""
-        std = None if self.model is None else self.model.expected_std_px
-        if std is None or PRIOR not in settings.declared() or self.prediction != CONTROLLER:
-            return settings
-        changes: dict[str, Any] = {PRIOR: np.sqrt(np.square(std).reshape(2, -1).mean(axis=0))}
-        return settings.replace(**changes)
+    def with_controller(self, kind: str) -> Control:
+        """Return the same with another controller.
+
+        Raises
+        ------
+        InputError
+            When the model is not what that one has learnt.
+        """
+        if kind == self.options.controller:
+            return self
+        return replace(self, options=self.options.replaced({"controller": kind}))
 
     @property
     def commands(self) -> int:
@@ -221,15 +225,21 @@ class Control:
                 f"got {slopes}"
             )
 
-    def check_errors(self, calibration: Calibration) -> None:
+    def check_errors(self, calibration: Calibration, kind: str | None = None) -> None:
         """Refuse a camera whose read noise is not known, where slopes are weighed by their standard errors.
+
+        Parameters
+        ----------
+        calibration : Calibration
+        kind : str, optional
+            Of the controller. Default: the one that is set.
 
         Raises
         ------
         InputError
             It says what is missing.
         """
-        kind = self.options.controller
+        kind = kind or self.options.controller
         if kind in (POLC, KALMAN) and calibration.read_noise_photoelectrons is None:
             raise InputError(
                 f"{TABLE}.controller = {kind!r}: expected standard errors of the slopes, which need the "

@@ -13,10 +13,10 @@ from faintspot.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
 
-_MEMORY_FRAMES = 400
-_CORRELATED_FRAMES = 5  # over which residuals are alike
-_FEWEST_FRAMES = 50  # before the first change
-_STANDARD_ERRORS = 2.5  # by which one must leave less than the other
+MEMORY_FRAMES = 400
+CORRELATED_FRAMES = 5  # over which residuals are alike
+FEWEST_FRAMES = 50  # before the first change
+STANDARD_ERRORS = 2.5  # by which one must leave less than the other
 
 
 class Guarded:
@@ -93,17 +93,17 @@ class Guarded:
             residual = open_loop + self._interaction @ line.acting
             left.append(float(np.square(self._reconstruct @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error)
-        self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
         self._line.put(self._lines[self.chosen].latest)
+        self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
 
     def _choose(self, difference: float) -> None:
-        """Change places where the mean difference of late, -1 to 1, is beyond its error."""
+        """Change places, from the next frame on, where the mean difference of late is beyond its error."""
         self._frames += 1
-        share = 1 / min(self._frames, _MEMORY_FRAMES)
+        share = 1 / min(self._frames, MEMORY_FRAMES)
         self._difference += share * (np.array([difference, difference**2]) - self._difference)
-        if self._frames < _FEWEST_FRAMES:
+        if self._frames < FEWEST_FRAMES:
             return
         mean, square = self._difference
-        values = min(self._frames, 2 * _MEMORY_FRAMES) / _CORRELATED_FRAMES
-        if abs(mean) > _STANDARD_ERRORS * np.sqrt(max(0.0, square - mean**2) / values):
+        values = min(self._frames, 2 * MEMORY_FRAMES) / CORRELATED_FRAMES
+        if abs(mean) > STANDARD_ERRORS * np.sqrt(max(0.0, square - mean**2) / values):
             self.chosen = int(mean > 0)

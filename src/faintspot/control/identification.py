@@ -4,13 +4,15 @@ What telemetry says of the slopes behind its noise depends on the model that the
 at first (expectation maximisation). A ridge regression of z[k + 1] on z[k], z[k - 1] draws the model back to
 theory, in the metric of theory's own covariances: its normal equations are those of a weighted mean of
 measured and theoretical moments. Which theory, and how much weight the measured moments get, is decided by
-what the control would have left of the turbulence in frames that it has not learnt from.
+what the control would have left of the turbulence in frames that it has not learnt from. A theory that knows
+layers is tried with each of them by itself, too; telemetry cannot tell them apart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Self
 
 import numpy as np
@@ -60,12 +62,8 @@ class Identified:
     model: SlopeModel
     noise_factor: float
     """What to multiply the variances of standard errors by."""
-    theory: str
-    """Which theory it is drawn to."""
-    covariances_px2: Floats
-    """(3, m, m): of that theory, with the strength of the telemetry."""
-    measured_share: float
-    """Weight of measured moments, 0 to 1."""
+    source: str
+    """What it was learnt from: which theory, and how much telemetry counts."""
     score: float
     """Mean square of what control by it leaves, in frames that were not learnt from."""
 
@@ -81,36 +79,49 @@ def identify(
     Parameters
     ----------
     telemetry : Telemetry
-    theories_px2 : mapping of (3, m, m) arrays
-        Theoretical covariances for lags of 0, 1 and 2 frames, by name; their strength is not used.
+    theories_px2 : mapping of (layers, 3, m, m) arrays
+        Theoretical covariances for lags of 0, 1 and 2 frames, by name; only the ratio of the layers'
+        strengths is used.
     score : callable
         Mean square of what control by a model leaves in some frames.
     shares : sequence of float
         Weights of measured moments that are tried beside none.
     """
     middle = len(telemetry) // 2
-    halves = telemetry.part(0, middle), telemetry.part(middle, len(telemetry))
-    strengths = [Strengths.of(half) for half in halves]
+    parts = telemetry.part(0, middle), telemetry.part(middle, len(telemetry)), telemetry
+    strengths = [Strengths.of(part) for part in parts]
+    together = {name: theory.sum(axis=0) for name, theory in theories_px2.items()}
+    makers: dict[str, Callable[[int], SlopeModel]] = {}
+    tried: dict[str, float] = {}
 
-    def left(models: Sequence[SlopeModel]) -> float:
-        of_each = zip(models, strengths, halves[::-1], strict=True)
-        return float(np.mean([score(model, other.scaled(by.noise_factor)) for model, by, other in of_each]))
+    def of_theory(name: str, layers: Floats, part: int) -> SlopeModel:
+        return SlopeModel.of_covariances(strengths[part].relative_to(together[name]) * layers)
 
-    tried = {
-        (name, 0.0): left([SlopeModel.of_covariances(by.relative_to(theory) * theory) for by in strengths])
-        for name, theory in theories_px2.items()
-    }
-    name, _ = min(tried, key=tried.__getitem__)
-    pairs = [_moments(half, by, theories_px2[name]) for half, by in zip(halves, strengths, strict=True)]
+    @cache
+    def moments(name: str, part: int) -> tuple[Floats, Floats]:
+        return _moments(parts[part], strengths[part], together[name])
+
+    def measured(name: str, share: float, part: int) -> SlopeModel:
+        return SlopeModel.of_moments(mixed(*moments(name, part), share))
+
+    def attempt(source: str, make: Callable[[int], SlopeModel]) -> None:
+        makers[source] = make
+        left = [score(make(of), parts[1 - of].scaled(strengths[of].noise_factor)) for of in (0, 1)]
+        tried[source] = float(np.mean(left))
+
+    for name, theory in together.items():
+        attempt(name, partial(of_theory, name, theory))
+    nearest = min(tried, key=tried.__getitem__)
     for share in shares:
-        tried[name, share] = left([SlopeModel.of_moments(mixed(*pair, share)) for pair in pairs])
-    name, share = best = min(tried, key=tried.__getitem__)
-    whole = Strengths.of(telemetry)
-    theory = whole.relative_to(theories_px2[name]) * theories_px2[name]
-    model = SlopeModel.of_covariances(theory)
-    if share:
-        model = SlopeModel.of_moments(mixed(*_moments(telemetry, whole, theories_px2[name]), share))
-    return Identified(model, whole.noise_factor, name, theory, share, tried[best])
+        attempt(f"{nearest}, measured moments {share:g}", partial(measured, nearest, share))
+    for name, layers in theories_px2.items():
+        if len(layers) > 1:
+            source = f"{name}, {len(layers)} layers"
+            makers[source] = partial(of_theory, name, layers)
+            # Two numbers are learnt from all frames, which are scored at once: its filter takes long to make.
+            tried[source] = score(makers[source](2), telemetry.scaled(strengths[2].noise_factor))
+    best = min(tried, key=tried.__getitem__)
+    return Identified(makers[best](2), strengths[2].noise_factor, best, tried[best])
 
 
 def mixed(measured_px2: Floats, theory_px2: Floats, share: float) -> Floats:

@@ -16,7 +16,7 @@ LARGEST_VARIANCE_PX2 = 1e6
 
 
 class SlopePredictor:
-    """The Kalman filter of a `SlopeModel`: state [z[k], z[k - 1]], of which noisy z[k] is measured.
+    """The Kalman filter of a `SlopeModel`, of whose state noisy z[k] is measured.
 
     The error of its predictions is the steady one, for slopes with their usual noise; how much each slope
     corrects follows the noise of each frame.
@@ -28,77 +28,99 @@ class SlopePredictor:
         Usual variance of the slopes' noise.
     steady : bool
         Whether the gain does not follow the noise of frames: one product with a matrix, much less work.
+    covariance : (states, states) array, optional
+        What `steady_covariance` gives, where it is known already.
     """
 
-    def __init__(self, model: SlopeModel, variance_px2: Floats, *, steady: bool = False) -> None:
+    def __init__(
+        self,
+        model: SlopeModel,
+        variance_px2: Floats,
+        *,
+        steady: bool = False,
+        covariance: Floats | None = None,
+    ) -> None:
         self.model, self._steady = model, steady
-        m = model.slopes
-        self.covariance = steady_covariance(model, variance_px2)
-        """(2 m, 2 m): of the state's error before a frame is measured."""
-        self._gain = _gain(self.covariance, variance_px2)
-        self._onward = model.both
-        self.state = np.zeros(2 * m)
-        self._correction = np.zeros(2 * m)
+        self.covariance = steady_covariance(model, variance_px2) if covariance is None else covariance
+        """(states, states): of the state's error before a frame is measured."""
+        self.with_slopes = self.covariance @ model.seen.T
+        """(states, m): of the state's error with that of the slopes."""
+        self.predicted_px2 = model.seen @ self.with_slopes
+        """(m, m): of the predicted slopes' error."""
+        self.usual_px2 = self.predicted_px2 + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
+        """(m, m): covariance of measured slopes about the prediction, with their usual noise."""
+        self._gain = np.linalg.solve(self.usual_px2, self.with_slopes.T).T
+        self.state = np.zeros(model.states)
+        self._correction = np.zeros(model.states)
 
     @property
     def mean_px(self) -> Floats:
         """(m,): what the coming frame's open-loop slopes are expected to be."""
-        return self.state[: self.model.slopes]
+        return np.asarray(self._of_layers[:, 0].sum(axis=0))
 
     @property
     def std_px(self) -> Floats:
         """(m,): how far they will be from that."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[: self.model.slopes]))
+        return np.asarray(np.sqrt(np.diag(self.predicted_px2)))
+
+    @property
+    def _of_layers(self) -> Floats:
+        """(layers, 2, m): the state."""
+        return self.state.reshape(self.model.layers, 2, self.model.slopes)
+
+    def begin(self, slopes_px: Floats) -> None:
+        """Start from open-loop slopes that have not changed of late."""
+        self._of_layers[:] = shares(self.model)[:, None, None] * slopes_px
 
     def correct(self, slopes_px: Floats, variance_px2: Floats) -> None:
         """Take the measured open-loop slopes of this frame; infinite variance: not measured."""
-        m = self.model.slopes
-        surprise = slopes_px - self.state[:m]
+        surprise = slopes_px - self.mean_px
         if self._steady:
             surprise[~np.isfinite(variance_px2)] = 0.0
             np.matmul(self._gain, surprise, out=self._correction)
         else:
             variance = np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
             surprise[variance >= LARGEST_VARIANCE_PX2] = 0.0
-            total = self.covariance[:m, :m].copy()
-            total[np.diag_indices(m)] += variance
-            np.matmul(self.covariance[:, :m], np.linalg.solve(total, surprise), out=self._correction)
+            total = self.predicted_px2.copy()
+            total[np.diag_indices(len(total))] += variance
+            np.matmul(self.with_slopes, np.linalg.solve(total, surprise), out=self._correction)
         self.state += self._correction
 
     def advance(self) -> None:
         """Go on to the next frame."""
-        m = self.model.slopes
-        now = self._onward @ self.state
-        self.state[m:] = self.state[:m]
-        self.state[:m] = now
+        layers = self._of_layers
+        now = np.matmul(self.model.both, self.state.reshape(len(layers), -1, 1))[:, :, 0]
+        layers[:, 1] = layers[:, 0]
+        layers[:, 0] = now
+
+
+def shares(model: SlopeModel) -> Floats:
+    """Return how slopes of which nothing else is known are shared between the layers, (layers,)."""
+    driving = np.trace(model.driving, axis1=1, axis2=2)
+    return np.asarray(driving / driving.sum())
 
 
 def steady_covariance(model: SlopeModel, variance_px2: Floats) -> Floats:
-    """Return the covariance (2 m, 2 m) of the predicted state's error that a Kalman filter comes to.
+    """Return the covariance (states, states) of the predicted state's error that a Kalman filter comes to.
 
     The discrete algebraic Riccati equation by doubling (Chu, Fan & Lin 2005, Linear Algebra Appl. 396, 55):
     twice as many frames with each step.
     """
-    m = model.slopes
-    step = np.zeros((2 * m, 2 * m))
-    step[:, :m] = np.vstack([model.first.T, model.second.T])  # transposed: of the dual problem
-    step[:m, m:] = np.eye(m)
-    informed, error = np.zeros_like(step), np.zeros_like(step)
-    informed[:m, :m] = np.diag(1 / np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
-    error[:m, :m] = model.driving
-    identity = np.eye(2 * m)
+    n, m = model.states, model.slopes
+    seen, information = model.seen, 1 / np.minimum(variance_px2, LARGEST_VARIANCE_PX2)
+    step = model.onward.T  # transposed: of the dual problem
+    informed = seen.T @ (information[:, None] * seen)
+    error = np.zeros((n, n))
+    for layer, driving in enumerate(model.driving):
+        now = slice(2 * m * layer, 2 * m * layer + m)
+        error[now, now] = driving
+    identity = np.eye(n)
     for _ in range(_MOST_DOUBLINGS):
         solved = np.linalg.solve(identity + informed @ error, np.hstack([step, informed]))
-        more = step.T @ error @ solved[:, : 2 * m]
-        informed = informed + step @ solved[:, 2 * m :] @ step.T
-        step = step @ solved[:, : 2 * m]
+        more = step.T @ error @ solved[:, :n]
+        informed = informed + step @ solved[:, n:] @ step.T
+        step = step @ solved[:, :n]
         error = error + 0.5 * (more + more.T)
         if np.abs(more).max() <= _CONVERGED * np.abs(error).max():
             break
     return np.asarray(error)
-
-
-def _gain(covariance: Floats, variance_px2: Floats) -> Floats:
-    m = len(variance_px2)
-    total = covariance[:m, :m] + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
-    return np.asarray(np.linalg.solve(total, covariance[:m]).T)

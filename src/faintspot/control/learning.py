@@ -52,9 +52,9 @@ def learn(
         One of `CONTROLS` but the plain integrator.
     plant : Plant
     telemetry : Telemetry
-    theories_px2 : mapping of (3, m, m) arrays
-        Theoretical covariances of the slopes for lags of 0, 1 and 2 frames, by name; at least one. Their
-        strength is taken from telemetry.
+    theories_px2 : mapping of (layers, 3, m, m) arrays
+        Theoretical covariances of each layer's slopes for lags of 0, 1 and 2 frames, by name; at least one
+        theory. Their strength as a whole is taken from telemetry.
     noise_scale : float
         What to multiply the variance of the noise by that telemetry shows.
     """
@@ -75,7 +75,7 @@ def learn(
     found = identify(telemetry, theories_px2, score)
     factor = noise_scale * found.noise_factor
     variance = usual_variance(telemetry.scaled(factor))
-    text = f"{found.theory}, measured moments {found.measured_share:g}, noise variance x {factor:.2f}"
+    text = f"{found.source}, noise variance x {factor:.2f}"
     model = found.model
     arrays = {
         "first": model.first,
@@ -111,7 +111,8 @@ def _pseudo_open_loop(
     factor = noise_scale * strengths.noise_factor
     frames, clean = telemetry.scaled(factor), plant.reconstructor.clean
     tried = []
-    for name, theory in theories_px2.items():
+    for name, layers in theories_px2.items():
+        theory = layers.sum(axis=0)
         covariances = strengths.relative_to(theory) * theory
         now = covariances[0]
         ahead = covariances[min(plant.delay_frames, 2)]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from faintspot.checks import finite_array, one_of
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
+from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
-from faintspot.control.kalman import SlopePredictor
+from faintspot.control.kalman import SlopePredictor, steady_covariance
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
@@ -41,7 +42,8 @@ _OF_KIND = {
     POLC: ("now_px2", "ahead_px2", "gain"),
     KALMAN: ("first", "second", "driving_px2", "variance_px2"),
 }
-_SQUARE = {"now_px2", "ahead_px2", "first", "second", "driving_px2"}
+_SQUARE = {"now_px2", "ahead_px2"}
+_OF_LAYERS = {"first", "second", "driving_px2"}
 _OF_ALL = ("plain_gain", "noise_factor", "left")
 
 
@@ -72,7 +74,7 @@ class Model:
     kind: str
     arrays: Mapping[str, Floats]
     """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
-    (m, m), variance_px2 (m,) of the slopes' noise."""
+    (layers, m, m), variance_px2 (m,) of the slopes' noise."""
     plain_gain: float
     """Of the integrator that is fallen back to."""
     noise_factor: float
@@ -91,16 +93,30 @@ class Model:
         if self.kind == POLC:
             covariances = arrays["now_px2"], arrays["ahead_px2"]
             return PseudoOpenLoop(line, plant.interaction, *covariances, clean, float(arrays["gain"]))
-        return Predictive(line, plant.interaction, self._predictor(), clean)
+        return Predictive(line, plant.interaction, self.predictor(), clean)
 
     @property
     def expected_std_px(self) -> Floats | None:
         """(m,): how sure it is of the slopes that it expects; None: it does not know."""
-        return self._predictor().std_px if self.kind == KALMAN else None
+        return self.predictor().std_px if self.kind == KALMAN else None
 
-    def _predictor(self) -> SlopePredictor:
-        model = SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
-        return SlopePredictor(model, self.arrays["variance_px2"])
+    def predictor(self) -> SlopePredictor:
+        """Return the filter of what "kalman" has learnt."""
+        model, variance = self._slopes, self.arrays["variance_px2"]
+        return SlopePredictor(model, variance, covariance=self._covariance)
+
+    def with_noise(self, scale: float) -> Model:
+        """Return what "kalman" would have learnt with the variances of the noise so many times as large."""
+        arrays = {**self.arrays, "variance_px2": scale * self.arrays["variance_px2"]}
+        return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor)
+
+    @cached_property
+    def _slopes(self) -> SlopeModel:
+        return SlopeModel(*(self.arrays[name] for name in ("first", "second", "driving_px2")))
+
+    @cached_property
+    def _covariance(self) -> Floats:
+        return steady_covariance(self._slopes, self.arrays["variance_px2"])
 
     def save(self, path: str | Path) -> None:
         """Write it to a NumPy file (.npz).
@@ -129,6 +145,8 @@ class Model:
         slopes, modes = len(plant.interaction), plant.reconstructor.modes.shape[1]
         shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
         shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
+        layers = len(numbers["first"]) if kind == KALMAN and numbers["first"].ndim == 3 else 1
+        shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
         for name, array in numbers.items():
             if array.shape != shapes.get(name, ()):
                 raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
@@ -159,9 +177,22 @@ class Learnt:
         """(m,): how sure it is of the slopes that it expects; None: it does not know."""
         return self.model.expected_std_px
 
-    def controller(self, line: CommandLine, prior_std_px: Floats | None = None) -> Guarded:
+    def controller(self, line: CommandLine, prior_std_px: Floats | None = None) -> Guarded | CompiledKalman:
         """Return the controller; with the estimator's prior where it has one."""
         plant, model = self.plant, self.model
+        if model.kind == KALMAN:
+            return CompiledKalman(
+                line,
+                plant.interaction,
+                plant.reconstructor.matrix,
+                model.predictor(),
+                plant.reconstructor.clean,
+                model.plain_gain,
+                plant.leak,
+                prior_std_px=prior_std_px,
+                noise_factor=model.noise_factor,
+                prefers_plain=model.left[1] < model.left[0],
+            )
         return Guarded(
             line,
             plant.interaction,

@@ -1,4 +1,8 @@
-"""How open-loop slopes go on from frame to frame: a vector autoregression of second order."""
+"""How open-loop slopes go on from frame to frame: vector autoregressions of second order.
+
+The slopes are the sum of those of layers, each of which goes on by itself. What blows with one wind is far
+easier to predict than the sum of several; where winds are not known, one layer stands for all.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 Floats = NDArray[np.float64]
 
@@ -17,14 +22,17 @@ _LEAST_DRIVING = 1e-6  # of a slope's variance
 
 @dataclass(frozen=True, eq=False)
 class SlopeModel:
-    """z[k + 1] = first z[k] + second z[k - 1] + e[k], with E[e e^T] = driving."""
+    """z[k] = sum over layers of y[k]; y[k + 1] = first y[k] + second y[k - 1] + e[k], E[e e^T] = driving.
+
+    The state is [y[k], y[k - 1]] of every layer, one layer after the other.
+    """
 
     first: Floats
-    """(m, m)"""
+    """(layers, m, m)"""
     second: Floats
-    """(m, m)"""
+    """(layers, m, m)"""
     driving: Floats
-    """(m, m) px^2"""
+    """(layers, m, m) px^2"""
 
     @classmethod
     def of_covariances(cls, covariances_px2: Floats) -> Self:
@@ -32,44 +40,73 @@ class SlopeModel:
 
         Parameters
         ----------
-        covariances_px2 : (3, m, m) array
-            E[z[k + lag] z[k]^T] for lags of 0, 1 and 2 frames.
+        covariances_px2 : (layers, 3, m, m) or (3, m, m) array
+            E[y[k + lag] y[k]^T] of each layer for lags of 0, 1 and 2 frames.
         """
-        return cls.of_moments(joint_moments(covariances_px2))
+        lags = covariances_px2.shape[-3:]
+        layers = [_regression(joint_moments(each)) for each in covariances_px2.reshape(-1, *lags)]
+        return cls(*(np.array(each) for each in zip(*layers, strict=True)))
 
     @classmethod
     def of_moments(cls, moments_px2: Floats) -> Self:
-        """Return the regression of z[k + 1] on z[k], z[k - 1], with a small ridge.
+        """Return the regression of z[k + 1] on z[k], z[k - 1], with a small ridge, as one layer.
 
         Parameters
         ----------
         moments_px2 : (3 m, 3 m) array
             Second moments of z[k + 1], z[k], z[k - 1].
         """
-        m = len(moments_px2) // 3
-        variance = np.trace(moments_px2) / (3 * m)
-        past, onward = moments_px2[m:, m:], moments_px2[:m, m:]
-        both = np.linalg.solve(past + _RIDGE * variance * np.eye(2 * m), onward.T).T
-        left = moments_px2[:m, :m] - both @ onward.T - onward @ both.T + both @ past @ both.T
-        return cls(both[:, :m], both[:, m:], _positive(left, _LEAST_DRIVING * variance))
+        return cls(*(each[None] for each in _regression(moments_px2)))
+
+    @property
+    def layers(self) -> int:
+        """Number of layers."""
+        return len(self.first)
 
     @property
     def slopes(self) -> int:
         """Number of slopes, m."""
-        return len(self.first)
+        return int(self.first.shape[1])
+
+    @property
+    def states(self) -> int:
+        """Length of the state, 2 m for each layer."""
+        return 2 * self.layers * self.slopes
 
     @cached_property
     def both(self) -> Floats:
-        """(m, 2 m): `first` beside `second`."""
-        return np.hstack([self.first, self.second])
+        """(layers, m, 2 m): `first` beside `second`."""
+        return np.concatenate([self.first, self.second], axis=2)
+
+    @cached_property
+    def onward(self) -> Floats:
+        """(states, states): from one frame's state to the next one's."""
+        step = np.eye(2 * self.slopes, k=-self.slopes)
+        blocks = np.repeat(step[None], self.layers, axis=0)
+        blocks[:, : self.slopes] = self.both
+        return np.asarray(block_diag(*blocks))
+
+    @cached_property
+    def seen(self) -> Floats:
+        """(m, states): from the state to z[k]."""
+        return np.tile(np.eye(self.slopes, 2 * self.slopes), self.layers)
 
     def ahead(self, frames: int) -> Floats:
-        """Return (m, 2 m): z so many frames after the state [z[k], z[k - 1]]."""
-        m = self.slopes
-        now, before = np.eye(m, 2 * m), np.eye(m, 2 * m, m)
+        """Return (m, states): z so many frames after the state."""
+        seen = self.seen
         for _ in range(frames):
-            now, before = self.first @ now + self.second @ before, now
-        return now
+            seen = seen @ self.onward
+        return seen
+
+
+def _regression(moments_px2: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return `first`, `second` and `driving` of one layer, (m, m), for moments (3 m, 3 m)."""
+    m = len(moments_px2) // 3
+    variance = np.trace(moments_px2) / (3 * m)
+    past, onward = moments_px2[m:, m:], moments_px2[:m, m:]
+    both = np.linalg.solve(past + _RIDGE * variance * np.eye(2 * m), onward.T).T
+    left = moments_px2[:m, :m] - both @ onward.T - onward @ both.T + both @ past @ both.T
+    return both[:, :m], both[:, m:], _positive(left, _LEAST_DRIVING * variance)
 
 
 def joint_moments(covariances_px2: Floats) -> Floats:

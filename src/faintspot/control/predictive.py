@@ -90,7 +90,7 @@ class Predictive:
 
     def begin(self) -> None:
         """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
-        self.predictor.state[:] = np.tile(-(self._interaction @ self._line.latest), 2)
+        self.predictor.begin(-(self._interaction @ self._line.latest))
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""

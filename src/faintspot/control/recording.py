@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import numbers_between
 from faintspot.control.configuration import NONE, STREAM, Control
-from faintspot.control.learnt import INTEGRATOR, MODAL
+from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
 from faintspot.control.telemetry import Telemetry, make_telemetry
 from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
@@ -62,7 +63,9 @@ def telemetry_of_recording(
             f"{commands.shape[1]}"
         )
     predicted = prior_std_px is not None and control.prediction != NONE
-    if predicted and (control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM):
+    unknown = control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM
+    in_turn = any(str(arm).endswith(f"+{KALMAN}") for arm in recording.attributes.get("arms", []))
+    if (predicted and unknown) or (prior_std_px is not None and in_turn):
         raise InputError(
             "recording: expected a loop closed with an integrator, as what another controller or program has "
             "told the estimator to expect was not recorded"
@@ -92,11 +95,24 @@ def telemetry_of_recording(
 
 
 def theories_of(
-    layout: Layout, frame_rate_hz: float, wind_speeds_m_per_s: Sequence[float] = WIND_SPEEDS_M_PER_S
+    layout: Layout,
+    frame_rate_hz: float,
+    wind_speeds_m_per_s: Sequence[float] = WIND_SPEEDS_M_PER_S,
+    layers: Sequence[tuple[float, float, float]] = (),
 ) -> Mapping[str, Floats]:
-    """Return what theory says of slopes without r0 and winds: as if these came from all directions alike.
+    """Return what theory says of slopes without r0: with layers, and as if winds came from anywhere.
 
     Covariances for lags of 0, 1 and 2 frames, as `learn` takes them; their strength means nothing.
+
+    Parameters
+    ----------
+    layout : Layout
+    frame_rate_hz : float
+    wind_speeds_m_per_s : sequence of float
+        Of winds from all directions alike.
+    layers : sequence of (float, float, float)
+        Speed in m/s, direction in degrees from +x (along columns) to +y (along rows), and strength of each,
+        where they are known, of which only the ratios count.
 
     Raises
     ------
@@ -116,7 +132,20 @@ def theories_of(
     winds = np.column_stack([speeds, np.zeros_like(speeds)])
     scale = (layout.pixel_scale_arcsec or 1.0) * _ARCSEC
     turbulence = SlopeTurbulence(positions, side, scale, 0.15, OUTER_SCALE_M, np.ones(len(speeds)), winds)
-    return {"winds from anywhere": turbulence.from_anywhere().lagged_px2(1 / frame_rate_hz)}
+    anywhere = {"winds from anywhere": turbulence.from_anywhere().lagged_px2(1 / frame_rate_hz)[None]}
+    if not layers:
+        return anywhere
+    told = _told(turbulence, layers).layers()
+    return {"winds as told": np.array([layer.lagged_px2(1 / frame_rate_hz) for layer in told]), **anywhere}
+
+
+def _told(turbulence: SlopeTurbulence, layers: Sequence[tuple[float, float, float]]) -> SlopeTurbulence:
+    speed, direction, share = np.asarray(layers, np.float64).reshape(-1, 3).T
+    numbers_between("layers: speed", speed, 0, 200)
+    numbers_between("layers: direction", direction, -360, 360)
+    numbers_between("layers: strength", share, 0, 1e6, low_open=True)
+    winds = speed * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
+    return replace(turbulence, fraction=share, wind_m_per_s=winds.T)
 
 
 def _longest(frame: NDArray[np.int64], closed: NDArray[np.bool_]) -> tuple[int, int]:

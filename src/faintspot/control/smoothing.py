@@ -16,13 +16,14 @@ Floats = NDArray[np.float64]
 def smoothed_moments(model: SlopeModel, telemetry: Telemetry) -> Floats:
     """Return expected second moments (3 m, 3 m) of z[k + 1], z[k], z[k - 1], given all frames and a model.
 
+    The model is of one layer.
     The expectation step of expectation maximisation (Shumway & Stoffer 1982, J. Time Series Anal. 3, 253),
     with the steady errors of the filter and of the Rauch-Tung-Striebel smoother.
     """
     variance = usual_variance(telemetry)
     filtered, predicted, ahead = _filtered(model, telemetry, variance)
     m = model.slopes
-    onward = np.vstack([model.both, np.eye(m, 2 * m)])
+    onward = model.onward
     gain = np.linalg.solve(ahead[:m, :m] + np.diag(variance), ahead[:m]).T
     after = ahead - gain @ ahead[:m]
     back = np.linalg.solve(ahead + 1e-9 * np.trace(ahead) * np.eye(2 * m), onward @ after).T

@@ -14,9 +14,9 @@ from faintspot.control.commands import CommandLine
 
 Floats = NDArray[np.float64]
 
-_LEAST_SHARE = 0.02  # of the prior's information, that a slope is taken to add at least
+LEAST_SHARE = 0.02  # of the prior's information, that a slope is taken to add at least
 
-_LEAST_VARIANCE = 1e-8  # px^2: of slopes that are known without an error
+LEAST_VARIANCE_PX2 = 1e-8  # of slopes that are known without an error
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +75,13 @@ def without_prior(
     v / 0.02 so that a posterior as wide as the prior stays harmless, and its slope is as much farther from
     the prior's mean as the prior has drawn it there (all Gaussian).
     """
-    variance = np.maximum(np.square(standard_error_px), _LEAST_VARIANCE)
+    variance = np.maximum(np.square(standard_error_px), LEAST_VARIANCE_PX2)
     measured = np.isfinite(variance)
     if prior_std_px is None:
         return slopes_px, variance, measured.astype(np.float64)
     prior = np.square(prior_std_px)
     # Information of the frame in units of the prior's.
-    share = np.maximum(prior / variance - 1, _LEAST_SHARE)
+    share = np.maximum(prior / variance - 1, LEAST_SHARE)
     trust = np.where(measured, share / (1 + share), 0.0)
     alone = expected_px + (slopes_px - expected_px) * (1 + share) / share
     return alone, np.where(measured, prior / share, np.inf), trust

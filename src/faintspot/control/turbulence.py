@@ -77,6 +77,20 @@ class SlopeTurbulence:
         """Return (3, 2 n, 2 n): `covariance_px2` for 0, 1 and 2 frames."""
         return np.array([self.covariance_px2(lag * frame_s) for lag in range(3)])
 
+    def layers(self) -> list[Self]:
+        """Return each layer by itself, as strong as it is."""
+        part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
+        return [
+            replace(
+                self,
+                r0_m=self.r0_m * strength ** (-3 / 5),
+                fraction=np.ones(1),
+                wind_m_per_s=np.asarray(self.wind_m_per_s)[[number]],
+            )
+            for number, strength in enumerate(part)
+            if strength > 0
+        ]
+
     def from_anywhere(self) -> Self:
         """Return the same with winds of these speeds from all directions alike."""
         angles = 2 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
@@ -100,6 +114,24 @@ class SlopeTurbulence:
         )
         xx, xy, yy = (each[which.reshape(-1)].reshape(x.shape) for each in values)
         return np.block([[xx, xy], [xy, yy]])
+
+
+def phase_covariance_rad2(positions_m: Floats, r0_m: float, outer_scale_m: float) -> Floats:
+    """Return the covariance of the phase at 500 nm between points, (n, n) rad^2, without an infinite piston.
+
+    Parameters
+    ----------
+    positions_m : (n, 2) array
+        x and y of points in the pupil.
+    r0_m : float
+        Fried parameter at 500 nm.
+    outer_scale_m : float
+        Of von Karman's spectrum; finite.
+    """
+    structure = _structure(outer_scale_m)
+    x, y = (line[:, None] - line for line in positions_m.T)
+    far = structure(np.array([(1e3 * outer_scale_m) ** 2]))
+    return np.asarray(0.5 * r0_m ** (-5 / 3) * (far - structure(x * x + y * y)))
 
 
 class _Structure:

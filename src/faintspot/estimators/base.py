@@ -214,6 +214,8 @@ class Prepared:
     """Compiled function that measures it."""
     light_step: float = 1.02
     """Measured light counts in steps of this factor, so that settings vary slowly."""
+    prior_weight_row: int | None = None
+    """Of the table of settings: 1 / prior_std_px^2, for a prior whose width may change between frames."""
     fewer_lanes_are_faster: bool = False
     """Whether a group that is not full is measured faster with a narrower vector."""
     variance: float

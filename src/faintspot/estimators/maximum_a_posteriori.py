@@ -80,6 +80,7 @@ class _Prepared(LikelihoodPrepared):
     """Tables of the posterior, too, for every level of light that occurs."""
 
     kernel = staticmethod(located.posterior_of_groups)
+    prior_weight_row = located.PRIOR_WEIGHT
     light_step = 1.1  # larger than others', as each level has its tables
 
     def __init__(self, estimator: MaximumAPosteriori, sensor: Sensor) -> None:

@@ -197,6 +197,19 @@ class LoopConfiguration:
         changed = dataclasses.replace(getattr(self, section), **values)
         return dataclasses.replace(self, **{section: changed})
 
+    def slowed_to(self, rate_hz: float) -> LoopConfiguration:
+        """Return the same loop at another frame rate: with winds that move the air as far in a frame.
+
+        Raises
+        ------
+        InputError
+            For a rate or winds out of range.
+        """
+        part = rate_hz / self.control.frame_rate_hz
+        winds = tuple(part * each for each in self.atmosphere.wind_speed_m_per_s)
+        slower = self.replace("control", frame_rate_hz=rate_hz)
+        return slower.replace("atmosphere", wind_speed_m_per_s=winds)
+
     @property
     def subaperture_m(self) -> float:
         """Side of a sub-aperture."""

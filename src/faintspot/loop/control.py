@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
 from faintspot.control.integrator import Integrator
-from faintspot.control.learning import INTEGRATOR, Learnt, Plant, learn
+from faintspot.control.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
 from faintspot.control.telemetry import Telemetry, make_telemetry
 from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
@@ -139,13 +139,16 @@ def _learnt(
 ) -> Learnt:
     from faintspot.loop.observatory import prepare
 
+    if kind == KALMAN and noise_scale != 1.0:  # learning takes long
+        usual = _learnt(configuration, known, kind, 1.0, seed)
+        return replace(usual, model=usual.model.with_noise(noise_scale))
     optics, control = prepare(configuration), configuration.control
     telemetry = _telemetry(_without_told(configuration), known, seed)
     told = slope_turbulence(configuration, optics.sensor.layout.cells)
     frame_s = 1 / control.frame_rate_hz
     theories = {
-        "winds as told": told.lagged_px2(frame_s),
-        "winds from anywhere": told.from_anywhere().lagged_px2(frame_s),
+        "winds as told": np.array([layer.lagged_px2(frame_s) for layer in told.layers()]),
+        "winds from anywhere": told.from_anywhere().lagged_px2(frame_s)[None],
     }
     plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
     return learn(kind, plant, telemetry, theories, noise_scale)

@@ -17,11 +17,12 @@ _USUAL_TURN = 50  # frames
 _EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
 
 
+_MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
 LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, interleave, loop, stop, and those for modules."""
+    """Return the commands: status, get, set, interleave, loop, advice, stop, and those for modules."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return engine.status()
@@ -54,8 +55,15 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
     def loop(fields: dict[str, Any]) -> Mapping[str, Any]:
         return loop_command(engine, fields)
 
+    def advice(fields: dict[str, Any]) -> Mapping[str, Any]:
+        lines = fields.get("lines")
+        if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
+            raise InputError(f"lines = {lines!r:.80}: expected a list of texts")
+        engine.advice = [line[:_LONGEST_LINE] for line in lines[:_MOST_LINES]]
+        return {}
+
     own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
-    own |= {"interleave": interleave, "loop": loop}
+    own |= {"interleave": interleave, "loop": loop, "advice": advice}
     return own | module_commands(engine.modules)
 
 

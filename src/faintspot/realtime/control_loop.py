@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
 from faintspot.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
-from faintspot.control.configuration import Control
+from faintspot.control.compiled_kalman import CompiledKalman
+from faintspot.control.configuration import CONTROLLER, Control
 from faintspot.control.guarded import Guarded
 from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
+from faintspot.realtime.prior import Prior
 from faintspot.realtime.timing import Latencies
 from faintspot.sensor.layout import Layout
 from faintspot.slopes import RESULT_TYPES, Slopes
@@ -22,9 +26,34 @@ NONE, OPEN, CLOSED = "none", "open", "closed"
 STATES = (NONE, OPEN, CLOSED)
 """Of a loop; telemetry has their places."""
 _AT_START = "not closed since the engine began"
-_BY_REQUEST = "asked to"
+BY_REQUEST = "asked to"
+"""Why a loop is open that somebody has opened."""
 _BEYOND_OPEN = 1.25  # times the open loop's slopes: a loop that leaves more than that does harm
 _LARGEST_RESIDUAL = 0.25  # of a window's side, where the open loop's are not known
+
+
+class _Ready(NamedTuple):
+    """A controller that can take its turn."""
+
+    kind: str
+    controller: Any
+    predicts: bool
+    """Whether estimators are told what it expects."""
+    takes_prior: bool
+    """Whether it asks how wide the prior is that slopes are drawn to."""
+    is_compiled: bool
+    """Then its commands are finite."""
+
+    @classmethod
+    def of(cls, control: Control, line: CommandLine) -> Self:
+        controller = control.controller(line)
+        return cls(
+            control.options.controller,
+            controller,
+            control.prediction == CONTROLLER,
+            isinstance(controller, (Guarded, CompiledKalman)),
+            isinstance(controller, (CompiledIntegrator, CompiledKalman)),
+        )
 
 
 class ControlLoop:
@@ -40,8 +69,8 @@ class ControlLoop:
         Of as many sub-apertures as the control is for.
     held : (commands,) array, optional
         What the mirror holds at the start. Default: it is flat.
-    prior : (1, 2, n) float32 array, optional
-        Where the slopes go that the controller expects of the next frame, px; 0 while the loop is open.
+    prior : Prior, optional
+        Told what a controller that predicts expects of the next frame; nothing while the loop is open.
 
     Attributes
     ----------
@@ -54,17 +83,16 @@ class ControlLoop:
         control: Control,
         layout: Layout,
         held: NDArray[np.floating] | None = None,
-        prior: NDArray[np.float32] | None = None,
+        prior: Prior | None = None,
     ) -> None:
         self.control, self.latencies = control, Latencies()
         self._line = control.line()
         if held is not None:
             self._line.hold(held.astype(np.float64))
-        self.controller = control.controller(self._line)
-        self._guarded = self.controller if isinstance(self.controller, Guarded) else None
-        self._prior = None if prior is None else prior.reshape(-1)
-        self._largest_px = max(layout.frame_shape)
-        self._is_compiled = isinstance(self.controller, CompiledIntegrator)  # whose commands are finite
+        self._prior = prior
+        self._ready: dict[str, _Ready] = {}
+        self.make_ready(control.options.controller)
+        self._on = self._ready[control.options.controller]
         self._slopes, self._errors = np.zeros((2, 2 * len(layout)))
         self._said = np.zeros(2)
         self._true_slopes = Direct(true_slopes)
@@ -90,7 +118,7 @@ class ControlLoop:
             How wide the prior around the expected slopes was that these are drawn to. Default: they are not.
         """
         line = self._line
-        if self._number >= 0:
+        if number != self._number + 1 and self._number >= 0:
             for _ in range(min(number - self._number - 1, line.delay_frames)):
                 line.put(line.latest)
         self._number = number
@@ -109,9 +137,10 @@ class ControlLoop:
             self._flattened = False
             line.hold(np.zeros_like(line.latest))
         if self.closed:
-            if self._guarded is not None:
-                self._guarded.prior_std_px = None if self._prior is None else prior_std_px
-            self._update()
+            on = self._on
+            if on.takes_prior:
+                on.controller.prior_std_px = prior_std_px if on.predicts else None
+            self._update(on)
         else:
             line.put(line.latest)
         return line.latest
@@ -123,26 +152,41 @@ class ControlLoop:
         elif reason := self.guard.objection(self._said, self._line.latest):
             self.closed, self.opened_because = False, reason
             self._flattened = self.guard.flattens
-        if self._prior is not None:
-            self._expect(self._prior)
+        self._expect()
 
-    def _expect(self, prior: NDArray[np.float32]) -> None:
-        """Write down the slopes of the next frame; what no frame can hold counts as not expected."""
-        prior[:] = 0.0
+    def take_turn(self, kind: str | None) -> None:
+        """Let a controller have the coming frames, None: the one that is set.
+
+        It goes on from what the mirror holds, where another one had the frames before.
+        """
+        new = self._ready[self.control.options.controller if kind is None else kind]
+        if new is self._on:
+            return
+        self._on = new
         if self.closed and not self._begins:
-            mean = self.controller.expected().mean_px
-            np.copyto(prior, mean, where=np.abs(mean) <= self._largest_px, casting="same_kind")
+            new.controller.begin()
+        self._expect()
 
-    def _update(self) -> None:
-        """Let the controller send its command; one that fails opens the loop."""
+    def _expect(self) -> None:
+        """Tell estimators what the controller expects of the next frame."""
+        prior, on = self._prior, self._on
+        if prior is None:
+            return
+        if on.predicts and self.closed and not self._begins:
+            prior.expect(*on.controller.expected())
+        else:
+            prior.forget()
+
+    def _update(self, on: _Ready) -> None:
+        """Let a controller send its command; one that fails opens the loop."""
         line = self._line
         before = line.latest
         try:
             if self._begins:
                 self._begins = False
-                self.controller.begin()
-            self.controller.update(self._slopes, self._errors)
-            if self._is_compiled or math.isfinite(line.latest.sum()):
+                on.controller.begin()
+            on.controller.update(self._slopes, self._errors)
+            if on.is_compiled or math.isfinite(line.latest.sum()):
                 return
             reason = "the controller's commands were not finite"
         except Exception as error:  # in the frame path nothing raises
@@ -151,6 +195,28 @@ class ControlLoop:
         self.closed, self.opened_because = False, self.guard.end(reason)
 
     # Any thread -------------------------------------------------------------------------------------
+
+    def make_ready(self, kind: str) -> None:
+        """Make a controller, for it to take its turn; one at a time.
+
+        Raises
+        ------
+        InputError
+            When the model of the control is not what it has learnt.
+        """
+        if kind in self._ready:
+            return
+        control = self.control.with_controller(kind)
+        tried = control.controller(control.line())  # so that everything is compiled
+        tried.update(np.zeros(len(control.interaction)), np.ones(len(control.interaction)))
+        tried.expected()
+        self._ready[kind] = _Ready.of(control, self._line)
+
+    @property
+    def controller(self) -> Controller:
+        """That of the frame that came last."""
+        controller: Controller = self._on.controller
+        return controller
 
     def close(self) -> None:
         """Close the loop, from what the mirror holds on; of one that is closed already nothing changes."""
@@ -163,7 +229,7 @@ class ControlLoop:
     def open(self) -> None:
         """Open the loop: the mirror keeps what it has."""
         if self.closed:
-            self.opened_because = _BY_REQUEST
+            self.opened_because = BY_REQUEST
             self.guard.end()
         self.closed = False
 
@@ -181,8 +247,9 @@ class ControlLoop:
 
     @property
     def gain(self) -> float | None:
-        """The loop gain; None where the controller has none."""
-        return getattr(self.controller, "gain", None)
+        """The loop gain of the controller that is set, or else of another one; None where none has one."""
+        integrator = self._integrator
+        return None if integrator is None else integrator.gain
 
     @gain.setter
     def gain(self, gain: float) -> None:
@@ -191,11 +258,17 @@ class ControlLoop:
         Raises
         ------
         InputError
-            For a value out of range, and where the controller has none.
+            For a value out of range, and where no controller has one.
         """
-        if not isinstance(self.controller, CompiledIntegrator):
+        integrator = self._integrator
+        if integrator is None:
             raise InputError(f"gain: the controller {self.control.options.controller!r} has none")
-        self.controller.gain = number_between("gain", gain, 0, 2)
+        integrator.gain = number_between("gain", gain, 0, 2)
+
+    @property
+    def _integrator(self) -> CompiledIntegrator | None:
+        controllers = [each.controller for each in list(self._ready.values())]
+        return next((each for each in controllers if isinstance(each, CompiledIntegrator)), None)
 
     @property
     def state(self) -> str:
@@ -208,7 +281,7 @@ class ControlLoop:
             "state": self.state,
             "gain": self.gain,
             "opened_because": None if self.closed else self.opened_because,
-            "controller": self.control.options.controller,
+            "controller": self._on.kind,
             "commands": self.control.commands,
             **self.guard.status(),
             "latency": self.latencies.as_dict(),

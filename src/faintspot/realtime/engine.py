@@ -10,10 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from faintspot.configuration import to_text
-from faintspot.control.configuration import CONTROLLER, NONE, STREAM, Control
+from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
-from faintspot.realtime.control_loop import STATES, ControlLoop
+from faintspot.realtime.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.realtime.engine_modules import EngineModules
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM, Interleaving
 from faintspot.realtime.light_following import LightFollower
@@ -21,6 +21,7 @@ from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
+from faintspot.realtime.prior import Prior
 from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
@@ -61,7 +62,7 @@ class Engine:
     cpus : sequence of int, optional
         Processors to pin threads to, the first one for the thread that calls `run`.
     interleaving : Interleaving, optional
-        Several states of the settings, in turn.
+        Several states of the settings, in turn, and controllers.
     deadline_s : float
         From a frame's last row; slopes that come later count as late.
     source : FrameSource, optional
@@ -106,6 +107,8 @@ class Engine:
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
         """What of the real-time scheduling was not permitted."""
+        self.advice: list[str] = []
+        """What was last said to be better, for whoever asks for the status."""
         self._source, self._unfit = source, ""
         self._path: MeasuringPath | None = None
         self._waiting = False
@@ -113,9 +116,7 @@ class Engine:
         self._measured: dict[int, int] = {}  # by an arm's number
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
-        prior = None
-        if control is not None and control.prediction != NONE:
-            prior = np.zeros((1, 2, len(control.interaction) // 2), np.float32)
+        prior = None if control is None else Prior(len(control.interaction) // 2)
         self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
         self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
         self.modules = EngineModules(self.live, self.preparer)
@@ -125,15 +126,18 @@ class Engine:
         if control is not None:
             control.check_fits(len(layout))
             control.check_errors(self.live.running.pipelines[0].calibration)
+        if prior is not None:
+            prior.largest_px = max(layout.frame_shape)
         commands = 0 if control is None else control.commands
         self._streams = SlopeStreams(name, len(layout), commands)
         try:
             self.loop, self._prediction = None, None
             if control is not None:
-                own = prior if control.prediction == CONTROLLER else None
+                own = None if control.prediction == STREAM else prior
                 self.loop = ControlLoop(control, layout, self._streams.held_commands, own)
                 if control.prediction == STREAM and prior is not None:
-                    self._prediction = PredictionStream(name, prior, max(layout.frame_shape))
+                    self._prediction = PredictionStream(name, prior)
+            self._make_ready(interleaving)
             self._telemetry = TelemetryRing.create(
                 name,
                 layout,
@@ -169,6 +173,7 @@ class Engine:
             "modules": {stage: module.name for stage, module in self.modules.modules().items()},
             "module_fault": self.modules.module_fault(),
             "not_permitted": list(self.refused),
+            "advice": self.advice,
             "loop": self.loop_status(),
             "prediction": None if self._prediction is None else self._prediction.status(),
         }
@@ -189,12 +194,26 @@ class Engine:
         """
         before = self.preparer.interleaving
         new = Interleaving.parse(text, every, before.first + len(before.arms))
+        self._make_ready(new)
         self.preparer.interleaving = new
         try:
             return self.live.renew({ARMS: new.labels, FIRST_ARM: new.first, EVERY: new.every})
         except BaseException:
             self.preparer.interleaving = before
             raise
+
+    def _make_ready(self, interleaving: Interleaving) -> None:
+        """Make the controllers of arms, or refuse them."""
+        for arm in interleaving.arms:
+            if arm.control is None:
+                continue
+            try:
+                if self.loop is None:
+                    raise InputError("this engine makes no commands; its configuration has no [control]")
+                self.loop.control.check_errors(self.live.running.pipelines[0].calibration, arm.control)
+                self.loop.make_ready(arm.control)
+            except InputError as error:
+                raise InputError(f"interleave: {arm.label!r}: {error}") from None
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -302,6 +321,8 @@ class Engine:
         """Return the path of the next frame, and whose turn it is; changes of settings take effect here."""
         prepared = self.live.take(self._number + 1)
         place = prepared.interleaving.arm_of(self.counters.processed)
+        if self.loop is not None:
+            self.loop.take_turn(prepared.interleaving.arms[place].control)
         return prepared.paths(ring)[place], prepared.interleaving.first + place
 
     def _end_frame(
@@ -318,10 +339,11 @@ class Engine:
         latency = published - moment
         loop, state, commands = self.loop, 0, None
         if loop is not None:
-            state = STATES.index(loop.state)
+            was_closed = loop.closed
             commands = loop.follow(slopes, number, path.prior_std_px)
             self._streams.publish_commands(commands, number)
             loop.latencies.add(time.monotonic_ns() - moment)
+            state = STATES.index(CLOSED if was_closed else OPEN)
             loop.look_after()
         self.latencies.add(latency)
         change = self.live.change_number
@@ -330,6 +352,8 @@ class Engine:
         self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
         if self._light is not None:
             self._light.take(slopes.flux)
+        if self._streams.commands_lost:
+            counters.commands_renewed += self._streams.renew_commands()
         if explained:
             np.copyto(self._raw, ring.slot(number))
             if ring.intact(number, arrival):
@@ -390,6 +414,8 @@ class Engine:
             self.live.let_go()
             if self._prediction is not None:
                 self._prediction.look_after()
+            if looks % _LOOKS_BETWEEN_STALE == 0:
+                self._streams.look_after_commands()
             loop_told = self._tell_of_loop(loop_told)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):

@@ -20,6 +20,7 @@ from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scra
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.streaming import Arrival, streamed, wait_for_rows
 from faintspot.pipeline import SlopePipeline
+from faintspot.realtime.prior import Prior
 from faintspot.realtime.workers import Workers
 from faintspot.slopes import RESULT_TYPES, Slopes
 
@@ -62,11 +63,14 @@ class _Groups:
         slots: Sequence[NDArray[Any]] | NDArray[Any],
         groups: tuple[int, int],
         shares: int,
-        prior: NDArray[np.float32] | None,
+        prior: Prior | None,
     ) -> None:
         self._groups, self._shares = groups, shares
         self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
-        task = pipeline.preparation.task(np.zeros(1, np.int64), prior)
+        task = pipeline.preparation.task(np.zeros(1, np.int64), None if prior is None else prior.mean_px)
+        task = task._replace(settings=task.settings.copy())
+        self.settings: NDArray[np.float32] = task.settings[0]
+        """What the kernel reads of every sub-aperture: rows as in `faintspot.kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
         self._kernel = Direct(streamed(pipeline.preparation.prepared.kernel))
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
@@ -105,7 +109,7 @@ class FramePath:
     progress : Progress
     workers : Workers, optional
         Who else measures. Default: the caller's thread alone.
-    prior : (1, 2, n) float32 array, optional
+    prior : Prior, optional
         Predicted slopes, which the caller changes between frames. Default 0.
 
     Raises
@@ -122,7 +126,7 @@ class FramePath:
         progress: Progress,
         *,
         workers: Workers | None = None,
-        prior: NDArray[np.float32] | None = None,
+        prior: Prior | None = None,
     ) -> None:
         self.pipeline, self._progress, self._workers = pipeline, progress, workers
         self._check(slots)
@@ -147,7 +151,9 @@ class FramePath:
             width = min(narrow)
             groups = full * wide // width, full * wide // width + 1
             self._narrow = _Groups(pipeline.with_width(width), slots, groups, 1, prior)
-        self.prior_std_px = None if prior is None else prior_std_px(pipeline.settings, pipeline.layout)
+        self._prior, self._prior_changes = prior, 0
+        self._usual_std_px = prior_std_px(pipeline.settings, pipeline.layout)
+        self.prior_std_px = None if prior is None else self._usual_std_px
         """How wide the prior is that slopes are drawn to, (2 n,); None: they are not."""
         self._plain = results, self._stages[:0]
         self._explaining = results, self._stages
@@ -186,6 +192,8 @@ class FramePath:
         explain : bool
             Whether to keep its images.
         """
+        if self._prior is not None and self._prior.changes != self._prior_changes:
+            self._widen(self._prior)
         frame = number, number % self._slots if slot is None else slot
         after = self._explaining if explain else self._plain
         if self._workers is None:
@@ -214,6 +222,18 @@ class FramePath:
         if self._narrow is None or share < self._shares - 1:
             return whole
         return whole and self._narrow.measure(0, frame, progress, self._control, after)
+
+    def _widen(self, prior: Prior) -> None:
+        """Have the estimator's prior as wide as the predicted slopes are unsure, where that is known."""
+        self._prior_changes = prior.changes
+        row = self.pipeline.preparation.prepared.prior_weight_row
+        if row is None:
+            return
+        usual = np.inf if self._usual_std_px is None else self._usual_std_px[: prior.std_px.size]
+        std = np.where(np.isnan(prior.std_px), usual, prior.std_px)
+        for groups in filter(None, (self._wide, self._narrow)):
+            groups.settings[row] = std**-2.0
+        self.prior_std_px = np.tile(std, 2) if np.isfinite(std).all() else None
 
     def _check(self, slots: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
         """Refuse slots that the kernels cannot read, and settings that are not known in time."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from faintspot.checks import number_between
+from faintspot.control.learnt import CONTROLS
 from faintspot.errors import InputError
 from faintspot.estimators.registry import estimators
 from faintspot.realtime.live import check_names
@@ -26,6 +27,8 @@ class Arm:
     changes: dict[str, Any]
     denoises: bool = True
     """False: the estimator's denoising is left out."""
+    control: str | None = None
+    """Its controller; None: that which is set."""
 
     def of(self, settings: Settings) -> Settings:
         """Return what this arm makes of the settings that are set.
@@ -76,7 +79,8 @@ class Interleaving:
         """Return what a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml" says.
 
         Each arm is "set" (the settings as they are set), "none" (the same without denoising), the name of an
-        estimator, or new values of settings, NAME=VALUE, with "+" between them.
+        estimator, or new values of settings, NAME=VALUE, with "+" between them; after another "+" its
+        controller may follow, as in "map+kalman".
 
         Raises
         ------
@@ -111,6 +115,13 @@ def arms_after(
 
 
 def _parsed_arm(text: str) -> Arm:
+    measured, _, control = text.rpartition("+")
+    if measured and control in CONTROLS:
+        return replace(_parsed_settings(measured), label=text, control=control)
+    return _parsed_settings(text)
+
+
+def _parsed_settings(text: str) -> Arm:
     if text in (_SET, _NONE):
         return Arm(text, {}, denoises=text == _SET)
     if text in estimators():
@@ -120,4 +131,7 @@ def _parsed_arm(text: str) -> Arm:
         check_names(list(changes))
         return Arm(text, changes)
     known = ", ".join([_SET, _NONE, *estimators()])
-    raise InputError(f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several")
+    raise InputError(
+        f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, then perhaps + and "
+        f"one of {', '.join(CONTROLS)}"
+    )

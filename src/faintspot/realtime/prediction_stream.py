@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from faintspot.realtime.prior import Prior
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
 _READ_S = 2e-4  # for a writer that is writing at this moment
@@ -31,17 +31,15 @@ class PredictionCounters:
 class PredictionStream:
     """The stream NAME_prediction, floats: 2 n slopes, px, their 2 n variances, the number of the frame.
 
-    Slopes are all x, then all y, as the engine publishes them. Variances are for others: how wide an
-    estimator's prior is, its settings say (`prior_std_px`).
+    Slopes are all x, then all y, as the engine publishes them. A variance that is not a positive number says
+    nothing: there the estimator's prior is as wide as its settings say (`prior_std_px`).
 
     Parameters
     ----------
     name : str
         The engine's.
-    prior : (1, 2, n) float32 array
+    prior : Prior
         Where to put them.
-    largest_px : float
-        Beyond which no slope is.
 
     Raises
     ------
@@ -49,17 +47,18 @@ class PredictionStream:
         Without pyshmem.
     """
 
-    def __init__(self, name: str, prior: NDArray[np.float32], largest_px: float) -> None:
+    def __init__(self, name: str, prior: Prior) -> None:
         self._pyshmem: Any = pyshmem_module("reading predictions in shared memory")
-        self.stream, self._prior, self._largest_px = f"{name}_prediction", prior.reshape(-1), largest_px
-        self._length = 2 * self._prior.size + 1
+        self.stream, self._prior = f"{name}_prediction", prior
+        self._slopes = prior.mean_px.size
+        self._length = 2 * self._slopes + 1
         self._source: Any = None
         self.counters, self.obstacle = PredictionCounters(), "is not there"
         self.look_after()
 
     def fill(self, number: int) -> None:
-        """Put in the prediction for a frame, 0 where there is none; by the engine's thread."""
-        self._prior[:] = 0.0
+        """Put in the prediction for a frame, nothing where there is none; by the engine's thread."""
+        self._prior.forget()
         source, counters = self._source, self.counters
         if source is None or not source.count:
             counters.late += 1
@@ -72,12 +71,12 @@ class PredictionStream:
         if values[-1] != number:
             counters.late += 1
             return
-        mean = values[: self._prior.size]
-        if not np.abs(mean).max() <= self._largest_px:
+        mean, variance = values[:-1].astype(np.float64).reshape(2, -1)
+        if not np.abs(mean).max() <= self._prior.largest_px:
             counters.refused += 1
             return
         counters.taken += 1
-        self._prior[:] = mean
+        self._prior.expect(mean, np.sqrt(np.maximum(variance, 0.0)))
 
     def look_after(self) -> None:
         """See whether the stream is the same, and look for one where there is none; by any other thread."""

@@ -17,6 +17,7 @@ from faintspot.realtime.modular_path import ModularPath
 from faintspot.realtime.module_loading import Module
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import ARRIVALS, ROWS
+from faintspot.realtime.prior import Prior
 from faintspot.realtime.workers import Workers
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
@@ -81,7 +82,7 @@ class PreparedSettings:
     workers : Workers, optional
     budget_s : float
         For modules, from a frame's last row.
-    prior : (1, 2, n) float32 array, optional
+    prior : Prior, optional
         Of all frames, see `FramePath`; what modules measure has none.
 
     Raises
@@ -98,7 +99,7 @@ class PreparedSettings:
         modules: Mapping[str, Module],
         workers: Workers | None,
         budget_s: float,
-        prior: NDArray[np.float32] | None = None,
+        prior: Prior | None = None,
     ) -> None:
         self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
         self.pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
@@ -158,7 +159,7 @@ class SettingsPreparer:
     workers : Workers, optional
     budget_s : float
         For modules, from a frame's last row.
-    prior : (1, 2, n) float32 array, optional
+    prior : Prior, optional
         Predicted slopes, see `FramePath`.
     """
 
@@ -168,7 +169,7 @@ class SettingsPreparer:
         interleaving: Interleaving,
         workers: Workers | None,
         budget_s: float,
-        prior: NDArray[np.float32] | None = None,
+        prior: Prior | None = None,
     ) -> None:
         self.make_pipeline = make_pipeline
         self.interleaving = interleaving

@@ -66,8 +66,16 @@ def lock_file(name: str) -> Path:
     return path
 
 
-def create_stream(name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Any:
+def create_stream(
+    name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, patience_s: float = LOCK_LIMIT_S
+) -> Any:
     """Create a stream; one that is damaged, or whose maker has died, is replaced.
+
+    Parameters
+    ----------
+    name, shape, dtype
+    patience_s : float
+        How long to wait for somebody else who holds the name's lock.
 
     Raises
     ------
@@ -79,7 +87,7 @@ def create_stream(name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float
     """
     pyshmem = pyshmem_module("publishing slopes in shared memory")
     try:
-        _check_free(name)
+        _check_free(name, patience_s)
         for path in _left_behind(pyshmem, name):
             path.unlink()  # pyshmem does not remove what is damaged
         _reserve(name, math.prod(shape) * np.dtype(dtype).itemsize + _BESIDE_BYTES)
@@ -89,6 +97,14 @@ def create_stream(name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float
     except (OSError, ValueError, RuntimeError) as error:
         text = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise InputError(f"{name}: this stream cannot be made ({text})") from None
+
+
+def generation(name: str) -> int | None:
+    """Return a number that changes when a stream is made anew, None where there is none; it takes some us."""
+    try:
+        return os.stat(FOLDER / _base(name)).st_ino
+    except OSError:
+        return None
 
 
 @contextmanager
@@ -143,12 +159,12 @@ def _private_lock_folder() -> Path:
     return folder
 
 
-def _check_free(name: str) -> None:
+def _check_free(name: str, patience_s: float) -> None:
     """Refuse a name whose lock is held, which a living publisher does, or that another user has taken."""
     path = lock_file(name)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
-        if not _lock_within(descriptor, LOCK_LIMIT_S):
+        if not _lock_within(descriptor, patience_s):
             raise InputError(
                 f"{name}: a living process publishes under this name (it holds {path}); stop it or choose "
                 "another --name"

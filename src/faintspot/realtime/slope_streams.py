@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.telemetry_rows import fill_telemetry_rows
-from faintspot.realtime.shared_streams import LOCK_LIMIT_S, create_stream, held, lock_file, pyshmem_module
+from faintspot.realtime.shared_streams import (
+    LOCK_LIMIT_S,
+    create_stream,
+    generation,
+    held,
+    lock_file,
+    pyshmem_module,
+)
 from faintspot.slopes import Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
@@ -59,14 +68,22 @@ class SlopeStreams:
             undo.callback(self._marks.unlink)
             self._commands = create_stream(stream, (commands,)) if commands else None
             undo.pop_all()
-        self._all = [each for each in (self._slopes, self._details, self._marks, self._commands) if each]
+        self._of_commands = stream, (commands,)
+        self._generation = generation(stream)
+        self._commands_lock = ExitStack()
+        self.commands_lost = False
+        """Whether to make the stream of commands anew."""
         self._n, self._closed = n, False
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
 
-    def held(self) -> AbstractContextManager[None]:
+    @contextmanager
+    def held(self) -> Iterator[None]:
         """Keep the streams' locks while publishing; see `shared_streams.held`."""
-        return held(*self._all)
+        with held(self._slopes, self._details, self._marks), self._commands_lock:
+            if self._commands is not None:
+                self._commands_lock.enter_context(held(self._commands))
+            yield
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
         """Publish the vector of slopes; by the thread that holds the streams."""
@@ -76,9 +93,36 @@ class SlopeStreams:
 
     def publish_commands(self, commands: NDArray[np.float64], frame: int) -> None:
         """Publish the commands that follow from a frame; by the thread that holds the streams."""
-        assert self._commands is not None
+        if self._commands is None:  # it was lost
+            return
         with self._commands.write_view_locked(frame_id=frame) as vector:
             vector[:] = commands
+
+    def renew_commands(self) -> bool:
+        """Make the stream of commands anew, which was removed; by the thread that holds the streams.
+
+        Returns
+        -------
+        bool
+            False: another program publishes under its name.
+        """
+        self.commands_lost = False
+        if self._commands is not None:
+            self._commands_lock.close()
+            self._commands.close()
+            self._commands = None
+        try:
+            new = create_stream(*self._of_commands, patience_s=0.0)
+            self._commands_lock.enter_context(held(new))
+        except InputError:
+            return False
+        self._commands, self._generation = new, generation(new.name)
+        return True
+
+    def look_after_commands(self) -> None:
+        """Have the stream of commands made anew where it was removed; by any thread."""
+        if self._of_commands[1][0] and generation(self._of_commands[0]) != self._generation:
+            self.commands_lost = True
 
     def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int, int]:
         """Publish what else is known of each slope; by the thread that holds the streams.
@@ -109,21 +153,22 @@ class SlopeStreams:
 
     def commands_obstacle(self) -> str | None:
         """Return why nobody sees the commands, None where they do; by any thread."""
-        if self._commands is None or self._closed:
+        (name, (commands,)), own = self._of_commands, self._commands
+        if not commands or self._closed:
             return None
-        name = self._commands.name
         try:
             there = pyshmem_module("publishing commands in shared memory").stat(name)["instance_id"]
         except (OSError, ValueError):
-            return f"{name} was removed; restart the engine"
-        same = there == self._commands.instance_id
-        return None if same else f"{name} was made anew by another program; end it and restart the engine"
+            return f"{name} was removed"
+        same = own is not None and there == own.instance_id
+        return None if same else f"{name} was made anew by another program; end it"
 
     def close(self) -> None:
         """Remove all streams."""
         self._closed = True
-        for stream in self._all:
-            stream.unlink()
+        for stream in (self._slopes, self._details, self._marks, self._commands):
+            if stream is not None:
+                stream.unlink()
 
 
 def commands_left_behind(stream: str, commands: int) -> NDArray[np.float32] | None:

@@ -174,6 +174,8 @@ class Counters:
     """Changes that were refused."""
     source_restarts: int = 0
     """How often the source went away and came back."""
+    commands_renewed: int = 0
+    """How often NAME_commands was removed and made anew."""
     worker_restarts: int = 0
     """Worker threads that died and were replaced."""
 

@@ -319,6 +319,9 @@ function showStatus() {
   const { values } = known.status;
   say("estimator", values.estimator || "");
   controls.status(values);
+  const advice = values.advice || [];
+  byId("advice-section").hidden = !advice.length;
+  say("advice", advice.join("\n"));
   const counters = { ...values.counters };
   if (values.subapertures && counters.processed) {
     counters["iterations a sub-aperture"] = counters.iterations / (counters.processed * values.subapertures);

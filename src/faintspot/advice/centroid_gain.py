@@ -1,0 +1,76 @@
+"""Centroid gain and light from recorded images, without moving anything but the windows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.compare.statistics import Estimate
+from faintspot.control.telemetry import without_prior
+from faintspot.pipeline import SlopePipeline
+from faintspot.sensor.calibration import Calibration
+
+Floats = NDArray[np.float64]
+
+_STEP_PX = 1
+_FEWEST_IMAGES = 5
+
+
+def electrons_of(frames_adu: NDArray[np.floating], calibration: Calibration) -> NDArray[np.float32]:
+    """Return frames in electrons, without the dark."""
+    dark, electrons_per_adu = calibration.maps(frames_adu.shape[-2:])
+    return np.asarray((frames_adu - dark) * electrons_per_adu, np.float32)
+
+
+def calibration_of_electrons(calibration: Calibration) -> Calibration:
+    """Return what is left of a calibration for frames of `electrons_of`."""
+    plain = replace(calibration, dark=0.0, flat=None, gain_e_per_adu=1.0, em_gain=1.0, saturation_adu=None)
+    noise = calibration.read_noise_photoelectrons
+    return replace(plain, bad_pixels=None, read_noise_e=noise)
+
+
+def shifted_gain(
+    pipeline: SlopePipeline, frames_e: NDArray[np.float32], prior_px: Floats | None = None
+) -> Estimate | None:
+    """Return by how much slopes grow when all spots are moved by one pixel: frames against their windows.
+
+    The spots are those that the loop left, with all their speckles and noise, so it is the gain where it is
+    needed; an estimator that does not see spots that are far off has a small one.
+
+    Parameters
+    ----------
+    pipeline : SlopePipeline
+        For frames in electrons.
+    frames_e : (images, h, w) array
+    prior_px : (2 n,) array, optional
+        Width of the estimator's prior, which does not count. Default: it has none.
+
+    Returns
+    -------
+    Estimate
+        Its error is from the scatter between images; None of fewer than five.
+    """
+    if len(frames_e) < _FEWEST_IMAGES:
+        return None
+    n = len(pipeline.layout)
+    moved, trust = np.zeros(len(frames_e)), np.zeros(len(frames_e))
+    for image, axis in ((2, 0), (1, 1)):
+        ends = []
+        for step in (_STEP_PX, -_STEP_PX):
+            slopes = pipeline(np.roll(frames_e, step, axis=image))
+            found = slopes.vector.astype(np.float64)
+            error = np.hstack([slopes.standard_error_x, slopes.standard_error_y]).astype(np.float64)
+            error[~np.tile(slopes.valid, 2)] = np.inf
+            ends.append(without_prior(found, error, np.zeros_like(found), prior_px))
+        along = slice(axis * n, (axis + 1) * n)
+        weight = np.minimum(ends[0][2], ends[1][2])[:, along]
+        moved += (weight * (ends[0][0] - ends[1][0])[:, along]).sum(axis=1) / (2 * _STEP_PX)
+        trust += weight.sum(axis=1)
+    total = trust.sum()
+    if not total > 0:
+        return None
+    gain = float(moved.sum() / total)
+    scatter = (moved - gain * trust) * len(moved) / total
+    return Estimate(gain, float(scatter.std(ddof=1) / np.sqrt(len(moved))), count=len(moved))

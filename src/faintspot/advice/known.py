@@ -1,0 +1,232 @@
+"""What telemetry tells of star, camera, spots and air; and what it cannot tell, and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.advice.centroid_gain import calibration_of_electrons
+from faintspot.advice.seen import Seen
+from faintspot.control.turbulence import SlopeTurbulence
+from faintspot.errors import InputError
+from faintspot.estimate.noise import pixel_noise
+from faintspot.loop.configuration import ARCSEC
+from faintspot.loop.seeing import estimate_r0
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
+from faintspot.training.psf_learning import learn_psf_from_images
+
+Floats = NDArray[np.float64]
+
+OUTER_SCALE_M = 25.0
+"""That r0 and wind are told with."""
+_STRETCHES = 5  # whose scatter says an error
+_FEWEST_IMAGES = 10
+_FEWEST_OF_STRETCH = 40  # frames
+_WIND_LAG = 8  # frames, in which the air changes by enough to see
+_WINDS_M_PER_S = np.geomspace(1.0, 60.0, 9)
+_BINS = 256  # of a spectrum
+_NEIGHBOURS = 10  # bins on each side that say how strong the turbulence is there
+_FALSE_ALARM = 0.01  # of a spectrum without vibrations
+_FIRST_BIN = 10  # below, the turbulence's own spectrum is too steep
+
+
+@dataclass(frozen=True)
+class Known:
+    """A quantity that telemetry tells."""
+
+    name: str
+    unit: str
+    value: float = math.nan
+    """NaN: not known."""
+    error: float = math.nan
+    """Standard error; NaN where it cannot be told."""
+    remark: str = ""
+    """Why it is not known, or what it rests on."""
+
+    def in_words(self) -> str:
+        """Return it as a line."""
+        remark = f" ({self.remark})" if self.remark else ""
+        if not math.isfinite(self.value):
+            return f"{self.name}: not known{remark}"
+        error = f" +- {self.error:.2g}" if math.isfinite(self.error) else ""
+        return f"{self.name}: {self.value:.3g}{error} {self.unit}".rstrip() + remark
+
+
+def of_images(
+    frames_e: NDArray[np.float32], layout: Layout, calibration: Calibration
+) -> tuple[list[Known], PSF | None]:
+    """Return light, read noise and width of the spots from frames in electrons; and the PSF learnt.
+
+    Parameters
+    ----------
+    frames_e : (images, h, w) array
+    layout : Layout
+    calibration : Calibration
+        Of the camera; where its dark is rough, the background is taken from the windows' edges.
+    """
+    light = "light", "e- per sub-aperture and frame"
+    noise, width = ("read noise", "e-"), ("width of the spots", "px, with the pixel and the mean speckles")
+    if len(frames_e) < _FEWEST_IMAGES:
+        why = f"{len(frames_e)} images in telemetry, expected {_FEWEST_IMAGES}: images-every"
+        return [Known(*each, remark=why) for each in (light, noise, width)], None
+    images = layout.images(frames_e)
+    pixels = images.shape[-2] * images.shape[-1]
+    background = calibration.background_e * pixels
+    remark = "pixels above the calibrated dark"
+    if calibration.rough_dark:
+        background = pixels * float(np.median(images[..., [0, -1], :]))
+        remark = "pixels above the windows' edges: wings are missing"
+    sums = images.sum(axis=(-2, -1)).mean(axis=-1) - background
+    halves = [pixel_noise(half) for half in np.array_split(images, 2)]
+    found = [
+        Known(*light, float(sums.mean()), float(sums.std(ddof=1) / math.sqrt(len(sums))), remark),
+        Known(*noise, float(np.mean(halves)), abs(halves[0] - halves[1]) / 2),
+    ]
+    plain = calibration_of_electrons(calibration)
+    try:
+        spots = images.reshape(-1, *images.shape[-2:])
+        psf = learn_psf_from_images(spots, calibration=plain, rng=np.random.default_rng(1)).psf
+    except InputError as error:
+        return [*found, Known(*width, remark=str(error))], None
+    return [*found, Known(*width, float(psf.fwhm_px.mean()))], psf
+
+
+def of_air(seen: Seen, layout: Layout, gains: Sequence[float] | None = None) -> list[Known]:
+    """Return r0, the wind and vibrations, from the slopes without what the mirror added."""
+    _, air = seen.weighted(gains)
+    r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
+    side = layout.subaperture_m
+    if side is None and layout.diameter_m is not None:
+        side = layout.diameter_m / (int(np.ptp(layout.cells, axis=0).max()) + 1)
+    if side is None or layout.pixel_scale_arcsec is None:
+        why = "the layout does not say subaperture_m and pixel_scale_arcsec"
+        found = [Known(*r0, remark=why), Known(*wind, remark=why)]
+    else:
+        found = [
+            _r0(Known(*r0), seen, air, layout, side),
+            _wind(Known(*wind), seen, air, layout, side),
+        ]
+    return [*found, *_vibrations(seen, air)]
+
+
+def _stretches(seen: Seen) -> list[NDArray[np.int64]]:
+    return list(np.array_split(np.arange(len(seen)), _STRETCHES))
+
+
+def _of_stretches(kind: Known, whole: float, parts: list[float], remark: str) -> Known:
+    """Return a value with the error that its scatter between stretches tells."""
+    known = [part for part in parts if math.isfinite(part)]
+    error = float(np.std(known, ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
+    if not math.isfinite(whole):
+        return Known(kind.name, kind.unit, remark="the slopes vary no more than their noise")
+    return Known(kind.name, kind.unit, whole, error, remark)
+
+
+def _r0(kind: Known, seen: Seen, air: Floats, layout: Layout, side: float) -> Known:
+    def estimated(rows: NDArray[np.int64]) -> float:
+        return estimate_r0(
+            air[rows],
+            cells=layout.cells,
+            subaperture_m=side,
+            pixel_scale_rad=(layout.pixel_scale_arcsec or 1.0) * ARCSEC,
+            outer_scale_m=OUTER_SCALE_M,
+            segment=seen.turn[rows],
+            static_px=air.mean(axis=0),
+        ).r0_m
+
+    parts = _stretches(seen)
+    if min(len(part) for part in parts) < _FEWEST_OF_STRETCH:
+        return Known(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
+    whole = estimated(np.arange(len(seen)))
+    return _of_stretches(
+        kind, whole, [estimated(part) for part in parts], f"outer scale {OUTER_SCALE_M:g} m assumed"
+    )
+
+
+def _wind(kind: Known, seen: Seen, air: Floats, layout: Layout, side: float) -> Known:
+    """Return the speed of one layer, from anywhere, that changes the slopes as fast as they do."""
+    positions = layout.cells[:, ::-1].astype(np.float64) * side
+    far = _WIND_LAG
+    if seen.rate_hz <= 0 or len(seen) < 10 * far:
+        return Known(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
+    alone = SlopeTurbulence(positions, side, 1.0, 0.15, OUTER_SCALE_M, np.ones(1), np.array([[1.0, 0.0]]))
+    anywhere = alone.from_anywhere()
+    still = _without_tilt(anywhere.covariance_px2(0.0))
+    metres = np.concatenate([[0.0], _WINDS_M_PER_S * far / seen.rate_hz])
+    theory = np.array([_without_tilt(anywhere.covariance_px2(each)) for each in metres]) / still
+
+    def speed(rows: NDArray[np.int64]) -> float:
+        slopes, turn = _without_mean(air[rows] - air.mean(axis=0)), seen.turn[rows]
+
+        def lagged(lag: int) -> float:
+            together = turn[lag:] == turn[:-lag]
+            products = (slopes[lag:] * slopes[:-lag])[together]
+            return float(products.mean()) if len(products) else math.nan
+
+        share = 3 * lagged(far) / max(4 * lagged(1) - lagged(2), 1e-12)
+        falling = np.minimum.accumulate(theory)
+        moved = np.interp(-share, -falling, metres) if falling[-1] <= share <= 1 else math.nan
+        return float(moved * seen.rate_hz / far)
+
+    whole = speed(np.arange(len(seen)))
+    remark = "of a single layer that would change the slopes as fast"
+    found = _of_stretches(kind, whole, [speed(part) for part in _stretches(seen)], remark)
+    if not math.isfinite(whole):
+        return Known(kind.name, kind.unit, remark=f"beyond {_WINDS_M_PER_S[-1]:g} m/s, or hidden by noise")
+    return found
+
+
+def _without_mean(slopes: Floats) -> Floats:
+    axes = slopes.reshape(len(slopes), 2, -1)
+    return np.asarray((axes - axes.mean(axis=2, keepdims=True)).reshape(slopes.shape))
+
+
+def _without_tilt(covariance: Floats) -> float:
+    """Return the sum of variances about each axis's mean over the sub-apertures."""
+    n = len(covariance) // 2
+    total = float(np.trace(covariance))
+    for axis in (slice(0, n), slice(n, 2 * n)):
+        total -= float(covariance[axis, axis].mean()) * n
+    return total
+
+
+def _vibrations(seen: Seen, air: Floats) -> list[Known]:
+    """Return lines in the spectra of tip and tilt that the turbulence beside them does not explain."""
+    from scipy.signal import welch
+    from scipy.stats import chi2
+
+    name, unit = "vibrations", "Hz"
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(seen.turn) != 0, [True]]))
+    longest = int(np.argmax(np.diff(starts)))
+    rows = slice(starts[longest], starts[longest + 1])
+    length = rows.stop - rows.start
+    if length < 4 * _BINS:
+        return [Known(name, unit, remark=f"{length} frames without a gap, expected {4 * _BINS}")]
+    found, hidden = [], 0.0
+    for axis, letter in enumerate("xy"):
+        mean = air[rows].reshape(length, 2, -1)[:, axis].mean(axis=1)
+        frequency, power = welch(mean, seen.rate_hz, nperseg=2 * _BINS, detrend="linear")
+        beside = np.array([_median_beside(power, place) for place in range(len(power))])
+        freedom = 2 * length / (2 * _BINS)
+        limit = chi2.isf(_FALSE_ALARM / len(power), freedom) / freedom
+        hidden = max(hidden, float((limit * beside[_FIRST_BIN:]).max() * frequency[1]))
+        for place in np.flatnonzero(power > limit * beside):
+            if place < _FIRST_BIN or power[place] < power[max(place - 2, 0) : place + 3].max():
+                continue
+            near = slice(max(place - 2, 0), place + 3)
+            square = float((power[near] - beside[near]).sum() * frequency[1])
+            remark = f"along {letter}, rms {math.sqrt(max(square, 0.0)):.2g} px"
+            found.append(Known("vibration", unit, float(frequency[place]), float(frequency[1] / 2), remark))
+    return found or [Known(name, "px", 0.0, remark=f"none with an rms above {math.sqrt(hidden):.2g} px")]
+
+
+def _median_beside(power: Floats, place: int) -> float:
+    """Return the median of the bins beside one, without those next to it."""
+    low, high = power[max(place - _NEIGHBOURS, 0) : max(place - 2, 0)], power[place + 3 : place + _NEIGHBOURS]
+    return float(np.median(np.concatenate([low, high])))

@@ -1,0 +1,106 @@
+"""How large the wavefront is that a loop leaves, without the noise of the slopes that tell it.
+
+Measured slopes are residual slopes and noise. The noise is what the open-loop slopes of a frame, those
+without what the mirror added, differ by from their neighbours' beyond a parabola: it is that of one frame
+alone, while air and commands are known to the frames around it. So an arm of settings is neither punished
+for noise that the mirror does not make, nor rewarded for smoothing that hides what is left; noise that has
+gone through the loop to the mirror counts, as it should.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.advice.seen import Seen
+from faintspot.compare.statistics import Estimate, paired_mean
+from faintspot.loop.statistics import neighbour_differences
+from faintspot.sensor.layout import Layout
+from faintspot.slopes import RESULT_TYPES, Slopes
+from faintspot.wavefront.fit import fit_wavefront
+
+Floats = NDArray[np.float64]
+
+_FEWEST_TURNS = 4
+SETTLE_FRAMES = 20
+"""Of a turn, in which the loop forgets the arm before."""
+
+
+def wavefront_modes(layout: Layout) -> tuple[Floats, str]:
+    """Return what makes Zernike coefficients of slopes, (k, 2 n), and their unit; see `fit_wavefront`.
+
+    Raises
+    ------
+    InputError
+        Where the layout's sub-apertures cannot tell modes apart.
+    """
+    n = len(layout)
+    names = Slopes.__dataclass_fields__
+    fields = {name: np.zeros((2 * n, n), kind) for name, kind in zip(names, RESULT_TYPES, strict=True)}
+    fields["x"][:n], fields["y"][n:] = np.eye(n), np.eye(n)
+    found = fit_wavefront(Slopes(**fields), layout)
+    return np.ascontiguousarray(found.coefficients.T), found.unit
+
+
+def residual_wavefront(seen: Seen, modes: Floats, gains: Sequence[float] | None = None) -> Floats:
+    """Return the mean square of each frame's residual wavefront without the noise, (frames,).
+
+    In the square of the modes' unit; of single frames it may be negative. NaN near the ends of turns, and
+    while the loop forgets the turn before.
+
+    Parameters
+    ----------
+    seen : Seen
+    modes : (k, m) array
+        See `wavefront_modes`.
+    gains : sequence of float, optional
+        Centroid gain of every arm; see `faintspot.advice.centroid_gain`.
+    """
+    residual, air = (each @ modes.T for each in seen.weighted(gains))
+    around = np.full_like(air, np.nan)
+    near, far = air[3:-1] + air[1:-3], air[4:] + air[:-4]
+    around[2:-2] = (4 * near - far) / 6
+    noise = (air * (air - around)).sum(axis=1)
+    left: Floats = np.square(residual).sum(axis=1) - noise
+    apart = np.full(len(seen), True)
+    apart[2:-2] = seen.turn[4:] != seen.turn[:-4]
+    left[apart | (seen.since < SETTLE_FRAMES)] = np.nan
+    return left
+
+
+def compared_residual(seen: Seen, left: Floats, gain_errors: Sequence[float] = (0.0, 0.0)) -> Estimate:
+    """Return by how much arm 1 leaves more than arm 0, in turn with it.
+
+    Each turn of arm 1 is compared with the straight line between the turns of arm 0 before and after it.
+    The interval is Student's t, as if these differences were independent: they nearly are, as the air's slow
+    changes cancel.
+
+    Parameters
+    ----------
+    seen : Seen
+    left : (frames,) array
+        See `residual_wavefront`.
+    gain_errors : two floats
+        Relative errors of the centroid gains that `left` rests on.
+    """
+    turns, first, of_frame = np.unique(seen.turn, return_index=True, return_inverse=True)
+    kept = np.isfinite(left)
+    count = np.bincount(of_frame, weights=kept, minlength=len(turns))
+    sums = np.bincount(of_frame, weights=np.where(kept, left, 0.0), minlength=len(turns))
+    full = count >= 0.5 * np.median(count)
+    means, arm = sums[full] / count[full], seen.arm[first][full]
+    if len(means) < _FEWEST_TURNS or len(set(arm.tolist())) < 2:
+        return Estimate(math.nan)
+    apart = neighbour_differences(means, np.arange(len(means), dtype=np.float64), arm == 0)
+    found = paired_mean(apart[np.isfinite(apart)])
+    of_gains = math.hypot(
+        *(2 * error * means[arm == number].mean() for number, error in enumerate(gain_errors))
+    )
+    if not math.isfinite(found.standard_error) or of_gains == 0:
+        return found
+    widened = math.hypot(1, of_gains / max(found.standard_error, 1e-300))
+    low, high = (found.value + widened * (end - found.value) for end in (found.low, found.high))
+    return Estimate(found.value, widened * found.standard_error, low, high, found.count)

@@ -1,0 +1,46 @@
+"""A simulated loop as advice sees a running one: its slopes, and images of some of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.advice.centroid_gain import electrons_of
+from faintspot.advice.seen import Seen, without_priors
+from faintspot.loop.arms import LoopArm
+from faintspot.loop.camera import camera_calibration
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.control import prior_std_px
+from faintspot.loop.observatory import Observatory
+from faintspot.loop.record import LoopRecord
+
+
+def seen_in_record(record: LoopRecord, arms: Sequence[LoopArm]) -> Seen:
+    """Return what a simulated loop has seen after settling; its slopes divided as the loop does it."""
+    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
+    later, arm = record.delay_frames - 1, record.arm.astype(np.int64)
+    expected = np.zeros_like(held)
+    expected[: len(held) - later] = held[: len(held) - later] - held[later:]
+    predicts = np.array([each.predict_prior for each in arms])[arm]
+    expected[~predicts] = 0.0
+    divisor = np.where(record.corrected, record.centroid_gain, 1.0)[arm][:, None]
+    priors = [prior_std_px(each, held.shape[1]) for each in arms]
+    slopes, error = (each / divisor for each in (record.slopes_px, record.standard_error_px))
+    alone = without_priors(slopes.astype(np.float64), error.astype(np.float64), expected, arm, priors)
+    turn = np.concatenate([[0], np.cumsum(np.diff(arm) != 0)])
+    seen = Seen(arm, turn, *alone, held, record.frame_rate_hz)
+    return seen.chosen(record.scored & (np.arange(record.frames) < record.frames - later))
+
+
+def frames_of_record(record: LoopRecord, numbers: Sequence[int]) -> NDArray[np.float32]:
+    """Return some frames of a run, (images, h, w) electrons, made anew from what the mirror held."""
+    configuration = LoopConfiguration.from_text(record.configuration)
+    observatory = Observatory(configuration, record.seed, record.realisation)
+    frames = []
+    for number in numbers:
+        time_s = (number + 0.5) / record.frame_rate_hz
+        _, seen = observatory.wavefronts(time_s, record.commands[number].astype(np.float64))
+        frames.append(observatory.frame(number, seen))
+    return electrons_of(np.stack(frames), camera_calibration(configuration))

@@ -1,0 +1,178 @@
+"""The guarded Kalman filter in compiled code, as a controller."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.base import Expected
+from faintspot.control.commands import CommandLine
+from faintspot.control.kalman import SlopePredictor, shares
+from faintspot.control.kalman_kernels import (
+    CHOSEN,
+    COMMAND_ROWS,
+    FOLLOW,
+    FRAMES,
+    GO_ON,
+    HELD,
+    HOLD,
+    LATEST_PLAIN,
+    PREDICTED,
+    SLOPE_ROWS,
+    Lines,
+    Matrices,
+    Memory,
+)
+
+Floats = NDArray[np.float64]
+
+STEPS = 4
+"""Of conjugate gradients, for how much each slope corrects."""
+_NO_PRIOR = np.zeros(0)
+
+
+class CompiledKalman:
+    """`guarded.Guarded` with `predictive.Predictive` and the integrator beside it, in compiled code.
+
+    How much each slope corrects follows the noise of each frame, as in `SlopePredictor`; in place of solving
+    its equations to the end it takes `STEPS` steps of conjugate gradients, which is products with matrices.
+
+    Before a command goes out, only that is done which needs the frame's slopes: the rest when somebody asks
+    what is expected next, or with the next `update`.
+
+    Parameters
+    ----------
+    line : CommandLine
+        To the mirror.
+    interaction : (m, commands) array
+    reconstruct : (commands, m) array
+        From slopes to what is compared, and what the integrator integrates.
+    predictor : SlopePredictor
+    clean : (commands, m) array
+        The wavefront, as commands that cause it, from open-loop slopes without noise.
+    plain_gain, leak : float
+        Of the integrator.
+    prior_std_px : (m,) array, optional
+        Prior of the estimator, whose mean is `expected`. Default: it has none.
+    noise_factor : float
+        What to multiply the variances of standard errors by.
+    prefers_plain : bool
+        Whether the integrator begins.
+    steps : int
+        Of conjugate gradients.
+    """
+
+    undoes_prior = False
+
+    def __init__(
+        self,
+        line: CommandLine,
+        interaction: Floats,
+        reconstruct: Floats,
+        predictor: SlopePredictor,
+        clean: Floats,
+        plain_gain: float,
+        leak: float,
+        *,
+        prior_std_px: Floats | None = None,
+        noise_factor: float = 1.0,
+        prefers_plain: bool = False,
+        steps: int = STEPS,
+    ) -> None:
+        self._line, self._interaction = line, interaction
+        slopes, commands = interaction.shape
+        self._learnt, self._plain = (CommandLine(commands, line.delay_frames, line.largest) for _ in range(2))
+        self.prior_std_px = prior_std_px
+        ahead = -clean @ predictor.model.ahead(line.delay_frames)
+        usual = predictor.usual_px2
+        self._matrices = Matrices(
+            np.ascontiguousarray(interaction.T),
+            np.ascontiguousarray(reconstruct.T),
+            np.ascontiguousarray(predictor.with_slopes.T),
+            predictor.predicted_px2,
+            np.linalg.inv(usual),
+            np.diag(usual).copy(),
+            np.ascontiguousarray(predictor.model.both.swapaxes(1, 2)),
+            np.ascontiguousarray(ahead.T),
+        )
+        self._lines = Lines(line.rows, self._learnt.rows, self._plain.rows)
+        self._memory = Memory(
+            np.zeros((predictor.model.layers, 2, slopes)),
+            np.zeros(4),
+            np.zeros((SLOPE_ROWS, slopes)),
+            np.zeros((COMMAND_ROWS, commands)),
+        )
+        self._memory.guard[CHOSEN] = prefers_plain
+        self._noise_factor = float(noise_factor)
+        self._numbers = float(plain_gain), 1.0 - leak, float(line.largest), steps
+        self._std_px, self._shares = predictor.std_px, shares(predictor.model)
+        self._is_behind = False
+        self._held_at = -1
+        """Where the line was when what acts was turned into slopes."""
+
+    @property
+    def chosen(self) -> int:
+        """0: the filter's commands go out; 1: the integrator's."""
+        self._catch_up()
+        return int(self._memory.guard[CHOSEN])
+
+    def expected(self) -> Expected:
+        """See `Controller`."""
+        self._catch_up()
+        rows = self._memory.slopes
+        if self._memory.guard[CHOSEN]:
+            return Expected(rows[HELD] - rows[LATEST_PLAIN], None)
+        return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
+
+    def begin(self) -> None:
+        """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
+        latest = self._line.latest
+        for own in (self._learnt, self._plain):
+            own.hold(latest)
+        open_loop = -(self._interaction @ latest)
+        self._memory.state[:] = self._shares[:, None, None] * open_loop
+        self._memory.slopes[PREDICTED] = open_loop
+        self._memory.guard[FRAMES:] = 0.0
+        self._is_behind, self._held_at = False, -1
+
+    def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
+        """See `Controller`.
+
+        Raises
+        ------
+        ArithmeticError
+            When the filter's numbers have become too large.
+        """
+        self._catch_up()
+        prior = self.prior_std_px
+        total = FOLLOW(
+            slopes_px,
+            standard_error_px,
+            _NO_PRIOR if prior is None else prior,
+            self._noise_factor,
+            self._numbers,
+            self._matrices,
+            self._lines,
+            self._places(),
+            self._memory,
+        )
+        if not math.isfinite(total):
+            raise ArithmeticError("its commands were not finite")
+        self._line.sent()
+        self._is_behind = True
+
+    def _catch_up(self) -> None:
+        """Do what is left of the frame before."""
+        if self._is_behind:
+            GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
+            self._learnt.sent()
+            self._plain.sent()
+            self._is_behind, self._held_at = False, -1
+        if self._held_at != self._line.place:
+            HOLD(self._matrices, self._lines, self._places(), self._memory)
+            self._held_at = self._line.place
+
+    def _places(self) -> tuple[int, int, int]:
+        return self._line.place, self._learnt.place, self._plain.place

@@ -1,0 +1,117 @@
+"""Other commands of faintspot as processes that end with this one, whatever happens to it (Linux)."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from faintspot.errors import InputError
+from faintspot.files import output_errors
+
+_PATIENCE_S = 10.0  # for a process to end as it is asked to
+_LOOK_S = 0.02
+_DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+_ERROR = "faintspot: error: "
+
+
+class ChildProcesses:
+    """Commands that run beside this process. As a context manager it ends them, the last one first.
+
+    Ctrl-C in the terminal does not reach them, so that they end in order; the kernel ends them where this
+    process is killed.
+
+    Parameters
+    ----------
+    folder : path
+        Where NAME.log gets what each of them says; for this user's eyes only.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._started: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, arguments: Sequence[str]) -> None:
+        """Start `faintspot ARGUMENTS`; the thread that does so must live as long as they are needed.
+
+        Raises
+        ------
+        InputError
+            When its log cannot be written.
+        """
+        library = ctypes.CDLL(None)
+        with output_errors(self._log(name)):
+            self._log(name).unlink(missing_ok=True)
+            log = os.open(self._log(name), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            self._started[name] = subprocess.Popen(
+                [sys.executable, "-m", "faintspot", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                preexec_fn=lambda: library.prctl(_DIES_WITH_PARENT, signal.SIGTERM),
+            )
+        finally:
+            os.close(log)
+
+    def said(self, name: str) -> list[str]:
+        """Return the lines that a command has written so far."""
+        return self._log(name).read_text(encoding="utf-8", errors="replace").splitlines()
+
+    def check(self) -> None:
+        """Make sure that all of them run.
+
+        Raises
+        ------
+        InputError
+            With the last line of one that has ended.
+        """
+        for name, process in self._started.items():
+            if process.poll() is not None:
+                words = (self.said(name) or [f"exit code {process.returncode}"])[-1]
+                raise InputError(f"{name}: it has ended: {words.removeprefix(_ERROR)}")
+
+    def wait_until(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+        """Wait for something that needs all of them.
+
+        Raises
+        ------
+        InputError
+            When one of them ends, or the time is over; `what` says what was waited for.
+        """
+        end = time.monotonic() + timeout_s
+        while not condition():
+            self.check()
+            if time.monotonic() > end:
+                raise InputError(f"{what}: waited for it for {timeout_s:g} s in vain")
+            time.sleep(_LOOK_S)
+
+    def close(self) -> None:
+        """End all of them; those that do not end as they are asked to are killed."""
+        while self._started:
+            _, process = self._started.popitem()
+            process.terminate()
+            try:
+                process.wait(_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _log(self, name: str) -> Path:
+        return self._folder / f"{name}.log"

@@ -1,0 +1,11 @@
+"""Fixtures for the tests of advice."""
+
+from __future__ import annotations
+
+import pytest
+from tests.cli.cli_cases import Commands
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Commands:
+    return Commands(capsys)

@@ -1,0 +1,138 @@
+"""faintspot demo --live: it shows a loop, ends what it has started, and says what the arms were worth."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+import urllib.request
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from rich.console import Console
+from tests.cli.cli_cases import Commands, command_line
+
+pytest.importorskip("hcipy")
+pytest.importorskip("pyshmem")
+pytest.importorskip("tornado")
+pytest.importorskip("zarr")
+
+from faintspot.cli.demo_live import arms_table, in_words
+from faintspot.errors import InputError
+from faintspot.live_page.demonstration import Shown
+from faintspot.realtime.control import ControlServer, request
+from faintspot.realtime.pixel_segment import FOLDER
+from faintspot.realtime.private_socket import socket_path
+
+PATIENCE_S = 240.0  # the engine may have to compile its code
+OPEN, CLOSED = 1, 2
+COUNTERS = {"processed": 600, "dropped": 2, "skipped": 1}
+
+
+@pytest.fixture
+def name() -> str:
+    return f"fs_test_{uuid4().hex[:12]}"
+
+
+def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
+    """Interrupted, it gives a table of what it has seen, and leaves nothing behind."""
+    arguments = [
+        "demo",
+        "--live",
+        "--rate",
+        "50",
+        "--seconds",
+        str(PATIENCE_S),
+        "--port",
+        "0",
+        "--name",
+        name,
+    ]
+    process = command_line(*arguments, cwd=tmp_path)
+    too_late = threading.Timer(PATIENCE_S, process.kill)
+    too_late.start()
+    try:
+        assert process.stdout is not None
+        lines = [process.stdout.readline() for _ in range(4)]
+        assert lines[3].startswith("the loop is closed; in turn"), (lines, process.communicate(timeout=60))
+        with urllib.request.urlopen(lines[1], timeout=60) as page:
+            assert b"<title>faintspot</title>" in page.read()
+        end = time.monotonic() + PATIENCE_S
+        while request(socket_path(name), "status")["counters"]["processed"] < 400:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=60)
+    finally:
+        too_late.cancel()
+        process.kill()
+    assert process.returncode == 0, errors
+    for text in ("brightest", "window", "map", "over brightest", "frames measured", "of the open loop"):
+        assert text in out
+    assert not list(FOLDER.glob(f"{name}*"))
+    with pytest.raises(InputError):
+        request(socket_path(name), "status")
+    for log in ("telescope", "engine", "page"):
+        assert "Traceback" not in (tmp_path / "faintspot-demo" / f"{log}.log").read_text()
+
+
+def shown(turns: int) -> Shown:
+    """Arms of 60 frames with Strehl ratios of 0.3, 0.5 and 0.4, and 0.9 while they settle; before, 0.1."""
+    seen = Shown(["brightest", "window", "map"], delay_frames=2)
+    seen.status = {
+        "counters": COUNTERS,
+        "loop": {"latency": {"p50_us": 40.0, "p99_us": 90.0}, "opened_because": None},
+    }
+    for frame in range(60 * turns):
+        place, since = frame // 60 % 3, frame % 60
+        open_loop = frame < 60
+        strehl = 0.1 if open_loop else 0.9 if since < 20 else (0.3, 0.5, 0.4)[place]
+        seen.rows.append((frame, place, OPEN if open_loop else CLOSED, 30.0 + place))
+        if frame % 4 or open_loop:
+            seen.truth[frame] = strehl, frame - (2 if frame % 2 else 3)
+    return seen
+
+
+def test_table() -> None:
+    seen = shown(13)
+    arms = {arm.strehl.arm: arm for arm in seen.by_arm()}
+    assert [arm.strehl.mean.value for arm in arms.values()] == pytest.approx([0.3, 0.5, 0.4])
+    assert arms["brightest"].strehl.difference is None
+    difference = arms["window"].strehl.difference
+    assert difference is not None
+    assert difference.value == pytest.approx(0.2)
+    assert arms["map"].frames == 240
+    assert (arms["map"].p50_us, seen.open_strehl) == pytest.approx((32.0, 0.1))
+    assert seen.on_time == pytest.approx(2 / 3)  # of every four frames, three are known, two of them odd
+    console = Console(width=80, record=True)
+    console.print(arms_table(seen.by_arm()))
+    assert "0.500 ± 0.000  +0.200 ± 0.000" in console.export_text()
+    words = in_words(seen)
+    assert words[0].startswith("600 frames measured, 3 lost; ")
+    assert len(words) == 3
+
+
+def test_what_was_not_seen_is_said() -> None:
+    assert in_words(Shown(["a"], 2)) == ["ended before there was a loop"]
+    early = shown(2)
+    assert early.by_arm() == []
+    assert in_words(early)[-1] == "ended before every arm had its turn"
+    nothing = Shown(["a"], 2)
+    assert np.isnan([nothing.open_strehl, nothing.on_time]).all()
+
+
+def test_refusals(folder: Path, run: Commands, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.refused("demo", "--rate", 50, naming=("--rate: expected only with --live",))
+    run.refused("demo", "--live", "--frames", 50, naming=("--frames: expected only without --live",))
+    run.refused("demo", "--live", "--photons", 0, "--name", name, naming=("photons_per_subaperture",))
+    run.refused("demo", "--live", "-o", "faintspot.toml", "--name", name, naming=("faintspot.toml",))
+    with ControlServer(socket_path(name), {"status": lambda fields: {"counters": {}}}):
+        run.refused("demo", "--live", "--name", name, naming=("expected one that no engine has",))
+    monkeypatch.setattr("faintspot.cli.demo_live.present", lambda package: package == "zarr")
+    wanted = (
+        "needs pyshmem and tornado and hcipy: install it with pip install 'faintspot[realtime,live,loop]'"
+    )
+    run.refused("demo", "--live", naming=(wanted,))
+    assert [path.name for path in folder.iterdir()] == ["faintspot.toml"]

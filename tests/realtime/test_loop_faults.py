@@ -1,0 +1,137 @@
+"""What goes wrong around a closed loop: clocks that jump, and a stream of commands that is taken away."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+from faintspot.control.configuration import Control
+from faintspot.realtime.pixel_segment import FOLDER
+from faintspot.realtime.shared_streams import _base
+
+pytest.importorskip("hcipy")
+pyshmem = pytest.importorskip("pyshmem")
+
+from tests.realtime.closed_loop import COMMANDS, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
+    return configured(tmp_path_factory.mktemp("bench"))
+
+
+@pytest.fixture
+def sky(files: tuple[Path, Control]) -> Iterator[Sky]:
+    made = Sky(f"fs_test_{uuid4().hex[:12]}")
+    try:
+        made.start(make_engine(made.name, *files))
+        made.loop.close()
+        made.frames(6)
+        yield made
+    finally:
+        made.close()
+
+
+def check_commands(sky: Sky, control: Control) -> None:
+    """All frames came, and each has moved the mirror by what an integrator makes of its slopes."""
+    records, options = sky.records, control.options
+    frames = len(records)
+    assert records["frame"].tolist() == list(range(frames))
+    assert set(records["loop"]) == {2}
+    slopes = np.hstack([records["x"], records["y"]]) / options.centroid_gain
+    sent = np.vstack([np.zeros(COMMANDS), records["commands"]]).astype(np.float64)
+    expected = (1 - options.leak) * sent[:-1] - options.gain * slopes @ control.reconstructor.matrix.T
+    np.testing.assert_allclose(sent[1:], expected, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("jump_s", [-1e7, 1e7])
+def test_the_clock_jumps(
+    sky: Sky, files: tuple[Path, Control], jump_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true_s, true_ns = time.time, time.time_ns
+    monkeypatch.setattr(time, "time", lambda: true_s() + jump_s)
+    monkeypatch.setattr(time, "time_ns", lambda: true_ns() + round(jump_s * 1e9))
+    assert sky.frames(30)[20:].mean() > 0.4
+    check_commands(sky, files[1])
+    assert sky.loop.latencies.largest_ns < PATIENCE_S * 1e9
+
+
+def frames_until(sky: Sky, condition: Callable[[], bool]) -> None:
+    """Let frames come until something is so."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        sky.frame()
+
+
+def segments(sky: Sky) -> list[Path]:
+    return [FOLDER / f"{_base(f'{sky.name}_commands')}{part}" for part in ("", "_meta")]
+
+
+def maker(sky: Sky) -> int | None:
+    """Return the process that has made the stream of commands that is there."""
+    try:
+        return int(pyshmem.stat(f"{sky.name}_commands")["creator_pid"])
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def renewed(sky: Sky) -> int:
+    assert sky.running is not None
+    return sky.running.engine.counters.commands_renewed
+
+
+def obstacle(sky: Sky) -> str:
+    assert sky.running is not None
+    return str(sky.running.engine.loop_status()["obstacle"])
+
+
+def test_the_stream_of_commands_is_removed(sky: Sky, files: tuple[Path, Control]) -> None:
+    """The engine makes it anew, the mirror follows the new one, and the loop goes on."""
+    for path in segments(sky):
+        path.unlink()
+    assert "was removed" in obstacle(sky)
+    frames_until(sky, lambda: renewed(sky) == 1)
+    frames_until(sky, lambda: sky.frame()["frame"] - sky.frame()["command_frame"] <= 2)
+    assert obstacle(sky) == "None"
+    assert sky.frames(30)[20:].mean() > 0.4
+    check_commands(sky, files[1])
+
+
+def test_another_program_takes_the_stream_of_commands(
+    sky: Sky, files: tuple[Path, Control], tmp_path: Path
+) -> None:
+    """One with another folder of locks may: the engine leaves it alone and says so, until it has ended."""
+    code = (
+        "import sys, numpy as np, pyshmem\n"
+        f"stream = pyshmem.create(sys.argv[1], shape=({COMMANDS},), dtype='f4')\n"
+        "sys.stdin.read()\n"
+    )
+    for path in segments(sky):
+        path.unlink()
+    environment = {**os.environ, "PYSHMEM_LOCK_DIR": str(tmp_path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code, f"{sky.name}_commands"],
+        env=environment,
+        stdin=subprocess.PIPE,
+    ) as other:
+        try:
+            sky.until(lambda: maker(sky) == other.pid)
+            sky.frames(5)
+            time.sleep(0.5)  # for the watcher to look twice
+            sky.frames(5)
+            assert renewed(sky) == 0
+            assert "another program" in obstacle(sky)
+        finally:
+            other.kill()
+    frames_until(sky, lambda: renewed(sky) == 1)
+    sky.frames(5)
+    check_commands(sky, files[1])
