@@ -269,6 +269,9 @@ def test_who_may_take_a_name(folder: Path) -> None:
     (folder / "cam.im.shm").write_text("something else")
     with pytest.raises(InputError, match="is no stream; remove it or choose another name"):
         ImageStreamWriter("isio", "cam", (6,))
+    os.mkfifo(folder / "pipe.im.shm")
+    with pytest.raises(InputError, match="is no stream"):
+        ImageStreamWriter("isio", "pipe", (6,))
     with pytest.raises(InputError, match="cannot be made"):
         ImageStreamWriter("dao", "no/cam.im.shm", (6,))
 
@@ -315,6 +318,20 @@ def test_frames_go_into_the_ring(folder: Path, name: str) -> None:
     wait_for(lambda: bridge.step() or any("was removed" in line for line in lines))
     isio(folder, (7,), "f4")
     wait_for(lambda: bridge.step() or any("expected frames" in line for line in lines))
+    bridge.close()
+
+
+def test_counters_that_are_mad(folder: Path, name: str) -> None:
+    lines: list[str] = []
+    file = isio(folder)
+    bridge = StreamBridge("isio:cam", name, say=lines.append, spins=False)
+    wait_for(lambda: bridge.step() or bool(lines))
+    for counter in (2**64 - 2, 3):  # written by somebody else, or going back
+        file.put(264, "Q", counter)
+        file.write(np.ones((3, 5), np.uint16))
+        wait_for(bridge.step)
+    assert (bridge.counters.frames, bridge.counters.not_ahead) == (2, 1)
+    assert bridge.counters.missed == 2**64 - 2
     bridge.close()
 
 

@@ -170,7 +170,7 @@ class StreamBridge:
             ring.begin(number)[...] = slot.copy()
         ring.end()
         counters.frames += 1
-        counters.missed += publication.total - self._seen - 1
+        counters.missed += max(0, publication.total - self._seen - 1)
         counters.not_ahead += number <= self._last_number
         if self._silent and self._last_number >= 0:
             self._follower.say("goes on")

@@ -39,7 +39,7 @@ from faintspot.realtime.pixel_segment import identity_of
 from faintspot.realtime.processes import process_start
 from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
 from faintspot.realtime.semaphores import Semaphore
-from faintspot.realtime.stream import Publication
+from faintspot.realtime.stream import LARGEST_NUMBER, Publication
 
 _NAP_S = 5e-4
 _OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # of a pipe we want nothing
@@ -122,7 +122,7 @@ class ImageStream:
     @property
     def number(self) -> int:
         """Number of the newest."""
-        return max(self.count - 1, 0)
+        return _number(self.count)
 
     @property
     def maker(self) -> str:
@@ -166,7 +166,7 @@ class ImageStream:
                 newest = mapped.values[int(mapped.fields["cnt1"]) % len(mapped.values)]
                 np.copyto(target, newest if self._circular else mapped.values, casting="unsafe")
                 if not mapped.writing and self.count == count:
-                    return Publication(target, max(count - 1, 0), count)
+                    return Publication(target, _number(count), count)
             if time.monotonic() >= end:
                 break
         return None
@@ -219,7 +219,7 @@ class ImageStreamWriter:
         places = places_of(kind, head)
         there = _there(kind, self.path)
         if kind == DAO and there is not None:
-            memory = self._joined(head, there)
+            memory = self._joined(head, *there)
             places = places_of(kind, np.ndarray((), METADATA[kind], memory))
             self._mapped = _Mapped(kind, memory, places, self.shape)
         else:
@@ -279,19 +279,15 @@ class ImageStreamWriter:
         head["creationtime"] = head["lastaccesstime"] = _clock()
         return head
 
-    def _joined(self, wanted: NDArray[Any], there: NDArray[Any]) -> mmap.mmap:
-        """Map a stream that is there, where it is what is wanted."""
+    def _joined(self, wanted: NDArray[Any], there: NDArray[Any], memory: mmap.mmap) -> mmap.mmap:
+        """Return the memory of a stream that is there, where it is what is wanted."""
         sizes = [each["size"][: int(each["naxis"])].tolist() for each in (wanted, there)]
         if sizes[0] != sizes[1] or wanted["datatype"] != there["datatype"]:
             raise InputError(
                 f"{self.kind}:{self.path}: expected a stream of {sizes[0]} float32 values, or none, found "
                 f"{sizes[1]} of type {TYPES[int(there['datatype'])]}; remove it or choose another name"
             )
-        try:
-            with self.path.open("r+b") as file:
-                return mmap.mmap(file.fileno(), 0)
-        except OSError as error:
-            raise InputError(f"{self.kind}:{self.path}: cannot be opened ({error.strerror})") from None
+        return memory
 
     def _keywords(self) -> Any:
         """The keyword FRAME; None where somebody else's stream has no room for it."""
@@ -319,8 +315,13 @@ class ImageStreamWriter:
         return [*(f"{local}_sem{number:02d}" for number in range(count)), f"{local}_semlog"]
 
 
-def _there(kind: str, path: Path) -> NDArray[Any] | None:
-    """Return the metadata of a stream of that name that may be replaced or joined; None where there is none.
+def _number(count: int) -> int:
+    """Number of the frame that was published last."""
+    return max(count - 1, 0) & LARGEST_NUMBER
+
+
+def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
+    """Return metadata and memory of a stream of that name, which may be replaced or joined; None without one.
 
     Raises
     ------
@@ -328,25 +329,28 @@ def _there(kind: str, path: Path) -> NDArray[Any] | None:
         When it is something else, or its maker lives.
     """
     try:
-        content = path.read_bytes()[: METADATA[kind].itemsize]
-        size = path.stat().st_size
+        descriptor = os.open(path, os.O_RDWR | _OPEN)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise InputError(f"{kind}:{path}: cannot be opened ({error.strerror})") from None
     try:
-        if len(content) < METADATA[kind].itemsize:
+        status, layout = os.fstat(descriptor), METADATA[kind]
+        if not stat.S_ISREG(status.st_mode) or status.st_size <= layout.itemsize:
             raise Unfit("is no stream")
-        head = np.frombuffer(content, METADATA[kind])[0]
-        checked(kind, head, size)
+        head = np.frombuffer(os.pread(descriptor, layout.itemsize, 0), layout)[0]
+        checked(kind, head, status.st_size)
+        memory = mmap.mmap(descriptor, status.st_size)
     except Unfit as error:
         raise InputError(f"{kind}:{path}: {error}; remove it or choose another name") from None
+    finally:
+        os.close(descriptor)
     maker = int(head["creatorPID"]) if kind == ISIO else 0
     if maker not in (0, os.getpid()) and process_start(maker) >= 0:
         raise InputError(
             f"{kind}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
         )
-    return np.array(head)
+    return np.array(head), memory
 
 
 def _made(path: Path, size: int, head: NDArray[Any]) -> tuple[mmap.mmap, Path]:

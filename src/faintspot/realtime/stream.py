@@ -13,7 +13,8 @@ from faintspot.realtime.image_layout import DAO, ISIO, Unfit, path_of
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
 _NAP_S = 5e-4
-_LARGEST_NUMBER = 2**63 - 1
+LARGEST_NUMBER = 2**63 - 1
+"""Of a frame."""
 
 
 class Publication(NamedTuple):
@@ -141,7 +142,7 @@ class PyshmemStream:
 
 def _number(frame_id: int, count: int) -> int:
     """Return a publication's frame number; of a writer that stamps nothing, frame_id is 0."""
-    return (frame_id or max(count - 1, 0)) & _LARGEST_NUMBER
+    return (frame_id or max(count - 1, 0)) & LARGEST_NUMBER
 
 
 def split_name(name: str) -> tuple[str, str]:

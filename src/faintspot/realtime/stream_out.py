@@ -86,7 +86,7 @@ class StreamOut:
             return False
         assert self._writer is not None
         self._writer.publish(publication.values, publication.number)
-        self.missed += publication.total - self._seen - 1 if self._seen else 0
+        self.missed += max(0, publication.total - self._seen - 1) if self._seen else 0
         self._seen = publication.total
         self.published += 1
         return True
