@@ -43,7 +43,7 @@ from faintspot.settings import Settings
 BRIGHTEST_E, FADES_BY = 1600.0, 3.0  # photo-electrons of a sub-aperture in a frame; magnitudes
 SEEING_ARCSEC = 0.6, 1.2
 GAINS = (0.2, 0.4, 0.6)
-SETTLE, LEARN, TURN, IMAGES_EVERY = 60, 300, 60, 12  # frames
+SETTLE, LEARN, TURN, IMAGES_EVERY = 60, 400, 60, 12  # frames
 PLANNER_EVERY = 3  # stretches; the loop gain is looked at in all others
 OTHER_AIR = 1200  # first realisation of the air on which the first settings are chosen
 

@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]
 GAINS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 """Loop gains that are tried on telemetry."""
 _PARTS = 5  # of telemetry, whose scatter says an error
-_FEWEST_OF_PART = 150  # frames
+_FEWEST_OF_PART = 100  # frames
 _SETTLE = 30  # of them, in which the loop closes
 _LIGHT_TOLERANCE = 0.1  # of the light, within which it need not be told anew
 _SPOTS, _FLUX_STEPS = 1024, 1  # of the planner's simulation
