@@ -179,7 +179,8 @@ def new_estimators(
     residual_px : float
         Rms of the slopes that the loop leaves, which says how far spots are from their reference.
     centroid_gain : float
-        That the control divides slopes by.
+        By which the slopes of the estimator that runs grow with the spots' motion; a window is told a gain of
+        its own that makes its slopes as large, so that the loop's gain stays what it is.
     progress : callable, optional
         As of `faintspot.planner.tune`.
 
@@ -231,10 +232,7 @@ def _with_gain(
     frames_e: NDArray[np.float32],
     centroid_gain: float,
 ) -> dict[str, Any] | None:
-    """Tell a window its centroid gain on the spots that were recorded; None: it does not fit the sensor.
-
-    Its slopes are then as large as the control expects them.
-    """
+    """Tell a window its centroid gain on the spots that were recorded; None: it does not fit the sensor."""
     try:
         candidate = settings.replace(**changes)
         if Need.SCORE in candidate.estimator.needs and sensor.score is None:
