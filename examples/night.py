@@ -43,7 +43,7 @@ from faintspot.settings import Settings
 BRIGHTEST_E, FADES_BY = 1600.0, 3.0  # photo-electrons of a sub-aperture in a frame; magnitudes
 SEEING_ARCSEC = 0.6, 1.2
 GAINS = (0.2, 0.4, 0.6)
-SETTLE, LEARN, TURN, IMAGES_EVERY = 60, 300, 60, 12  # frames
+SETTLE, LEARN, TURN, IMAGES_EVERY = 60, 400, 60, 12  # frames
 PLANNER_EVERY = 3  # stretches; the loop gain is looked at in all others
 OTHER_AIR = 1200  # first realisation of the air on which the first settings are chosen
 
@@ -129,12 +129,13 @@ def tuned_night(
         modes, unit = wavefront_modes(sensor.layout)
         start = observed(loop, LEARN, [present], np.zeros(LEARN, np.int64), offset + number)
         seen = seen_in_record(start, [present])
+        images = frames_of_record(start, range(SETTLE, LEARN, IMAGES_EVERY))
+        shifted = shifted_gain(sensor.pipeline(present.settings), images)
+        answers = 1.0 if shifted is None else shifted.value
         if number % PLANNER_EVERY == 1 and not waiting:
-            waiting = planned(start, seen, sensor, present)
+            waiting = planned(images, seen, sensor, present, answers)
         elif not waiting:
-            images = frames_of_record(start, range(SETTLE, LEARN, IMAGES_EVERY))
-            answers = shifted_gain(sensor.pipeline(present.settings), images)
-            found = new_gain(seen, plant, modes, gain, unit, answers.value if answers is not None else 1.0)
+            found = new_gain(seen, plant, modes, gain, unit, answers)
             waiting = [] if found is None else [found]
         if not waiting:
             strehl.append(fixed_strehl((settings, gain), loop, frames, offset + number))
@@ -153,13 +154,12 @@ def tuned_night(
     return np.array(strehl), journal
 
 
-def planned(record: Any, seen: Seen, sensor: Sensor, present: LoopArm) -> list[Proposal]:
+def planned(images: Any, seen: Seen, sensor: Sensor, present: LoopArm, answers: float) -> list[Proposal]:
     """Ask the planner, with what the images of a stretch tell."""
-    frames = frames_of_record(record, range(SETTLE, LEARN, IMAGES_EVERY))
-    known, psf = of_images(frames, sensor.layout, sensor.calibration)
-    residual, _ = seen.weighted()
+    known, psf = of_images(images, sensor.layout, sensor.calibration)
+    residual, _ = seen.weighted([answers])
     rms = float(np.sqrt(np.median(np.square(residual).mean(axis=1))))
-    return new_estimators(present.settings, sensor, frames, known[0].value, psf, rms)
+    return new_estimators(present.settings, sensor, images, known[0].value, psf, rms, answers)
 
 
 def verdict(record: Any, arms: list[LoopArm], loop: LoopConfiguration, modes: Any, turns: Any) -> Any:

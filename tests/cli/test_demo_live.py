@@ -36,6 +36,10 @@ def name() -> str:
     return f"fs_test_{uuid4().hex[:12]}"
 
 
+def frames_measured(name: str) -> int:
+    return int(request(socket_path(name), "status")["counters"]["processed"])
+
+
 def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     """Interrupted, it gives a table of what it has seen, and leaves nothing behind."""
     arguments = [
@@ -55,12 +59,12 @@ def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     too_late.start()
     try:
         assert process.stdout is not None
-        lines = [process.stdout.readline() for _ in range(4)]
-        assert lines[3].startswith("the loop is closed; in turn"), (lines, process.communicate(timeout=60))
-        with urllib.request.urlopen(lines[1], timeout=60) as page:
+        lines = [process.stdout.readline() for _ in range(5)]
+        assert lines[4].startswith("the loop is closed; in turn"), (lines, process.communicate(timeout=60))
+        with urllib.request.urlopen(lines[2], timeout=60) as page:
             assert b"<title>faintspot</title>" in page.read()
-        end = time.monotonic() + PATIENCE_S
-        while request(socket_path(name), "status")["counters"]["processed"] < 400:
+        end, begun = time.monotonic() + PATIENCE_S, frames_measured(name)
+        while frames_measured(name) < begun + 260:  # each of three arms has turns of 50
             assert time.monotonic() < end
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
@@ -126,8 +130,13 @@ def test_what_was_not_seen_is_said() -> None:
 def test_refusals(folder: Path, run: Commands, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     run.refused("demo", "--rate", 50, naming=("--rate: expected only with --live",))
     run.refused("demo", "--live", "--frames", 50, naming=("--frames: expected only without --live",))
-    run.refused("demo", "--live", "--photons", 0, "--name", name, naming=("photons_per_subaperture",))
-    run.refused("demo", "--live", "-o", "faintspot.toml", "--name", name, naming=("faintspot.toml",))
+    for wrong, naming in (
+        (("--photons", 0), "photons_per_subaperture"),
+        (("-o", "faintspot.toml"), "faintspot.toml: "),
+    ):
+        refused = run("demo", "--live", *wrong, "--name", name)
+        assert refused.code == 2
+        assert naming in refused.error
     with ControlServer(socket_path(name), {"status": lambda fields: {"counters": {}}}):
         run.refused("demo", "--live", "--name", name, naming=("expected one that no engine has",))
     monkeypatch.setattr("faintspot.cli.demo_live.present", lambda package: package == "zarr")

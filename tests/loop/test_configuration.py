@@ -123,3 +123,15 @@ def test_a_folder_of_results_does_not_hide_a_shipped_configuration(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "canary").mkdir()
     assert load_loop("canary").name == "canary"
+
+
+def test_slowed_loops_are_the_same_in_frames() -> None:
+    loop = LoopConfiguration()
+    slowed = loop.slowed_to(loop.control.frame_rate_hz / 5)
+    for speed, before in zip(
+        slowed.atmosphere.wind_speed_m_per_s, loop.atmosphere.wind_speed_m_per_s, strict=True
+    ):
+        assert speed / slowed.control.frame_rate_hz == pytest.approx(before / loop.control.frame_rate_hz)
+    assert slowed.photons == loop.photons
+    with pytest.raises(InputError, match="frame_rate_hz"):
+        loop.slowed_to(0.0)

@@ -144,8 +144,8 @@ def advise(
     if math.isfinite(light.value):
         residual, _ = seen.weighted(gains)
         rms = float(np.sqrt(np.median(np.square(residual).mean(axis=1))))
-        divisor = loop.control.options.centroid_gain
-        proposals += new_estimators(settings, sensor, frames, light.value, psf, rms, divisor, progress)
+        answers = gains[0] * loop.control.options.centroid_gain
+        proposals += new_estimators(settings, sensor, frames, light.value, psf, rms, answers, progress)
     return Advice(len(seen), known, [each for each in proposals if each is not None])
 
 

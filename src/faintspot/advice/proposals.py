@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]
 GAINS = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
 """Loop gains that are tried on telemetry."""
 _PARTS = 5  # of telemetry, whose scatter says an error
-_FEWEST_OF_PART = 150  # frames
+_FEWEST_OF_PART = 100  # frames
 _SETTLE = 30  # of them, in which the loop closes
 _LIGHT_TOLERANCE = 0.1  # of the light, within which it need not be told anew
 _SPOTS, _FLUX_STEPS = 1024, 1  # of the planner's simulation
@@ -179,7 +179,8 @@ def new_estimators(
     residual_px : float
         Rms of the slopes that the loop leaves, which says how far spots are from their reference.
     centroid_gain : float
-        That the control divides slopes by.
+        By which the slopes of the estimator that runs grow with the spots' motion; a window is told a gain of
+        its own that makes its slopes as large, so that the loop's gain stays what it is.
     progress : callable, optional
         As of `faintspot.planner.tune`.
 
@@ -231,10 +232,7 @@ def _with_gain(
     frames_e: NDArray[np.float32],
     centroid_gain: float,
 ) -> dict[str, Any] | None:
-    """Tell a window its centroid gain on the spots that were recorded; None: it does not fit the sensor.
-
-    Its slopes are then as large as the control expects them.
-    """
+    """Tell a window its centroid gain on the spots that were recorded; None: it does not fit the sensor."""
     try:
         candidate = settings.replace(**changes)
         if Need.SCORE in candidate.estimator.needs and sensor.score is None:

@@ -147,6 +147,7 @@ class LiveDemonstration:
             does not do what it is waited for.
         """
         self._check_name()
+        say(f"a telescope is simulated, and its files written into {self.folder}: some seconds")
         loop, engine = self.write_files()
         shown = Shown(list(self.arms), self.observed.control.delay_frames)
         if stop.is_set():
@@ -158,7 +159,7 @@ class LiveDemonstration:
             images = ["--images-every", str(_IMAGES_EVERY)]
             processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *name, *seed])
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
-            say("telescope and engine start; the engine compiles its code where this is the first time")
+            say("telescope and engine start; the first time the engine compiles its code for a minute")
 
             def wait(condition: Callable[[], bool], what: str, timeout_s: float) -> None:
                 processes.wait_until(lambda: stop.is_set() or condition(), what, timeout_s)
