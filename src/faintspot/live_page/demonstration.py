@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from faintspot import configuration as configuration_file
 from faintspot.control.configuration import CONTROLLER, save_control
+from faintspot.control.learnt import INTEGRATOR, KALMAN
 from faintspot.errors import InputError
 from faintspot.files import output_errors, write_atomically
 from faintspot.live_page.streams import NewestOfStream
@@ -93,7 +94,7 @@ class LiveDemonstration:
         """What takes turns, by its name: as `faintspot realtime interleave` understands it.
 
         The window is told its centroid gain on speckled spots, as a system would have measured it. "map" is
-        told what the controller expects. Brightest pixels do better without their gain, which is very low.
+        told what the Kalman filter expects. Brightest pixels do better without their gain, which is very low.
         """
         observed = self.observed
         width = _WINDOW_WIDTH * observed.scene.seen_fwhm_px
@@ -101,9 +102,9 @@ class LiveDemonstration:
         pipeline = make_pipeline(observed, prepare(observed).sensor, LoopArm("-", window))
         gain = float(measure_gains(observed, [pipeline], seed=self.seed)[0])
         return {
-            "brightest": "brightest",
-            "window": f"estimator=window+window_fwhm_px={width:.3g}+centroid_gain={gain:.3g}",
-            "map": "map",
+            "brightest": f"brightest+{INTEGRATOR}",
+            "window": f"estimator=window+window_fwhm_px={width:.3g}+centroid_gain={gain:.3g}+{INTEGRATOR}",
+            f"map+{KALMAN}": f"map+{KALMAN}",
         }
 
     def write_files(self) -> tuple[Path, Path]:
@@ -125,7 +126,7 @@ class LiveDemonstration:
         settings = Settings("map", prior_std_px=_PRIOR_PX, flux_e=self.photons)
         engine = self.folder / "faintspot.toml"
         configuration_file.save(engine, settings)
-        write_engine_files(observed, self.folder)
+        write_engine_files(observed, self.folder, KALMAN)
         save_control(engine, gain=_GAIN, centroid_gain=1.0, prediction=CONTROLLER)
         return loop, engine
 
@@ -147,7 +148,7 @@ class LiveDemonstration:
             does not do what it is waited for.
         """
         self._check_name()
-        say(f"a telescope is simulated, and its files written into {self.folder}: some seconds")
+        say(f"a telescope is simulated, the Kalman filter learns from its loop: a minute; files: {self.folder}")
         loop, engine = self.write_files()
         shown = Shown(list(self.arms), self.observed.control.delay_frames)
         if stop.is_set():
