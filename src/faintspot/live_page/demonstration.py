@@ -148,9 +148,7 @@ class LiveDemonstration:
             does not do what it is waited for.
         """
         self._check_name()
-        say(
-            f"a telescope is simulated, the Kalman filter learns from its loop: a minute; files: {self.folder}"
-        )
+        say(f"a telescope is simulated, a Kalman filter learns from its loop: a minute; files: {self.folder}")
         loop, engine = self.write_files()
         shown = Shown(list(self.arms), self.observed.control.delay_frames)
         if stop.is_set():
