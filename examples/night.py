@@ -8,7 +8,8 @@ night and comes back, the seeing goes from 0.6 to 1.2 arcsec and back three time
 - a loop that begins with the first ones, asks itself for advice in every stretch as
   `faintspot realtime advise --apply` does, tries it in turn with what it has, and keeps what leaves less.
 
-The trials count. Light is followed by all of them (mean light). Some ten minutes on two processors:
+The trials count, and take more than half of every stretch here. All follow the light. Some ten minutes on two
+processors that are free:
 
     python examples/night.py [--stretches 10] [--frames 1000] [--nights 2]
 """
