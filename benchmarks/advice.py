@@ -89,7 +89,7 @@ def run() -> list[Table]:
         for name in others:
             pair = [arms[first], arms[name]]
             found = np.array([merits(configuration, pair, 1500 + r) for r in range(REALISATIONS)])
-            columns = {}
+            columns: dict[str, float] = {}
             for title, values in zip(("told", "true"), found.T[:2], strict=True):
                 mean = paired_mean(values)
                 columns |= {

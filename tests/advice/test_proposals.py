@@ -11,6 +11,7 @@ from tests.advice.test_centroid_gain import PSF, frames
 
 import faintspot as fs
 from faintspot.advice import proposals
+from faintspot.advice.centroid_gain import shifted_gain
 from faintspot.advice.proposals import Proposal, Sensor, new_estimators, new_gain, new_light
 from faintspot.advice.residual import wavefront_modes
 from faintspot.control.configuration import Control
@@ -40,6 +41,7 @@ def test_noise_wants_a_lower_gain() -> None:
         assert proposal is not None
         assert proposal.text == f"gain {proposal.gain:g}"
         assert "would have left" in proposal.promise
+        assert proposal.gain is not None
         gains.append(proposal.gain)
     assert gains[1] < gains[0]
     seen, _ = seen_with_truth(noise_px=(0.6, 0.6), frames=900, turn=900)
@@ -60,7 +62,7 @@ def test_estimators_of_the_planner(monkeypatch: pytest.MonkeyPatch) -> None:
         SENSOR.pipeline(told.replace(**each.changes))  # they fit
     window = changes["window"].changes
     alone = told.replace(**{**window, "centroid_gain": 1.0})
-    gain = proposals.shifted_gain(SENSOR.pipeline(alone), frames(60.0))
+    gain = shifted_gain(SENSOR.pipeline(alone), frames(60.0))
     assert gain is not None
     assert window["centroid_gain"] == pytest.approx(gain.value / 0.5, rel=0.01)
     assert window["flux_e"] == 60.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ SEEN, _ = seen_with_truth(frames=400)
 SENT = RNG.standard_normal((400, COMMANDS)).astype(np.float32)
 
 
-def control(**options: object) -> Control:
+def control(**options: Any) -> Control:
     return Control(MATRIX, None, ControlOptions(delay_frames=2, **options))
 
 
