@@ -42,6 +42,7 @@ def test_noise_wants_a_lower_gain() -> None:
         assert proposal.gain is not None
         assert proposal.text == f"gain {proposal.gain:g}"
         assert "would have left" in proposal.promise
+        assert proposal.gain is not None
         gains.append(proposal.gain)
     assert gains[1] < gains[0]
     seen, _ = seen_with_truth(noise_px=(0.6, 0.6), frames=900, turn=900)

@@ -42,18 +42,7 @@ def frames_measured(name: str) -> int:
 
 def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     """Interrupted, it gives a table of what it has seen, and leaves nothing behind."""
-    arguments = [
-        "demo",
-        "--live",
-        "--rate",
-        "50",
-        "--seconds",
-        str(PATIENCE_S),
-        "--port",
-        "0",
-        "--name",
-        name,
-    ]
+    arguments = ("demo", "--live", "--rate", 50, "--seconds", 240, "--port", 0, "--name", name)
     process = command_line(*arguments, cwd=tmp_path)
     too_late = threading.Timer(PATIENCE_S, process.kill)
     too_late.start()

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from uuid import uuid4
 
@@ -28,12 +29,22 @@ time.sleep(600)
 """
 
 
-def lives(pid: int) -> bool:
+def state(pid: int) -> str:
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
-        return False
-    return state != "Z"  # nobody asks for what is left of it
+        return ""
+
+
+def lives(pid: int) -> bool:
+    return state(pid) not in ("", "Z")  # nobody asks for what is left of it
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def test_they_end_where_this_one_is_killed(tmp_path: Path) -> None:
@@ -44,10 +55,7 @@ def test_they_end_where_this_one_is_killed(tmp_path: Path) -> None:
     assert lives(child)
     parent.kill()
     parent.communicate(timeout=PATIENCE_S)
-    end = time.monotonic() + PATIENCE_S
-    while lives(child):
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    until(lambda: not lives(child))
 
 
 def test_one_that_ends_says_why_and_all_others_end(tmp_path: Path) -> None:
@@ -72,6 +80,7 @@ def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.Mon
         processes.start("bridge", ["realtime", "bridge", "fs_test_none", "--name", "fs_test_none"])
         process = processes._started["bridge"]
         process.send_signal(signal.SIGSTOP)  # so that it cannot be asked
+        until(lambda: state(process.pid) == "T")
     assert process.returncode == -signal.SIGKILL
 
 
