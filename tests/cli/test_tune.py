@@ -157,7 +157,7 @@ def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert asked["folder"] == "diffraction_limit-tune"
     for text in ("Recommended: window+kalman", "against window", "galactic pole", "This rests on"):
         assert text in result.out
-    assert max(len(line) for line in result.out.splitlines()[:-3]) <= 80
+    assert max(len(line) for line in result.out.splitlines()[:-4]) <= 80
     assert "…" not in result.out
     assert (tmp_path / "faintspot-tune.png").read_bytes().startswith(b"\x89PNG")
     LAYOUT.save("faintspot.toml")

@@ -25,7 +25,7 @@ from faintspot.compare.statistics import Estimate, mean_by_blocks
 from faintspot.control.configuration import load_control
 from faintspot.control.learnt import INTEGRATOR
 from faintspot.errors import InputError
-from faintspot.files import write_atomically
+from faintspot.files import parse_json, write_atomically
 from faintspot.io.telemetry import Telemetry
 from faintspot.settings import Settings
 
@@ -180,7 +180,7 @@ def write_journal(path: str | Path, entry: dict[str, Any]) -> Path:
     entries: Any = []
     if place.exists():
         try:
-            entries = json.loads(place.read_text(encoding="utf-8"))
+            entries = parse_json(place.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             entries = None
         if not isinstance(entries, list):

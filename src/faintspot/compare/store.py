@@ -7,7 +7,6 @@ that is done is whole; the others are worked on again.
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot import __version__
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import output_errors
+from faintspot.files import output_errors, parse_json
 from faintspot.io.locations import one_line
 
 if TYPE_CHECKING:
@@ -200,7 +199,7 @@ def store_attributes(path: Path) -> dict[str, Any] | None:
     """Return the attributes of a store of any version; None when there is something else."""
     try:
         text = (path / "zarr.json").read_text(encoding="utf-8")
-        attributes: dict[str, Any] = json.loads(text)["attributes"]
+        attributes: dict[str, Any] = parse_json(text)["attributes"]
     except (OSError, ValueError, KeyError):
         return None
     return attributes if isinstance(attributes, dict) and _FINGERPRINT in attributes else None

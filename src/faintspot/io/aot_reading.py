@@ -6,7 +6,6 @@ positions are counted from 0, slopes are px from the middle of a sub-aperture's 
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import finite_array
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import parse_json
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_fits
 from faintspot.sensor.layout import Layout
@@ -264,12 +264,12 @@ def _own(image: Any) -> dict[str, Any]:
     if image is None:
         return {}
     values = {item.key: item.value for item in image.metadata}
-    return {name: json.loads(values[name]) for name in ("LAYOUT", "SUBTRACT") if name in values}
+    return {name: parse_json(values[name]) for name in ("LAYOUT", "SUBTRACT") if name in values}
 
 
 def _tables(system: Any) -> dict[str, Any]:
     """Estimator and settings of a file that faintspot has written."""
     if not any(item.key == "ORIGIN" and item.value == "faintspot" for item in system.metadata):
         return {}
-    tables = json.loads(system.config)
+    tables = parse_json(system.config)
     return tables if isinstance(tables.get("settings", {}), dict) else {}

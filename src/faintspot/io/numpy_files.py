@@ -12,6 +12,7 @@ from typing import IO, Any
 import numpy as np
 
 from faintspot.errors import InputError
+from faintspot.files import parse_json
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
 from faintspot.io.raw import DAMAGE, MappedArray, RawArray, pieces
@@ -74,7 +75,7 @@ class Npz(FileFormat):
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
-        attributes = json.loads(str(arrays.pop("attributes")))
+        attributes = parse_json(str(arrays.pop("attributes")))
         return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 
     def has_slopes(self, path: Path) -> bool:

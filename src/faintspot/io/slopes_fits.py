@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import parse_json
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip, pieces
 from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of, with_absent
@@ -61,7 +62,7 @@ def read_fits(path: Path) -> StoredSlopes:
     variables = with_absent(
         {name: arrays.pop(name).astype(VARIABLES[name].dtype) for name in VARIABLES if name in arrays}
     )
-    attributes = json.loads(arrays.pop("attributes").tobytes())
+    attributes = parse_json(arrays.pop("attributes").tobytes())
     return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 
 

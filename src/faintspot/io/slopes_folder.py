@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import replace_file, sync_file, sync_folder
+from faintspot.files import parse_json, replace_file, sync_file, sync_folder
 from faintspot.io.slopes_format import VARIABLES, Run, StoredSlopes, with_absent
 from faintspot.io.slopes_writer import Begun
 
@@ -146,7 +146,7 @@ def read_partial(folder: Path) -> StoredSlopes:
 
 def _read_description(folder: Path) -> dict[str, Any]:
     try:
-        description: dict[str, Any] = json.loads((folder / _RUN).read_text(encoding="utf-8"))
+        description: dict[str, Any] = parse_json((folder / _RUN).read_text(encoding="utf-8"))
     except ValueError:
         raise _damaged(folder) from None
     return description

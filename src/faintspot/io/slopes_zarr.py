@@ -7,7 +7,6 @@ store is valid and the mark includes only what is whole.
 
 from __future__ import annotations
 
-import json
 import shutil
 import warnings
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import sync_file, sync_folder
+from faintspot.files import parse_json, sync_file, sync_folder
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, unit_of, with_absent
@@ -220,7 +219,7 @@ def _create_arrays(path: Path, run: Run) -> None:
 
 def _stored_attributes(path: Path) -> dict[str, Any]:
     """Return the attributes of a store of slopes; KeyError when it is something else."""
-    attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+    attributes: dict[str, Any] = parse_json((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
     for name in (_MARK, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
         attributes[name]
     return attributes

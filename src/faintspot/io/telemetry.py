@@ -7,7 +7,6 @@ what is whole.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import output_errors
+from faintspot.files import output_errors, parse_json
 from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
@@ -244,7 +243,7 @@ def attributes_of(store: Path) -> dict[str, Any]:
     if not store.exists():
         raise InputError(f"{store}: no such file or directory")
     try:
-        attributes: dict[str, Any] = json.loads((store / "zarr.json").read_text(encoding="utf-8"))[
+        attributes: dict[str, Any] = parse_json((store / "zarr.json").read_text(encoding="utf-8"))[
             "attributes"
         ]
         known = attributes["format"] == FORMAT and attributes["version"] == 1

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import replace_file
+from faintspot.files import parse_json, replace_file
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 
@@ -28,7 +28,7 @@ def is_store(path: Path) -> bool:
 def holds_telemetry(path: Path) -> bool:
     """Tell whether a path is a store of telemetry, as `faintspot.io.telemetry` writes it."""
     try:
-        attributes = json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+        attributes = parse_json((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
         return bool(attributes["format"] == TELEMETRY)
     except (OSError, ValueError, KeyError, TypeError):
         return False
@@ -36,7 +36,7 @@ def holds_telemetry(path: Path) -> bool:
 
 def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
     """Change attributes of a group in one step, which the store's own setter does not promise."""
-    metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    metadata = parse_json((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)
     replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
 

@@ -14,6 +14,7 @@ from importlib.resources import files
 from typing import Any
 
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import parse_json
 from faintspot.live_page.access import Access
 from faintspot.live_page.batch import Source
 from faintspot.live_page.board import Board
@@ -268,8 +269,8 @@ class Client(_Guarded, WebSocketHandler):
 def _parsed(message: str | bytes) -> dict[str, Any]:
     """Return a request: a JSON object that says what to do."""
     try:
-        request = json.loads(message) if isinstance(message, str) else None
-    except (ValueError, RecursionError):
+        request = parse_json(message) if isinstance(message, str) else None
+    except ValueError:
         request = None
     if not isinstance(request, dict) or not isinstance(request.get("do"), str):
         raise InputError('expected a JSON object with "do"')

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import write_atomically
+from faintspot.files import parse_json, write_atomically
 from faintspot.loop.files import Stored, make_folder
 from faintspot.loop.record import LoopRecord
 from faintspot.loop.stored_results import BUDGET_FILE as BUDGET_FILE
@@ -80,7 +80,7 @@ class InterleavedResult:
         folder = Path(folder)
         path = folder / INTERLEAVED_FILE
         try:
-            document: Any = json.loads(path.read_text(encoding="utf-8"))
+            document: Any = parse_json(path.read_text(encoding="utf-8"))
             sets = document["sets"]
             if document["format"] != _FORMAT:
                 raise ValueError(f"format {document['format']}")

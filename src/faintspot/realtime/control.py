@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from faintspot.errors import InputError
+from faintspot.files import parse_json
 from faintspot.realtime.private_socket import (
     ENGINE,
     bound_listener,
@@ -304,8 +305,8 @@ def _refusal(text: str) -> dict[str, Any]:
 
 def _parsed_request(line: bytes) -> dict[str, Any]:
     try:
-        message = json.loads(line.decode())
-    except (ValueError, RecursionError):
+        message = parse_json(line.decode())
+    except ValueError:
         message = None
     if not isinstance(message, dict):
         raise InputError(f"request: expected a JSON object in one line, got {line[:40]!r}")
@@ -347,7 +348,7 @@ def _checked_reply(server: str, line: bytes) -> dict[str, Any]:
     if not line.endswith(b"\n"):
         raise InputError(f"the {server} went away before it had answered")
     try:
-        reply = json.loads(line)
+        reply = parse_json(line)
     except ValueError:
         reply = None
     if not isinstance(reply, dict) or not isinstance(reply.get("ok"), bool):

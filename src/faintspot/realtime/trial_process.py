@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import Any
 
 from faintspot.errors import InputError
+from faintspot.files import parse_json
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.modular import ModularPipeline
 from faintspot.realtime.module_loading import load_module
@@ -108,7 +109,7 @@ class Trial:
     def _digest(self, output: bytes, status: int) -> str:
         """What the process has answered."""
         try:
-            reply = json.loads(output)
+            reply = parse_json(output)
         except ValueError:
             message = f"module {self.source}: ended the process of its trial (exit status {status})"
             raise InputError(message) from None
