@@ -18,6 +18,7 @@ from tests.loop.loop_cases import faint
 import faintspot as fs
 from faintspot import configuration as configuration_file
 from faintspot.control.configuration import Control, load_control
+from faintspot.control.learnt import INTEGRATOR
 from faintspot.loop.engine_files import write_engine_files
 from faintspot.realtime.control_loop import ControlLoop
 from faintspot.realtime.engine import Engine
@@ -29,9 +30,16 @@ CONFIGURATION = faint()
 COMMANDS, PATIENCE_S = 54, 60.0
 
 
-def configured(folder: Path) -> tuple[Path, Control]:
+def configured(
+    folder: Path,
+    settings: fs.Settings | None = None,
+    configuration: Any = CONFIGURATION,
+    controller: str = INTEGRATOR,
+) -> tuple[Path, Control]:
     """Write what the engine needs; return the configuration file, and its control."""
-    path = write_engine_files(CONFIGURATION, folder)
+    if settings is not None:
+        configuration_file.save(folder / "faintspot.toml", settings)
+    path = write_engine_files(configuration, folder, controller)
     control = load_control(path)
     assert control is not None
     return path, control

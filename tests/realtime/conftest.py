@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from uuid import uuid4
 
 import pytest
 
@@ -15,3 +16,15 @@ def bench() -> Iterator[object]:
     bench = Bench()
     yield bench
     bench.close()
+
+
+@pytest.fixture
+def sky() -> Iterator[object]:
+    """A telescope with a name of its own, and the engines that follow it."""
+    pytest.importorskip("hcipy")
+    pytest.importorskip("pyshmem")
+    from tests.realtime.closed_loop import Sky
+
+    made = Sky(f"fs_test_{uuid4().hex[:12]}")
+    yield made
+    made.close()

@@ -7,10 +7,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -37,13 +35,6 @@ FRAMES = 60
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
     return configured(tmp_path_factory.mktemp("bench"))
-
-
-@pytest.fixture
-def sky() -> Iterator[Sky]:
-    made = Sky(f"fs_test_{uuid4().hex[:12]}")
-    yield made
-    made.close()
 
 
 def test_the_loop_is_the_simulated_one(sky: Sky, files: tuple[Path, Control]) -> None:

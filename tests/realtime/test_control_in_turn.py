@@ -2,47 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import pytest
 from tests.estimate.image_cases import refused
 
 import faintspot as fs
-from faintspot import configuration as configuration_file
 from faintspot.control.compiled_kalman import CompiledKalman
-from faintspot.control.configuration import Control, load_control
-from faintspot.loop.engine_files import write_engine_files
+from faintspot.control.configuration import Control
 from faintspot.realtime.commands import commands_of
 from faintspot.realtime.interleaving import Interleaving
 
 pytest.importorskip("hcipy")
 pytest.importorskip("pyshmem")
 
-from tests.realtime.closed_loop import CONFIGURATION, Sky, make_engine
+from tests.realtime.closed_loop import CONFIGURATION, Sky, configured, make_engine
 
 EVERY, FRAMES = 8, 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)
 ARMS = Interleaving.parse("window+integrator,map+kalman", EVERY)
 
 
-@pytest.fixture
-def sky() -> Iterator[Sky]:
-    made = Sky(f"fs_test_{uuid4().hex[:12]}")
-    yield made
-    made.close()
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
-    folder = tmp_path_factory.mktemp("bench")
-    configuration_file.save(folder / "faintspot.toml", SETTINGS)
-    path = write_engine_files(CONFIGURATION.replace("control", telemetry_frames=300), folder, "kalman")
-    control = load_control(path)
-    assert control is not None
-    return path, control
+    short = CONFIGURATION.replace("control", telemetry_frames=300)
+    return configured(tmp_path_factory.mktemp("bench"), SETTINGS, short, "kalman")
 
 
 def test_a_controller_goes_on_from_what_the_mirror_holds(sky: Sky, files: tuple[Path, Control]) -> None:

@@ -6,9 +6,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -29,15 +28,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
 
 
 @pytest.fixture
-def sky(files: tuple[Path, Control]) -> Iterator[Sky]:
-    made = Sky(f"fs_test_{uuid4().hex[:12]}")
-    try:
-        made.start(make_engine(made.name, *files))
-        made.loop.close()
-        made.frames(6)
-        yield made
-    finally:
-        made.close()
+def sky(sky: Sky, files: tuple[Path, Control]) -> Sky:
+    """With an engine that closes its loop."""
+    sky.start(make_engine(sky.name, *files))
+    sky.loop.close()
+    sky.frames(6)
+    return sky
 
 
 def check_commands(sky: Sky, control: Control) -> None:

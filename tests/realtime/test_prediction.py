@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
@@ -13,47 +12,31 @@ import pytest
 
 import faintspot as fs
 from faintspot import configuration as configuration_file
-from faintspot.control.configuration import Control, load_control
+from faintspot.control.configuration import Control
 from faintspot.loop import LoopArm, simulate_loop
 from faintspot.loop.control import learnt_control
-from faintspot.loop.engine_files import write_engine_files
 from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prior import Prior
 
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
-from tests.realtime.closed_loop import CONFIGURATION, Sky, make_engine  # noqa: E402
+from tests.realtime.closed_loop import CONFIGURATION, Sky, configured, make_engine  # noqa: E402
 
 FRAMES = 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)
 
 
-@pytest.fixture
-def sky() -> Iterator[Sky]:
-    made = Sky(f"fs_test_{uuid4().hex[:12]}")
-    yield made
-    made.close()
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
-    folder = tmp_path_factory.mktemp("bench")
-    configuration_file.save(folder / "faintspot.toml", SETTINGS)
-    path = write_engine_files(CONFIGURATION, folder)
-    control = load_control(path)
-    assert control is not None
-    return path, control
+    return configured(tmp_path_factory.mktemp("bench"), SETTINGS)
 
 
 def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path) -> None:
     """Maximum a posteriori around what it predicts, as wide as it is sure; frame by frame, from files."""
     run = CONFIGURATION.replace("control", telemetry_frames=300)
     run = run.replace("run", frames=FRAMES, settle_frames=10)
-    configuration_file.save(tmp_path / "faintspot.toml", SETTINGS)
-    path = write_engine_files(run, tmp_path, "kalman")
-    control = load_control(path)
-    assert control is not None
+    path, control = configured(tmp_path, SETTINGS, run, "kalman")
     assert (control.prediction, control.options.centroid_gain) == ("controller", 1.0)
     arm = LoopArm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
     told, _ = learnt_control(run, arm, run.run.seed)  # the first frame's prior, too, is as wide

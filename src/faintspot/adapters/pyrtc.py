@@ -38,6 +38,16 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def _pyrtc() -> Any:
+    """Return the module pyrtc; another version than was tested is said once."""
+    try:
+        import pyrtc
+    except ImportError:
+        raise MissingExtraError("pyrtc", "pyrtc", "faintspot.adapters.pyrtc") from None
+    check_version("pyRTC", "pyrtcao", *TESTED)
+    return pyrtc
+
+
 @functools.cache
 def slopes_process() -> Any:
     """Return the class `FaintspotSlopes`, a `SlopesProcess` of pyRTC's.
@@ -58,13 +68,10 @@ def slopes_process() -> Any:
     MissingExtraError
         When pyRTC is not installed.
     """
-    try:
-        from pyrtc import SlopesProcess, open_stream
-    except ImportError:
-        raise MissingExtraError("pyrtc", "pyrtc", "faintspot.adapters.pyrtc") from None
-    check_version("pyRTC", "pyrtcao", *TESTED)
+    tool = _pyrtc()
+    process: Any = tool.SlopesProcess
 
-    class FaintspotSlopes(SlopesProcess):  # type: ignore[misc]
+    class FaintspotSlopes(process):  # type: ignore[misc]
         """A slopes process of pyRTC's, with faintspot in place of its centroiders."""
 
         def __init__(self, conf: Any) -> None:
@@ -73,7 +80,7 @@ def slopes_process() -> Any:
 
         def _compute_slopes_shwfs(self, image: Any) -> NDArray[np.float32]:
             """Slopes as pyRTC's centroiders give them: (2 N, N) px, the x map above the y map."""
-            return self.measuring.maps(self, image, open_stream)
+            return self.measuring.maps(self, image, tool.open_stream)
 
         def calibrating(self, light_e: float | None = None) -> Any:
             """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`."""
@@ -98,13 +105,9 @@ def camera() -> Any:
     MissingExtraError
         When pyRTC is not installed.
     """
-    try:
-        from pyrtc import WavefrontSensor
-    except ImportError:
-        raise MissingExtraError("pyrtc", "pyrtc", "faintspot.adapters.pyrtc") from None
-    check_version("pyRTC", "pyrtcao", *TESTED)
+    sensor: Any = _pyrtc().WavefrontSensor
 
-    class FaintspotCamera(WavefrontSensor):  # type: ignore[misc]
+    class FaintspotCamera(sensor):  # type: ignore[misc]
         """A sensor of pyRTC's whose frames come by a stream."""
 
         EXTRA_CONFIG_KEYS = ("frames",)

@@ -73,17 +73,16 @@ def learn(
         return plant.left(partial(predictive, model, usual_variance(frames)), frames)
 
     found = identify(telemetry, theories_px2, score)
-    factor = noise_scale * found.noise_factor
-    variance = usual_variance(telemetry.scaled(factor))
+    factor, model = found.noise_factor, found.model
     text = f"{found.source}, noise variance x {factor:.2f}"
-    model = found.model
     arrays = {
         "first": model.first,
         "second": model.second,
         "driving_px2": model.driving,
-        "variance_px2": variance,
+        "variance_px2": usual_variance(telemetry.scaled(factor)),
     }
-    return Learnt(plant, Model(kind, arrays, gain, factor, (found.score, plain_left), text))
+    learnt = Model(kind, arrays, gain, factor, (found.score, plain_left), text)
+    return Learnt(plant, learnt.with_noise(noise_scale))
 
 
 def _modal(plant: Plant, telemetry: Telemetry, plain_gain: float, plain_left: float) -> Model:

@@ -107,6 +107,8 @@ class Model:
 
     def with_noise(self, scale: float) -> Model:
         """Return what "kalman" would have learnt with the variances of the noise so many times as large."""
+        if scale == 1.0:
+            return self
         arrays = {**self.arrays, "variance_px2": scale * self.arrays["variance_px2"]}
         text = f"{self.description}, and {scale:g} of that"
         return replace(self, arrays=arrays, noise_factor=scale * self.noise_factor, description=text)
