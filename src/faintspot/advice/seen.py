@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, MODAL
+from faintspot.control.recording import check_commands, recorded_slopes
 from faintspot.control.telemetry import without_prior
 from faintspot.errors import InputError
 from faintspot.io.telemetry import Telemetry
@@ -102,36 +103,23 @@ def seen_in_telemetry(
         When there are too few frames of a closed loop, commands of another number, no standard errors, or an
         estimator with a prior around what is not known any more.
     """
-    commands, delay = telemetry.commands.astype(np.float64), control.options.delay_frames
-    if commands.shape[1] != control.commands:
-        raise InputError(
-            f"telemetry: expected {control.commands} commands, as the interaction matrix has, got "
-            f"{commands.shape[1]}"
-        )
+    check_commands(telemetry, control, "telemetry")
     predicted = control.prediction != NONE and any(prior is not None for prior in priors_px)
     if predicted and (control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM):
         raise InputError(
             "telemetry: expected an integrator, as what another controller or program has told the estimator "
             "to expect is not in it"
         )
-    rows = _usable(telemetry, delay)
+    rows = _usable(telemetry, control.options.delay_frames)
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames of a closed loop, got {len(rows)}")
-    acting, latest = (commands[rows - lag] @ control.interaction.T for lag in (delay, 1))
-    expected = acting - latest if predicted else np.zeros_like(acting)
-    invalid = ~np.tile(telemetry.valid[rows], 2)
-    error = np.hstack([telemetry.standard_error_x[rows], telemetry.standard_error_y[rows]]).astype(np.float64)
-    error[invalid] = np.inf
-    if not np.isfinite(error).any():
-        raise InputError("telemetry: expected standard errors of slopes; give the calibration a read noise")
-    gain, frame, arm = control.options.centroid_gain, telemetry.frame[rows], telemetry.arm[rows]
-    alone = without_priors(
-        telemetry.slopes[rows].astype(np.float64) / gain, error / gain, expected, arm, priors_px
-    )
+    slopes, error, held, expected = recorded_slopes(telemetry, control, rows, predicted, "telemetry")
+    frame, arm = telemetry.frame[rows], telemetry.arm[rows]
+    alone = without_priors(slopes, error, expected, arm, priors_px)
     times = telemetry.last_row_time_ns[rows]
     rate = (frame[-1] - frame[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
     apart = (np.diff(arm) != 0) | (np.diff(frame) != 1)
-    return Seen(arm, np.concatenate([[0], np.cumsum(apart)]), *alone, acting, float(rate))
+    return Seen(arm, np.concatenate([[0], np.cumsum(apart)]), *alone, held, float(rate))
 
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:

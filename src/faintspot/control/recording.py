@@ -56,12 +56,7 @@ def telemetry_of_recording(
         When there are no commands, as many as the control has, or no stretch that is long enough; and where
         the estimator had a prior around what is not known any more.
     """
-    commands = recording.commands
-    if commands.shape[1] != control.commands:
-        raise InputError(
-            f"recording: expected {control.commands} commands, as the interaction matrix has, got "
-            f"{commands.shape[1]}"
-        )
+    check_commands(recording, control, "recording")
     predicted = prior_std_px is not None and control.prediction != NONE
     unknown = control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM
     in_turn = any(str(arm).endswith(f"+{KALMAN}") for arm in recording.attributes.get("arms", []))
@@ -71,27 +66,67 @@ def telemetry_of_recording(
             "told the estimator to expect was not recorded"
         )
     start, stop = _longest(np.asarray(recording.frame), np.asarray(recording.loop) == _CLOSED)
-    delay, gain = control.options.delay_frames, control.options.centroid_gain
+    delay = control.options.delay_frames
     if stop - start < FEWEST_FRAMES + delay:
         raise InputError(
             f"recording: expected {FEWEST_FRAMES + delay} frames in a row with a closed loop, got "
             f"{stop - start}"
         )
-    part = slice(start + delay, stop)
-    invalid = ~np.tile(recording.valid[part], 2)
-    error = np.hstack([recording.standard_error_x[part], recording.standard_error_y[part]]).astype(np.float64)
-    error[invalid] = np.inf
-    if not np.isfinite(error).any():
-        raise InputError("recording: expected standard errors of slopes; give the calibration a read noise")
-    slopes = recording.slopes[part].astype(np.float64) / gain
-    held = commands[start : stop - delay].astype(np.float64) @ control.interaction.T
-    expected = np.zeros_like(slopes)
-    if predicted:  # what acts less the latest command
-        latest = commands[start + delay - 1 : stop - 1].astype(np.float64) @ control.interaction.T
-        expected = held - latest
+    rows = np.arange(start + delay, stop)
+    slopes, error, held, expected = recorded_slopes(recording, control, rows, predicted, "recording")
     times = recording.last_row_time_ns[start:stop]
     rate = (stop - start - 1) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
-    return make_telemetry(slopes, error / gain, held, expected, prior_std_px), rate
+    return make_telemetry(slopes, error, held, expected, prior_std_px), rate
+
+
+def check_commands(recording: Recording, control: Control, what: str) -> None:
+    """Refuse a recording with another number of commands than the control has; `what` is its name."""
+    found = recording.commands.shape[1]
+    if found != control.commands:
+        raise InputError(
+            f"{what}: expected {control.commands} commands, as the interaction matrix has, got {found}"
+        )
+
+
+def recorded_slopes(
+    recording: Recording, control: Control, rows: NDArray[np.int64], predicted: bool, what: str
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return what a closed loop has seen: slopes, errors, what the mirror added, what an integrator expected.
+
+    Parameters
+    ----------
+    recording : faintspot.io.Telemetry
+    control : Control
+        Whose matrix, delay and centroid gain count.
+    rows : (frames,) array
+        Of the recording; as many frames as the delay before each must be there.
+    predicted : bool
+        Whether the estimator was told what to expect; else that is 0.
+    what : str
+        What errors call the recording.
+
+    Returns
+    -------
+    slopes, errors, held, expected : (frames, m) arrays
+        In true pixels; infinite error: not measured.
+
+    Raises
+    ------
+    InputError
+        When no slope has a standard error.
+    """
+    gain, delay = control.options.centroid_gain, control.options.delay_frames
+    invalid = ~np.tile(recording.valid[rows], 2)
+    error = np.hstack([recording.standard_error_x[rows], recording.standard_error_y[rows]]).astype(np.float64)
+    error[invalid] = np.inf
+    if not np.isfinite(error).any():
+        raise InputError(f"{what}: expected standard errors of slopes; give the calibration a read noise")
+    slopes = recording.slopes[rows].astype(np.float64) / gain
+    held, latest = (
+        recording.commands[rows - lag].astype(np.float64) @ control.interaction.T for lag in (delay, 1)
+    )
+    expected = held - latest if predicted else np.zeros_like(held)  # what acts less the latest command
+    return slopes, error / gain, held, expected
 
 
 def theories_of(
