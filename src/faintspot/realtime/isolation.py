@@ -36,6 +36,7 @@ from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 
 _LOOK_S = 0.1  # between looks at whether this thread is to end
+_ENDING_S = 5.0  # for a process that is ending to say how
 _LONGEST_MESSAGE = 2000
 _GO, _FAILED = b"+", b"-"
 
@@ -125,6 +126,8 @@ class _Elsewhere:
             self._end()
             raise
         if not answer:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_ENDING_S)
             self._end()
             code = self._process.returncode
             how = f"crashed ({signal.Signals(-code).name})" if code < 0 else f"ended (exit status {code})"
@@ -145,8 +148,6 @@ class _Elsewhere:
 def _end(process: subprocess.Popen[bytes], channel: socket.socket, lifeline: int) -> None:
     """End a process and let go of what leads to it."""
     channel.close()
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(_LOOK_S)  # its channel is closed: it ends by itself, and says how it did
     os.close(lifeline)
     process.kill()
     process.wait()
