@@ -65,7 +65,18 @@ class ArmResult:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What `faintspot.planner.tune` found."""
+    """What `faintspot.planner.tune` found.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.planner import Question
+    >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
+    >>> answer = fs.tune(question, realisations=256, steps=1)
+    >>> answer.save("faintspot.toml")
+    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.arm.name
+    True
+    """
 
     question: Question
     curve: Curve
