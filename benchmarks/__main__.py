@@ -33,6 +33,7 @@ _ORDER = (
     "latency",
     "realtime_sustained",
     "pyrtc",
+    "pyrtc_loop",
     "loop",
     "control",
     "study",
