@@ -51,7 +51,7 @@ WARM = 0.1
 """Part of the frames after which memory is taken as what it should stay."""
 MOST_GROWN = 5e6
 _DISTURBANCE_PX, _LARGEST_PX, _STEPS, _POOL = 0.7, 5.0, 32, 1 << 20
-_COMPILING_S, _SEEN_S = 900.0, 2.0
+_COMPILING_S, _SEEN_S = 900.0, 1.0
 
 
 # ---- the sky, a process of its own
@@ -133,13 +133,23 @@ def observe(name: str, folder: Path) -> None:
     shape = Layout.load(folder / "faintspot.toml").frame_shape
     with PixelRing.create(name, shape, dtype) as ring:
         sky = Sky(ring, folder, configuration)
-        time.sleep(_SEEN_S)  # for the engine to see the ring
+        while not _counted(name):  # the engine has yet to make itself ready for such frames
+            sky.run(1)
+            time.sleep(_SEEN_S)
+        sky.squares[:], before = 0, _counted(name)
         report = sky.run(FRAMES)
         disturbed, left = np.sqrt(sky.squares / report.frames)
-        said = {"frames": report.frames, "overruns": report.overruns, "seconds": report.seconds}
-        print(json.dumps(said | {"disturbance_px": disturbed, "left_px": left}), flush=True)
+        said: dict[str, float] = {"frames": report.frames, "before": before, "overruns": report.overruns}
+        said |= {"seconds": report.seconds, "disturbance_px": disturbed, "left_px": left}
+        print(json.dumps(said), flush=True)
         time.sleep(_SEEN_S)
         sky.commands.close()
+
+
+def _counted(name: str) -> int:
+    """Return how many frames the engine says that it has measured or lost."""
+    counters = request(socket_path(name), "status")["counters"]
+    return int(counters["processed"] + counters["dropped"])
 
 
 # ---- everything together
@@ -183,7 +193,7 @@ class Changes:
         elif kind == "gain":
             request(path, "loop", action="gain", gain=next(self._gains))
         elif kind == "arms":
-            arms = next(self._turns).split(",")
+            arms = next(self._turns)
             request(path, "interleave", timeout_s=LENGTHY_TIMEOUT_S, arms=arms, every=TURN_FRAMES)
         else:
             request(path, "loop", action="open" if kind == "opened" else "close")
@@ -266,7 +276,7 @@ def _tables(
     updates: int,
 ) -> list[Table]:
     counters = status["counters"]
-    uncounted = seen["frames"] - counters["processed"] - counters["dropped"]
+    uncounted = seen["before"] + seen["frames"] - counters["processed"] - counters["dropped"]
     columns = {
         "sent": seen["frames"],
         "measured": counters["processed"],

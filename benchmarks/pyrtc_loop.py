@@ -292,6 +292,10 @@ def measured() -> tuple[dict[str, NDArray[np.float64]], float]:
     return {name: np.array(each) for name, each in found.items()}, min(differences)
 
 
+def _spread_of_rounds(rounds: Times, name: str) -> float:
+    return spread(rounds, lambda part: median_ratio(part, name, HARD))
+
+
 def run() -> list[Table]:
     """Compare, where pyRTC is installed."""
     if not all(importlib.util.find_spec(package) for package in ("pyrtc", "pyshmem")):
@@ -311,12 +315,7 @@ def run() -> list[Table]:
             "ratio of p50": middle,
             "not in time": float(each[..., 1].size - len(commands)),
         }
-        own = name.startswith("faintspot")
-        known = (
-            {"ratio of p50": spread(rounds, lambda part, name=name: median_ratio(part, name, HARD))}
-            if own
-            else {}
-        )
+        known = {"ratio of p50": _spread_of_rounds(rounds, name)} if name != HARD else {}
         rows.append(Row(name, values, spread=known, better="lower"))
     notes = [
         f"{ROUNDS} rounds of {FRAMES_A_ROUND} frames at {RATE_HZ:g}/s; {os.cpu_count()} processors, load "
