@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import faintspot as fs
+from faintspot.kernels.ordered import store
 from faintspot.realtime.frame_path import FramePath, Progress, last_rows_of_groups
 from faintspot.realtime.workers import Workers
 
@@ -56,11 +57,11 @@ class Source:
 
     def write(self, number: int, frame: NDArray[Any], block: int = 5, pause_s: float = 0.0) -> None:
         slot = self.slots[number % SLOTS]
-        self.cells[1] = 0
-        self.cells[0] = number
+        store(self.cells, 1, 0)
+        store(self.cells, 0, number)
         for row in range(0, len(frame), block):
             slot[row : row + block] = frame[row : row + block]
-            self.cells[1] = min(row + block, len(frame))
+            store(self.cells, 1, min(row + block, len(frame)))
             time.sleep(pause_s)
 
 
