@@ -15,6 +15,8 @@ from numba.core import types
 from faintspot.kernels import ordered, streaming
 from faintspot.kernels.ordered import fence, load, store
 
+pytestmark = pytest.mark.portable
+
 CELLS = types.Array(types.int64, 1, "C")
 WHOLE = types.int64
 

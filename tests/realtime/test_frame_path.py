@@ -96,6 +96,7 @@ def test_float_frames() -> None:
     assert_same(path.slopes, pipeline("tv")(data), 0)
 
 
+@pytest.mark.portable
 def test_a_frame_that_has_passed_counts_as_there() -> None:
     data, source = frames(2), Source()
     source.write(0, data[0])
@@ -105,6 +106,7 @@ def test_a_frame_that_has_passed_counts_as_there() -> None:
     assert_same(path.slopes, pipeline("plain")(data), 0)
 
 
+@pytest.mark.portable
 def test_waiting_ends_when_told() -> None:
     """Half of a frame arrives, and no more: the path stops, keeps what it has, and can go on."""
     data, source = frames(1), Source()

@@ -24,7 +24,10 @@ from faintspot.errors import InputError
 from faintspot.realtime.pixel_ring import ARRIVALS, CLOSED, FRAME, ROWS, PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.portable,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+]
 
 SHAPE = (24, 32)
 ROW_NUMBERS = np.arange(SHAPE[0])[:, None]

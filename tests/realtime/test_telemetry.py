@@ -22,7 +22,10 @@ from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.telemetry import TelemetryReader, TelemetryRing
 from faintspot.sensor.layout import Layout
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.portable,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+]
 
 
 @pytest.fixture

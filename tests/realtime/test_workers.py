@@ -10,6 +10,8 @@ import pytest
 
 from faintspot.realtime.workers import Workers
 
+pytestmark = pytest.mark.portable
+
 PATIENCE_S = 20.0
 
 
