@@ -24,6 +24,8 @@ SYSTEM, PACKAGES, PYTHON = FOLDER / "system", FOLDER / "packages", FOLDER / "pyt
 TOOLS = ("hypothesis", "pytest", "pytest-timeout")
 LIMIT_S = 7200
 """Of one test: the first that needs a kernel compiles it."""
+PATIENCE = 20
+"""How many times longer than usual a test waits for another process."""
 
 
 def main() -> None:
@@ -97,8 +99,8 @@ def write_wrapper(python: Path) -> None:
     """Write what stands for Python in the emulator, also for the processes that tests start."""
     lines = (
         "#!/bin/sh",
-        f"export PYTHONHOME='{SYSTEM}/usr' PYTHONDONTWRITEBYTECODE=1 NUMBA_CACHE_DIR='{FOLDER}/kernels'",
-        f"export PYTHONPATH='{ROOT}/src:{PACKAGES}' OPENBLAS_NUM_THREADS=1",
+        f"export PYTHONHOME='{SYSTEM}/usr' PYTHONPATH='{ROOT}/src:{PACKAGES}' PYTHONDONTWRITEBYTECODE=1",
+        f"export NUMBA_CACHE_DIR='{FOLDER}/kernels' OPENBLAS_NUM_THREADS=1 FAINTSPOT_PATIENCE={PATIENCE}",
         f"exec qemu-aarch64 -L '{SYSTEM}' -0 '{PYTHON}' '{python}' \"$@\"",
     )
     PYTHON.write_text("\n".join(lines) + "\n", encoding="utf-8")
