@@ -75,7 +75,7 @@ class Sky(Readout):
         self._reference = np.load(folder / "reference_slopes.npy").astype(np.float64)
         self.commands = CommandStream(f"{ring.name}_commands", self._matrix.shape[1], lambda _: None)
         rng = np.random.default_rng(1)
-        self._rates = 2 * np.pi * rng.uniform(0.2, 8.0, (3, self._matrix.shape[1])) / RATE_HZ
+        self._rates = 2 * np.pi * rng.uniform(0.1, 3.0, (3, self._matrix.shape[1])) / RATE_HZ
         self._phases = rng.uniform(0, 2 * np.pi, self._rates.shape)
         self._amplitude = 1.0
         moved = np.array([self._disturbance(frame) for frame in range(0, 100_000, 1000)])
@@ -170,13 +170,18 @@ class Changes:
 
     def __init__(self, name: str, arms: list[str]) -> None:
         self._name, self.done, self.refused = name, dict[str, int](), dict[str, int]()
+        self.states: dict[str, int] = {}
+        """How often the loop was found in which state, and why it was open."""
         turns = ",".join(arms), ",".join(arms[::-1]), ",".join(arms[:2])
         light = (0.9 * PHOTONS, 1.1 * PHOTONS, PHOTONS)
         self._turns, self._light, self._gains = cycle(turns), cycle(light), cycle((0.3, 0.4, 0.5))
         self._kinds = cycle(("set", "gain", "set", "opened", "closed", "set", "refused", "set", "arms"))
 
     def next(self) -> None:
-        """Change something."""
+        """See how the loop is, and change something."""
+        loop = request(socket_path(self._name), "loop", action="status")["loop"]
+        state = loop["state"] if loop["opened_because"] is None else f"open ({loop['opened_because']})"
+        self.states[state] = self.states.get(state, 0) + 1
         kind = next(self._kinds)
         try:
             self._change(kind)
@@ -289,8 +294,9 @@ def _tables(
     notes = [
         f"done: {changes.done}; refused: {changes.refused}; the engine says {counters['settings_changes']} "
         f"changes of settings, {counters['settings_refused']} refused",
+        f"the loop, looked at every {CHANGE_S:g} s: {changes.states}",
         f"{updates / READING / seen['seconds']:.1f} updates a second of each client of the page; "
-        f"{seen['overruns']:.0f} frame times went by without a frame; loop {status['loop']['state']}",
+        f"{seen['overruns']:.0f} frame times went by without a frame",
     ]
     frames = Table(
         "closed-loop-long",

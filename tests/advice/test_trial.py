@@ -193,7 +193,7 @@ def test_proposals_are_tried_one_after_the_other(monkeypatch: pytest.MonkeyPatch
     loop: Any = type("Stub", (), {"unit": "nm"})
     said: list[str] = []
     apply(loop, advice, 5.0, threading.Event(), said.append)
-    assert said[0] == "trying gain 0.3 for 5 s"
+    assert said[0] == "trying gain 0.3 for at most 5 s"
     assert said[1] == "  leaves -2 +- 0.5 (nm)^2 of 10: kept"
     assert len(advice.verdicts) == 2
     config = tmp_path / "faintspot.toml"
