@@ -22,6 +22,7 @@ SETTINGS = {
     "tv": fs.Settings(noise_std=1.0, keep_brightest=9),
     "fast": fs.Settings(noise_std=1.0, keep_brightest=9, preset="fast"),
     "plain": fs.Settings("brightest", keep_brightest=9),
+    "thresholded": fs.Settings("thresholded", threshold_e=2.0),
     "ml": fs.Settings(estimator="ml", search_range_px=1.5),
     "map": fs.Settings(estimator="map", flux_e=200.0),
 }
