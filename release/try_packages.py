@@ -42,7 +42,8 @@ def main() -> None:
         for extra in chosen.extras.split(","):
             rows.append(tried(python, extra, wheel))
             print(rows[-1], flush=True)
-    print("", "python, extra, MB, seconds of all commands", *rows, sep="\n")
+    print("", f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB", "", sep="\n")
+    print("python, extra, MB installed, seconds of all commands", *rows, sep="\n")
 
 
 def built() -> Path:
@@ -63,13 +64,12 @@ def tried(python: str, extra: str, wheel: Path) -> str:
         wanted = str(wheel) if extra == "none" else f"{wheel}[{extra}]"
         pinned = ["--quiet", "--constraint", str(ROOT / "constraints.txt")]
         _run([str(environment / "bin/python"), "-m", "pip", "install", *pinned, wanted], empty)
+        size = sum(path.lstat().st_size for path in environment.rglob("*") if not path.is_symlink())
         start = time.monotonic()
         _run([str(environment / "bin/python"), "-c", FRAME], empty)
         for command in COMMANDS:
             _run([str(environment / "bin/faintspot"), *command.split()], empty)
-        seconds = time.monotonic() - start
-        size = sum(path.lstat().st_size for path in environment.rglob("*") if not path.is_symlink())
-        return f"{python}, {extra}, {size / 1e6:.0f}, {seconds:.0f}"
+        return f"{python}, {extra}, {size / 1e6:.0f}, {time.monotonic() - start:.0f}"
 
 
 def _runs(python: str) -> bool:

@@ -111,12 +111,12 @@ def test_processor_that_is_forced(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(doctor, "_SHARED_MEMORY", tmp_path)
+    monkeypatch.setattr(doctor, "SHARED_MEMORY", tmp_path)
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage(0, 0, 64e6))
     assert "--shm-size" in str(named("shared memory").advice)
     monkeypatch.setattr("shutil.disk_usage", lambda path: usage(0, 0, 4e9))
     assert named("shared memory").advice is None
-    monkeypatch.setattr(doctor, "_SHARED_MEMORY", tmp_path / "absent")
+    monkeypatch.setattr(doctor, "SHARED_MEMORY", tmp_path / "absent")
     assert "Linux" in str(named("shared memory").advice)
 
 

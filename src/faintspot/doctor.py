@@ -14,11 +14,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from faintspot import __version__
-from faintspot.extras import EXTRAS, present
+from faintspot.extras import EXTRAS, SHARED_MEMORY, present
 
 _REQUIRED = ("numpy", "scipy", "numba", "llvmlite", "tomlkit", "click", "rich")
 _NETWORK = ("nfs", "cifs", "smb", "lustre", "gpfs", "beegfs", "ceph", "afs", "fuse.sshfs", "9p")
-_SHARED_MEMORY = Path("/dev/shm")
 _LITTLE_MB = 256  # of shared memory: a ring of four frames of 2048 x 2048 pixels, its streams and telemetry
 _TRY_S = 60.0
 _TRY_REAL_TIME = """
@@ -173,16 +172,14 @@ def _gpu() -> Finding:
 
 def _shared_memory() -> Finding:
     """For `faintspot realtime`."""
-    if not _SHARED_MEMORY.is_dir():
-        return Finding("shared memory", f"no {_SHARED_MEMORY}", "faintspot realtime needs Linux")
-    free_mb = shutil.disk_usage(_SHARED_MEMORY).free / 1e6
-    words = f"{free_mb:.0f} MB free in {_SHARED_MEMORY}"
-    if not os.access(_SHARED_MEMORY, os.W_OK):
-        return Finding(
-            "shared memory", f"{words}, cannot be written", f"chmod 1777 {_SHARED_MEMORY}, as root"
-        )
+    if not SHARED_MEMORY.is_dir():
+        return Finding("shared memory", f"no {SHARED_MEMORY}", "faintspot realtime needs Linux")
+    free_mb = shutil.disk_usage(SHARED_MEMORY).free / 1e6
+    words = f"{free_mb:.0f} MB free in {SHARED_MEMORY}"
+    if not os.access(SHARED_MEMORY, os.W_OK):
+        return Finding("shared memory", f"{words}, cannot be written", f"chmod 1777 {SHARED_MEMORY}, as root")
     if free_mb < _LITTLE_MB:
-        advice = f"big cameras need more: mount -o remount,size=2G {_SHARED_MEMORY}; in Docker --shm-size=2g"
+        advice = f"big cameras need more: mount -o remount,size=2G {SHARED_MEMORY}; in Docker --shm-size=2g"
         return Finding("shared memory", words, advice)
     return Finding("shared memory", words)
 

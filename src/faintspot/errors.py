@@ -6,6 +6,14 @@ class InputError(ValueError):
 
     The message is one line: it names the value, what was expected and where it was found.
     The command line prints it and exits with code 2.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> fs.Settings(noise_std=-1.0)
+    Traceback (most recent call last):
+        ...
+    faintspot.errors.InputError: noise_std = -1: expected a number of at least 0
     """
 
     def __init__(self, message: str) -> None:
@@ -13,7 +21,14 @@ class InputError(ValueError):
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is absent; the message names the extra that installs it."""
+    """An optional dependency is absent; the message names the extra that installs it.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> print(fs.MissingExtraError("zarr", "io", "reading Zarr stores"))
+    reading Zarr stores needs zarr: install it with pip install 'faintspot[io]'
+    """
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(f"{purpose} needs {package}: install it with pip install 'faintspot[{extra}]'")

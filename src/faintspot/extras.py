@@ -1,10 +1,12 @@
-"""Optional packages: which extra installs them, and whether they are there."""
+"""What only some have: optional packages, with the extra that installs them, and Linux."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+from pathlib import Path
 
-from faintspot.errors import MissingExtraError
+from faintspot.errors import InputError, MissingExtraError
 
 EXTRAS = {
     "io": ("astropy", "tifffile", "zarr"),
@@ -20,6 +22,8 @@ EXTRAS = {
     "pyrtc": ("pyrtc",),
 }
 """Packages by the extra to name where one is missing; some extras bring those of others along."""
+SHARED_MEMORY = Path("/dev/shm")
+"""Where Linux keeps named shared memory."""
 
 
 def present(package: str) -> bool:
@@ -50,3 +54,22 @@ def require(extra: str, *packages: str, purpose: str) -> None:
     missing = [package for package in packages if not present(package)]
     if missing:
         raise MissingExtraError(" and ".join(missing), extra, purpose)
+
+
+def require_linux(purpose: str) -> None:
+    """Make sure that this is Linux, with its scheduler and shared memory, which real time needs.
+
+    Parameters
+    ----------
+    purpose : str
+        What needs it, the beginning of the message.
+
+    Raises
+    ------
+    InputError
+        When it is not.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        raise InputError(f"{purpose} needs Linux")
+    if not SHARED_MEMORY.is_dir():
+        raise InputError(f"{purpose} needs shared memory in {SHARED_MEMORY}, which Linux has")

@@ -39,6 +39,13 @@ class MeanLight:
     ------
     InputError
         For light that is not finite, of another shape, or numbers out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> light = fs.MeanLight([100.0, 40.0])
+    >>> print(light.updated([110.0, 60.0]).flux_e)
+    [105.  50.]
     """
 
     flux_e: Any

@@ -114,7 +114,21 @@ class Option:
 
 
 def option(default: Any, meaning: str, **bounds: Any) -> Any:
-    """Declare an option of a dataclass that derives from `Options`; `bounds` are those of `Option`."""
+    """Declare an option of a dataclass that derives from `Options`; `bounds` are those of `Option`.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from faintspot.estimators import Estimator, option
+    >>> @dataclass(frozen=True, eq=False, kw_only=True)
+    ... class Power(Estimator):
+    ...     name = "power"
+    ...     power: float = option(1.5, "Power of each pixel's light.", low=1.0, high=4.0)
+    >>> Power(power=9.0)
+    Traceback (most recent call last):
+        ...
+    faintspot.errors.InputError: power = 9: expected a number from 1 to 4
+    """
     bounds.setdefault("optional", default is None)
     return field(default=default, metadata={"option": Option(meaning, **bounds)})
 

@@ -22,7 +22,22 @@ RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f
 
 @dataclass(frozen=True, repr=False)
 class Slopes:
-    """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures)."""
+    """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures).
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((2, 2), pixels=8)
+    >>> frame = np.zeros(layout.frame_shape)
+    >>> frame[2:4, 4:6] = 50.0
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=4))(frame)
+    >>> slopes.valid
+    array([ True, False, False, False])
+    >>> float(slopes.x[0]), float(slopes.y[0]), float(slopes.flux[0])
+    (1.0, -1.0, 200.0)
+    >>> fs.SubapertureFlag(int(slopes.flags[1])).name
+    'NO_LIGHT'
+    """
 
     x: NDArray[np.float32]
     """Position of the spot along columns, px from the reference; 0 where invalid."""
@@ -90,7 +105,19 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Stages:
-    """The sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes."""
+    """The sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16)
+    >>> frames, _ = fs.simulate.sensor_frames(layout.corners, layout.window, layout.frame_shape, 1)
+    >>> stages = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12)).explain(frames[0])
+    >>> stages.denoised.shape
+    (49, 16, 16)
+    >>> bool(stages.denoised.std() < stages.calibrated.std())
+    True
+    """
 
     raw: NDArray[Any]
     """As in the frame, ADU."""

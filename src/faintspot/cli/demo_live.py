@@ -14,7 +14,7 @@ from rich.table import Table
 
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.errors import MissingExtraError
-from faintspot.extras import present
+from faintspot.extras import present, require_linux
 
 if TYPE_CHECKING:
     from faintspot.compare.statistics import Estimate
@@ -68,6 +68,7 @@ def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def show_live(options: dict[str, Any]) -> None:
     """Run the demonstration and print its table."""
+    require_linux("demo --live")
     _check_extras()
     from faintspot.live_page.demonstration import LiveDemonstration
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from faintspot.cli.needs import needs
-from faintspot.extras import require
+from faintspot.extras import require, require_linux
 
 if TYPE_CHECKING:
     from faintspot.live_page.server import LiveServer
@@ -53,8 +53,11 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
     from faintspot.cli.realtime_camera import stop_on_signal
     from faintspot.live_page.serving import serve_engine, serve_recording
 
+    if recording is None:
+        require_linux("live without a recording")
     os.nice(_NICENESS)
-    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # does not push others aside when it wakes
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # pushes nobody aside when it wakes
     with stop_on_signal() as stop:
         if recording is not None:
             serve_recording(recording, stop, _say, address=bind, port=port, private=private)

@@ -1,4 +1,4 @@
-"""What commands need beyond faintspot's own dependencies: asked before their work begins."""
+"""What commands need beyond faintspot's own dependencies, or Linux: asked before their work begins."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from faintspot.errors import MissingExtraError
-from faintspot.extras import present, require
+from faintspot.extras import present, require, require_linux
 
 
 def needs(extra: str, *packages: str) -> Callable[[click.Command], click.Command]:
@@ -19,19 +19,31 @@ def needs(extra: str, *packages: str) -> Callable[[click.Command], click.Command
     """
 
     def declared(command: click.Command) -> click.Command:
-        work = command.callback
-        assert work is not None
-
-        @wraps(work)
-        def checked(*arguments: Any, **options: Any) -> Any:
-            require(extra, *packages, purpose=click.get_current_context().command_path)
-            return work(*arguments, **options)
-
-        command.callback = checked
+        _check_first(command, lambda path: require(extra, *packages, purpose=path))
         command.epilog = f"Needs the extra `{extra}`: pip install 'faintspot[{extra}]'"
         return command
 
     return declared
+
+
+def needs_linux(command: click.Command) -> click.Command:
+    """Declare that a command, or every command of a group, does its work in real time: on Linux only."""
+    for each in command.commands.values() if isinstance(command, click.Group) else [command]:
+        _check_first(each, require_linux)
+    return command
+
+
+def _check_first(command: click.Command, check: Callable[[str], None]) -> None:
+    """Have a command check something, which is told what the command is called, before its work."""
+    work = command.callback
+    assert work is not None
+
+    @wraps(work)
+    def checked(*arguments: Any, **options: Any) -> Any:
+        check(click.get_current_context().command_path)
+        return work(*arguments, **options)
+
+    command.callback = checked
 
 
 def can_make(what: str, extra: str, *packages: str, asked: bool = False) -> bool:

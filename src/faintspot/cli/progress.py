@@ -17,6 +17,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from faintspot.extras import present
+
 
 class _Rate(ProgressColumn):
     """Units per second."""
@@ -37,7 +39,8 @@ def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int
     """Show a bar on standard error; yields a function to call with finished and total counts.
 
     A bar that never moved leaves no trace, so that an error before the first frame stands alone. Where
-    standard error is not a terminal, the bar is printed once, at its end.
+    standard error is not a terminal, the bar is printed once, at its end; so it is in a notebook without
+    ipywidgets, with which the bar moves.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -47,6 +50,8 @@ def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
+    if console.is_jupyter and not present("ipywidgets"):
+        console = Console(stderr=True, force_jupyter=False)
     progress = Progress(*columns, console=console, transient=True)
     task = progress.add_task(what, total=None)
 
@@ -61,4 +66,5 @@ def progress_bar(what: str, unit: str = "frames") -> Iterator[Callable[[int, int
         yield advance
     finally:
         if progress.live.is_started:
+            progress.refresh()  # a notebook's bar would stay where it was when last drawn
             progress.stop()

@@ -17,11 +17,12 @@ from faintspot.cli import (
     realtime_sources,
     realtime_telescope,
 )
+from faintspot.cli.needs import needs_linux
 
 
 @click.group("realtime")
 def command() -> None:
-    """Run the slope computation in real time: pixels stream in, slopes stream out.
+    """Run the slope computation in real time: pixels stream in, slopes stream out (Linux).
 
     \b
     In three terminals:
@@ -47,13 +48,12 @@ for each in (
     realtime_control.stop_engine,
     realtime_loop.loop,
     realtime_calibrate.calibrate,
-    realtime_learn.learn,
-    realtime_advise.advise,
     realtime_modules.modules,
     realtime_modules.load,
     realtime_modules.swap,
     realtime_modules.unload,
     realtime_record.record,
-    realtime_record.export,
 ):
+    command.add_command(needs_linux(each))
+for each in (realtime_learn.learn, realtime_advise.advise, realtime_record.export):  # of recordings
     command.add_command(each)

@@ -10,6 +10,7 @@ import click
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.errors import InputError
+from faintspot.extras import require_linux
 
 if TYPE_CHECKING:
     from faintspot.advice.advising import Advice
@@ -60,6 +61,8 @@ def advise(config: str, name: str, seconds: float, store: Path | None, tries: bo
     from faintspot.advice.advising import apply, loop_of, write_journal
     from faintspot.cli.progress import progress_bar
 
+    if store is None:
+        require_linux("realtime advise without --from")
     if tries and store is not None:
         raise InputError("--apply, --from: expected one of them; a recording cannot be changed")
     loop, written = loop_of(config, name)

@@ -60,6 +60,13 @@ class Photometry:
     ------
     InputError
         For a value out of range.
+
+    Examples
+    --------
+    >>> from faintspot.planner import Photometry
+    >>> photometry = Photometry(area_m2=0.36, frame_time_s=1 / 150, band="R")
+    >>> round(float(photometry.electrons(11.0))), round(float(photometry.magnitude(100.0)), 1)
+    (368, 12.4)
     """
 
     area_m2: float

@@ -120,6 +120,14 @@ def cramer_rao(
     ------
     InputError
         When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> camera = fs.simulate.Detector(read_noise_e=1.0)
+    >>> print(fs.cramer_rao([50.0, 500.0], shape=(8, 8), detector=camera).round(3))
+    [[0.133 0.133]
+     [0.034 0.034]]
     """
     flux: Floats = numbers_between("flux_e", flux_e, 0.0, low_open=True)
     ny, nx = image_shape("shape", shape)
@@ -172,6 +180,12 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     ------
     InputError
         As `cramer_rao`, and when the bound reaches the error nowhere between 1e-12 and 1e12 e-.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> round(float(fs.photon_efficiency(0.1, 100.0)), 2)
+    0.31
     """
     from scipy.interpolate import PchipInterpolator
 

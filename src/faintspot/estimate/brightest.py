@@ -59,6 +59,14 @@ def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtrac
     ----------
     .. [1] A. G. Basden, R. M. Myers & E. Gendron, 2012, MNRAS 419, 1628, and Basden et al. 2015,
        arXiv:1503.06043.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> print(fs.brightest_pixels([[1.0, 2.0, 1.0], [2.0, 9.0, 6.0], [1.0, 3.0, 1.0]], 3))
+    [[0. 0. 0.]
+     [0. 7. 4.]
+     [0. 1. 0.]]
     """
     stack = image_stack("images", images)
     one_of("rule", rule, RULES)

@@ -32,6 +32,12 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     ------
     InputError
         For images that are not real, finite and at least two-dimensional.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> print(fs.centre_of_gravity([[0.0, 0.0, 0.0], [0.0, 3.0, 1.0], [0.0, 0.0, 0.0]]))
+    [0.25 0.  ]
     """
     stack = image_stack("images", images)
     ny, nx = stack.shape[-2:]

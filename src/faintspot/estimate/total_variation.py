@@ -21,7 +21,16 @@ SMALLEST_SIDE = 2
 
 
 class Denoised(NamedTuple):
-    """Result of `tv_denoise` with `full_output`; every field but `images` has the leading shape."""
+    """Result of `tv_denoise` with `full_output`; every field but `images` has the leading shape.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> images, _ = fs.simulate.subapertures(100, flux_e=60.0, rng=np.random.default_rng(1))
+    >>> result = fs.tv_denoise(images, 0.4, full_output=True)
+    >>> result.images.shape, int(result.iterations.max()), int(result.infeasible.sum())
+    ((100, 16, 16), 24, 0)
+    """
 
     images: NDArray[Any]
     """(..., ny, nx) denoised images, in the dtype of the computation."""

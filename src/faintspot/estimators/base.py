@@ -25,7 +25,14 @@ Floats = NDArray[np.float64]
 
 
 class Need(enum.Enum):
-    """What an estimator may have to know; the value says it in words, and what provides it."""
+    """What an estimator may have to know; the value says it in words, and what provides it.
+
+    Examples
+    --------
+    >>> from faintspot.estimators import estimator_named
+    >>> sorted(need.name for need in estimator_named("ml").needs)
+    ['PSF', 'READ_NOISE']
+    """
 
     READ_NOISE = "calibration.read_noise_e: expected the read noise (electrons)"
     WIDTH = "settings.spot_fwhm_px: expected the spots' width (px), or a PSF,"
@@ -40,7 +47,14 @@ _MAKERS = {
 
 
 class Style(NamedTuple):
-    """How figures draw an estimator."""
+    """How figures draw an estimator.
+
+    Examples
+    --------
+    >>> from faintspot.estimators import Style
+    >>> Style("tab:red", line="--")
+    Style(colour='tab:red', line='--', marker='o')
+    """
 
     colour: str
     line: str = "-"
@@ -67,6 +81,25 @@ class Estimator(Options):
     options, declared by `faintspot.options.option`. It either overrides `locate`, in NumPy, or `prepared`,
     with a compiled kernel. `faintspot.estimators.register` makes it known by its name, as does the entry
     point group `faintspot.estimators` of an installed package.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.estimators import Estimator
+    >>> @dataclass(frozen=True, eq=False, kw_only=True)
+    ... class BrightestPixel(Estimator):
+    ...     name = "brightest_pixel"
+    ...     label = "brightest pixel"
+    ...     def locate(self, images, sensor, prior):
+    ...         ny, nx = sensor.window
+    ...         y, x = np.divmod(images.reshape(-1, ny * nx).argmax(1), nx)
+    ...         return np.stack([x - (nx - 1) / 2, y - (ny - 1) / 2], axis=1)
+    >>> image = np.zeros((1, 8, 8))
+    >>> image[0, 2, 5] = 10.0
+    >>> slopes = fs.estimators.measure(image, BrightestPixel())
+    >>> float(slopes.x[0]), float(slopes.y[0])
+    (1.5, -1.5)
     """
 
     name: ClassVar[str]
@@ -184,7 +217,16 @@ class Estimator(Options):
 
 
 class Positions(NamedTuple):
-    """What an estimator in NumPy may return beside positions; each (n,)."""
+    """What an estimator in NumPy may return beside positions; each (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.estimators import Positions
+    >>> found = Positions(np.array([0.1, 0.0]), np.array([-0.2, 0.0]), valid=np.array([True, False]))
+    >>> found.valid
+    array([ True, False])
+    """
 
     x: NDArray[Any]
     y: NDArray[Any]

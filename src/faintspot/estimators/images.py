@@ -49,6 +49,17 @@ def measure(
     ------
     InputError
         For images that are not real or not three-dimensional, and as `SlopePipeline`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> images, truth = fs.simulate.subapertures(2000, flux_e=100.0, rng=np.random.default_rng(1))
+    >>> for settings in (fs.Settings("brightest", keep_brightest=12), fs.Settings(noise_std=0.5)):
+    ...     slopes = fs.estimators.measure(images, settings)
+    ...     error = np.abs(np.stack([slopes.x, slopes.y], axis=1) - truth).mean()
+    ...     print(f"{settings.estimator.name}: R = {error:.3f} px")
+    brightest: R = 0.077 px
+    tv: R = 0.073 px
     """
     stack = real_array("images", images)
     if stack.ndim != 3:

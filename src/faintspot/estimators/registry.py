@@ -39,6 +39,21 @@ def register(kind: Kind) -> Kind:
     ------
     InputError
         When another one has that name.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> import faintspot as fs
+    >>> from faintspot.estimators import Estimator, register
+    >>> @register
+    ... @dataclass(frozen=True, eq=False, kw_only=True)
+    ... class Middle(Estimator):
+    ...     name = "middle"
+    ...     label = "the middle of the window"
+    ...     def locate(self, images, sensor, prior):
+    ...         return sensor.zero
+    >>> fs.Settings("middle").estimator.label
+    'the middle of the window'
     """
     name = getattr(kind, "name", None)
     if not isinstance(name, str) or not name.isidentifier():
@@ -51,7 +66,14 @@ def register(kind: Kind) -> Kind:
 
 
 def estimators() -> dict[str, type[Estimator]]:
-    """Return every estimator's class by name: built-in ones first, in the order in which they are shown."""
+    """Return every estimator's class by name: built-in ones first, in the order in which they are shown.
+
+    Examples
+    --------
+    >>> from faintspot.estimators import estimators
+    >>> list(estimators())[:4]
+    ['brightest', 'tv', 'smoothed', 'centroid']
+    """
     _load()
     places = {f"{__package__}.{module}": place for place, module in enumerate(_BUILT_IN)}
     # Not in the order in which modules happened to be imported.
@@ -65,6 +87,12 @@ def estimator_named(name: str) -> type[Estimator]:
     ------
     InputError
         For an unknown name.
+
+    Examples
+    --------
+    >>> from faintspot.estimators import estimator_named
+    >>> estimator_named("map").label
+    'maximum a posteriori'
     """
     _load()
     if not isinstance(name, str) or name not in _kinds:

@@ -40,6 +40,13 @@ class Scene:
         "diffraction" or "gaussian".
     learnt : bool
         Whether the PSF was learnt from frames.
+
+    Examples
+    --------
+    >>> from faintspot.estimators import Scene
+    >>> scene = Scene(flux_e=100.0, read_noise_e=1.0, window=(8, 8), spot_fwhm_px=1.8, position_range_px=1.0)
+    >>> round(scene.seen_fwhm_px, 2)
+    1.92
     """
 
     flux_e: float

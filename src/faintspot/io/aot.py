@@ -54,6 +54,11 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
         When there is no frame, the file exists, or cannot be written.
     MissingExtraError
         When aotpy is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_telemetry, write_aot
+    >>> write_aot("night.fits", read_telemetry("night.zarr"))  # doctest: +SKIP
     """
     try:
         from aotpy.io.fits import AOTFITSWriter

@@ -29,7 +29,14 @@ _PIXELS = ("pix", "pixel", "px")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AotSensor:
-    """A Shack-Hartmann sensor of an AOT file, with what the file has of it; None is what it has not."""
+    """A Shack-Hartmann sensor of an AOT file, with what the file has of it; None is what it has not.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_aot
+    >>> sensor = read_aot("night.fits")  # doctest: +SKIP
+    >>> sensor.n, sensor.unit  # doctest: +SKIP
+    """
 
     path: Path
     name: str
@@ -109,6 +116,12 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         When it is not a valid AOT file, has no such sensor, or says things of it that do not fit together.
     MissingExtraError
         When aotpy is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_aot
+    >>> sensor = read_aot("night.fits")  # doctest: +SKIP
+    >>> sensor.n, sensor.unit  # doctest: +SKIP
     """
     path = Path(path)
     try:

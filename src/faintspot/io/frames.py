@@ -34,6 +34,18 @@ class FrameSource:
         Data type of every block.
     description : str
         The file names, for messages.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.io import open_frames
+    >>> np.save("frames.npy", np.arange(50.0)[:, None, None] * np.ones((64, 64)))
+    >>> with open_frames(["frames.npy"]) as frames:
+    ...     for first, block in frames.blocks(0, frames.n_frames, 20):
+    ...         print(first, block.shape)
+    0 (20, 64, 64)
+    20 (20, 64, 64)
+    40 (10, 64, 64)
     """
 
     def __init__(self, arrays: Sequence[StoredArray]) -> None:
@@ -116,6 +128,16 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
         When a file is missing, damaged, of another format, or does not hold real frames of the others' size.
     MissingExtraError
         When the package that reads the format is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.io import open_frames
+    >>> np.save("first.npy", np.zeros((30, 64, 64)))
+    >>> np.save("second.npy", np.ones((20, 64, 64)))
+    >>> frames = open_frames(["first.npy", "second.npy"])
+    >>> frames.n_frames, frames.shape
+    (50, (64, 64))
     """
     if isinstance(paths, str | Path):
         paths = [paths]
@@ -153,6 +175,14 @@ def read_array(location: str | Path) -> NDArray[Any]:
         When the file is missing, damaged, of another format or does not hold a real array.
     MissingExtraError
         When the package that reads the format is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.io import read_array
+    >>> np.savez("calibration.npz", dark=np.full((64, 64), 100.0), flat=np.ones((64, 64)))
+    >>> float(read_array("calibration.npz:dark").mean())
+    100.0
     """
     array = _find_array(location, None)
     if array.dtype.kind not in "biuf":

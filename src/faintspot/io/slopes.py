@@ -75,6 +75,17 @@ def create_writer(
         run's and `overwrite` is False.
     MissingExtraError
         When the package that writes the format is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.io import create_writer, read_slopes
+    >>> names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
+    >>> run = {"n_frames": 5, "n_subapertures": 3, "attributes": {"fingerprint": "mine"}, "coordinates": {}}
+    >>> with create_writer("slopes.npz", **run) as writer:
+    ...     writer.append(0, {name: np.zeros((5, 3)) for name in names})
+    >>> read_slopes("slopes.npz").complete
+    True
     """
     path = Path(path)
     run = _checked_run(n_frames, n_subapertures, attributes, coordinates)
@@ -118,6 +129,19 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
         pixels that another unit needs.
     MissingExtraError
         When the package that reads the format is not installed.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.io import read_slopes
+    >>> from faintspot.recorded import measure_recorded
+    >>> fs.Layout.grid((4, 4), pixels=8).save("faintspot.toml")
+    >>> fs.Settings("centroid").save("faintspot.toml")
+    >>> np.save("frames.npy", np.ones((5, 32, 32)))
+    >>> _ = measure_recorded(["frames.npy"], "faintspot.toml", "slopes.npz")
+    >>> stored = read_slopes("slopes.npz")
+    >>> stored.complete, stored.variables["x"].shape
+    (True, (5, 16))
     """
     path = Path(path)
     if not path.exists():

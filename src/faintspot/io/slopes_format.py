@@ -71,6 +71,19 @@ class StoredSlopes:
         Whether all frames of the run are there.
     n_finished : int
         Number of frames that are there.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.io import read_slopes
+    >>> from faintspot.recorded import measure_recorded
+    >>> fs.Layout.grid((4, 4), pixels=8).save("faintspot.toml")
+    >>> fs.Settings("centroid").save("faintspot.toml")
+    >>> np.save("frames.npy", np.ones((5, 32, 32)))
+    >>> _ = measure_recorded(["frames.npy"], "faintspot.toml", "slopes.npz")
+    >>> stored = read_slopes("slopes.npz")
+    >>> stored.n_finished, stored.attributes["unit"], sorted(stored.coordinates)
+    (5, 'px', ['centre_x', 'centre_y', 'column', 'row'])
     """
 
     variables: Mapping[str, NDArray[Any]]
@@ -137,7 +150,19 @@ class Run:
 
 
 class SlopeWriter(Protocol):
-    """Takes slopes block by block; a `with` statement closes it."""
+    """Takes slopes block by block; a `with` statement closes it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.io import create_writer
+    >>> names = ("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels")
+    >>> run = {"n_frames": 5, "n_subapertures": 3, "attributes": {"fingerprint": "mine"}, "coordinates": {}}
+    >>> with create_writer("slopes.npz", **run) as writer:
+    ...     writer.append(0, {name: np.zeros((2, 3)) for name in names})
+    ...     print(writer.finished(), "of 5 frames")
+    2 of 5 frames
+    """
 
     def finished(self) -> int:
         """Return how many frames it has: the next block starts there."""

@@ -53,6 +53,12 @@ class Telemetry:
     """What was recorded of a running engine: (n_frames,) or (n_frames, n_subapertures), as it came.
 
     Frames that were lost are absent; `frame` tells.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_telemetry
+    >>> night = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
+    >>> night.x.std(axis=0), night.latency_s.max()  # doctest: +SKIP
     """
 
     frame: NDArray[np.int64]
@@ -208,6 +214,12 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     ------
     InputError
         When it is not a store of telemetry, or damaged.
+
+    Examples
+    --------
+    >>> from faintspot.io import read_telemetry
+    >>> night = read_telemetry("night.zarr", images=False)  # doctest: +SKIP
+    >>> night.x.std(axis=0), night.latency_s.max()  # doctest: +SKIP
     """
     store = Path(path)
     attributes = attributes_of(store)

@@ -79,6 +79,14 @@ class LoopArm:
     ------
     InputError
         For an empty label, an unknown control, a gain, window or scale out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.loop import Arm
+    >>> arm = Arm("a window, less gain", fs.Settings("window"), gain=0.4)
+    >>> arm.control, arm.gain
+    ('integrator', 0.4)
     """
 
     label: str

@@ -101,6 +101,11 @@ def run_budget(
         For unknown arms, a folder that holds another experiment, or a loop that is open.
     MissingExtraError
         When HCIPy, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop, run_budget
+    >>> result = run_budget(load_loop("canary"), "budget", quick=True)  # doctest: +SKIP
     """
     if configuration.control.mode != CLOSED:
         raise InputError(

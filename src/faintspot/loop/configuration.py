@@ -163,6 +163,13 @@ class LoopConfiguration:
         For a value out of its range, and for parts that do not fit together: an aperture smaller than a
         sub-aperture or than all of them cover, a window that the phase's points cannot fill, layers with
         lists of different lengths, no light or two amounts of it.
+
+    Examples
+    --------
+    >>> from faintspot.loop import LoopConfiguration
+    >>> loop = LoopConfiguration().replace("camera", photons_per_subaperture=50.0)
+    >>> loop.name, loop.sensor.subapertures, round(loop.subaperture_m, 2)
+    ('canary', 7, 0.6)
     """
 
     name: str = "canary"
@@ -338,6 +345,13 @@ def load_loop(path: str | Path) -> LoopConfiguration:
     ------
     InputError
         When there is neither, or as for `LoopConfiguration.from_text`.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop
+    >>> canary = load_loop("canary")
+    >>> canary.telescope.diameter_m, canary.control.frame_rate_hz
+    (4.2, 250.0)
     """
     path = Path(path)
     name = path.name.removesuffix(".toml")
@@ -352,7 +366,14 @@ def load_loop(path: str | Path) -> LoopConfiguration:
 
 
 def shipped_loops() -> list[str]:
-    """Return the names of the configurations that come with the package."""
+    """Return the names of the configurations that come with the package.
+
+    Examples
+    --------
+    >>> from faintspot.loop import shipped_loops
+    >>> shipped_loops()[:4]
+    ['camera_3e', 'canary', 'canary_faint', 'diffraction_limit']
+    """
     names = (item.name for item in _shipped().iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 

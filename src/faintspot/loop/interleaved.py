@@ -133,6 +133,11 @@ def run_interleaved(
         When the folder holds another experiment or cannot be written.
     MissingExtraError
         When HCIPy, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop, run_interleaved
+    >>> result = run_interleaved(load_loop("canary"), "interleaved", quick=True)  # doctest: +SKIP
     """
     place = Workplace() if place is None else place
     plan = plan or (QUICK_PLAN if quick else ObservingPlan())

@@ -79,6 +79,11 @@ def run_magnitude(
         For unknown arms, no flux, or a folder that holds another experiment.
     MissingExtraError
         When HCIPy, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop, run_magnitude
+    >>> result = run_magnitude(load_loop("canary"), "magnitude", quick=True)  # doctest: +SKIP
     """
     place = Workplace() if place is None else place
     configuration = quick_run(configuration) if quick else configuration

@@ -14,7 +14,17 @@ from faintspot.loop.files import Stored
 
 @dataclass(frozen=True, eq=False)
 class LoopRecord(Stored):
-    """One run of the loop, n sub-apertures and m commands."""
+    """One run of the loop, n sub-apertures and m commands.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.loop import Arm, LoopConfiguration, simulate_loop
+    >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
+    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record.labels, record.frames, 0.0 < record.mean_strehl() < 1.0
+    (('brightest',), 40, True)
+    """
 
     WHAT: ClassVar[str] = "a record of a loop"
 

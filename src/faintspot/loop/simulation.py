@@ -121,6 +121,15 @@ def simulate_loop(
         For a schedule that names arms that are not there, no arms, or parts that do not fit together.
     MissingExtraError
         When HCIPy is not installed.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.loop import Arm, LoopConfiguration, simulate_loop
+    >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
+    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
+    ((40,), (40, 72), True)
     """
     which = _checked_schedule(configuration, arms, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))

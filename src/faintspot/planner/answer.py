@@ -16,6 +16,7 @@ from faintspot.compare.curves import Curve
 from faintspot.compare.statistics import Estimate, SlopeStatistics
 from faintspot.errors import InputError
 from faintspot.estimators.registry import FORMER_NAMES
+from faintspot.notebook import table
 from faintspot.planner.promise import Promise
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration
@@ -65,7 +66,18 @@ class ArmResult:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What `faintspot.planner.tune` found."""
+    """What `faintspot.planner.tune` found.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.planner import Question
+    >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
+    >>> answer = fs.tune(question, realisations=256, steps=1)
+    >>> answer.save("faintspot.toml")
+    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.arm.name
+    True
+    """
 
     question: Question
     curve: Curve
@@ -142,6 +154,17 @@ class Answer:
             read_noise_e=question.read_noise_e,
             background_e=question.background_e,
         )
+
+    def _repr_html_(self) -> str:
+        from faintspot.planner.answer_text import settings_in_words
+
+        rows = {"recommended": f"{self.best.arm.label} ({settings_in_words(self.best.settings)})"}
+        for result in sorted(self.results, key=lambda each: _finite(each.statistics.corrected_rms.value)):
+            rows[result.arm.label] = (
+                f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
+                f"R {result.error_px[self.at_star]:.3g} px"
+            )
+        return table(f"Estimators for a star of {self.question.star_flux_e:.4g} e-", rows)
 
     def __getitem__(self, name: str) -> ArmResult:
         """Return the result of an estimator.

@@ -89,7 +89,15 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class LoopAnswer:
-    """What `faintspot.planner.tune_loop` found."""
+    """What `faintspot.planner.tune_loop` found.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop
+    >>> from faintspot.planner import LoopQuestion, tune_loop
+    >>> answer = tune_loop(LoopQuestion(load_loop("canary")), "loop-tune")  # doctest: +SKIP
+    >>> answer.best.name  # doctest: +SKIP
+    """
 
     question: LoopQuestion
     results: tuple[LoopArmResult, ...]

@@ -54,6 +54,14 @@ class LoopQuestion:
     ------
     InputError
         For values out of range, unknown arms, control that learns in open loop.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop
+    >>> from faintspot.planner import LoopQuestion
+    >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0), arms=["window", "map"])
+    >>> [round(photons) for photons in question.photons(3)]
+    [35, 139, 300]
     """
 
     configuration: LoopConfiguration

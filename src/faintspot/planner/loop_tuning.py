@@ -109,6 +109,13 @@ def tune_loop(
         For a question of the wrong kind, or a folder that holds another question's units.
     MissingExtraError
         When HCIPy, zarr, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop
+    >>> from faintspot.planner import LoopQuestion, tune_loop
+    >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0))
+    >>> answer = tune_loop(question, "loop-tune")  # doctest: +SKIP
     """
     if not isinstance(question, LoopQuestion):
         raise InputError(f"question: expected a LoopQuestion, got {type(question).__name__}")

@@ -39,6 +39,15 @@ class Promise:
 
     Two images of the same spots, whose noises are independent, are made of every frame; half the mean
     difference of their slopes, times sqrt(2), is R without movement.
+
+    Examples
+    --------
+    >>> from faintspot.compare.statistics import Estimate
+    >>> from faintspot.planner import Promise
+    >>> alike, moved = (Estimate(value, 0.002) for value in (0.103, 0.140))
+    >>> promise = Promise(200.0, Estimate(0.100, 0.002), alike, moved, noise_ratio=1.02, promised_px=0.098)
+    >>> print(f"{promise.ratio.value:.2f}", promise.contradicted)
+    1.03 False
     """
 
     flux_e: float
@@ -129,6 +138,14 @@ def check_promise(
     Returns
     -------
     Promise
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.planner import check_promise, question_from_frames
+    >>> question = question_from_frames(frames)  # doctest: +SKIP
+    >>> best = fs.tune(question).best  # doctest: +SKIP
+    >>> check_promise(question, best.arm, best.statistics.error.value).contradicted  # doctest: +SKIP
     """
     pair_rng, *exposures = spawn(np.random.default_rng(1) if rng is None else rng, 3)
     images, fitted = _recorded(question)

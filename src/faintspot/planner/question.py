@@ -102,6 +102,15 @@ class Question:
     ------
     InputError
         For a value that is missing, out of range or contradicts another one.
+
+    Examples
+    --------
+    >>> from faintspot.planner import Question
+    >>> question = Question(
+    ...     read_noise_e=3.0, pixels=8, fwhm_px=1.8, lenslet_m=0.6, frame_rate_hz=150.0, magnitude=11.0
+    ... )
+    >>> round(question.star_flux_e)
+    368
     """
 
     read_noise_e: Any = None

@@ -59,6 +59,20 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
     ------
     InputError
         When something can neither be measured nor is given, and as `Question`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.planner import question_from_frames
+    >>> camera = fs.simulate.Detector(read_noise_e=3.0, gain_e_per_adu=0.5, offset_adu=100.0)
+    >>> layout = fs.Layout.grid((6, 6), pixels=12)
+    >>> frames, _ = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 40, flux_e=300.0, position_range_px=0.5,
+    ...     detector=camera, rng=np.random.default_rng(1),
+    ... )
+    >>> question = question_from_frames(frames, layout=layout)
+    >>> print(f"{question.star_flux_e:.0f} e-, read noise {question.read_noise_e:.1f} e-")
+    294 e-, read noise 2.9 e-
     """
     stack = _stack("frames", frames)
     dark_stack = None if darks is None else _stack("darks", darks)

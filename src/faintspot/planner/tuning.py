@@ -95,6 +95,15 @@ def tune(
     ------
     InputError
         For a question of the wrong kind or numbers out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.planner import Question
+    >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
+    >>> answer = fs.tune(question, realisations=256, steps=1)
+    >>> sorted(result.arm.name for result in answer.results)[:3]
+    ['brightest', 'centroid', 'map']
     """
     if not isinstance(question, Question):
         raise InputError(f"question: expected a faintspot.planner.Question, got {type(question).__name__}")

@@ -63,6 +63,13 @@ class Calibration:
     ------
     InputError
         For a value out of range, or arrays of different shapes.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> emccd = fs.Calibration(dark=200.0, gain_e_per_adu=10.0, em_gain=500.0, read_noise_e=50.0)
+    >>> emccd.read_noise_photoelectrons, emccd.excess_noise
+    (0.1, 2.0)
     """
 
     dark: Any = None

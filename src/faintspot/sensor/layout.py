@@ -61,6 +61,13 @@ class Layout:
     InputError
         For an empty layout, a window that leaves the frame, windows that overlap, a centre far from its
         window, or more than 2^28 pixels or 2^20 lenslets.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+    >>> len(layout), layout.frame_shape, layout.window
+    (36, (112, 112), (16, 16))
     """
 
     frame_shape: tuple[int, int]

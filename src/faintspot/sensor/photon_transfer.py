@@ -139,6 +139,17 @@ def measure_detector(
     ------
     InputError
         When neither frames nor darks are given, or arrays are not finite or do not fit each other.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> rng = np.random.default_rng(1)
+    >>> camera = fs.simulate.Detector(read_noise_e=3.0, gain_e_per_adu=0.5, offset_adu=100.0)
+    >>> darks = camera.expose(np.zeros((20, 64, 64)), rng)
+    >>> lit = camera.expose(np.tile(np.linspace(10.0, 400.0, 64), (100, 64, 1)), rng)
+    >>> found = fs.measure_detector(lit, darks)
+    >>> print(f"read noise {found.read_noise_e:.1f} e-, gain {found.gain_e_per_adu:.2f} e-/ADU")
+    read noise 3.0 e-, gain 0.50 e-/ADU
     """
     multiplication = number_between("em_gain", em_gain, 1.0)
     if frames is None:

@@ -53,6 +53,13 @@ class PSF:
     ------
     InputError
         For samples that are not finite, of the wrong shape or without light, or an index out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> psf = fs.PSF.analytic(size=1.0)
+    >>> print(psf.fwhm_px.round(2))
+    [[1.87 1.87]]
     """
 
     samples: Any

@@ -62,6 +62,15 @@ class Detector:
     ------
     InputError
         When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> emccd = fs.simulate.Detector(50.0, em_gain=500.0, gain_e_per_adu=10.0, offset_adu=200.0, bits=14)
+    >>> adu = emccd.expose(np.full((1000, 8, 8), 3.0), np.random.default_rng(1))
+    >>> electrons = emccd.to_electrons(adu)
+    >>> print(f"{adu.dtype}: mean {electrons.mean():.1f}, variance {electrons.var():.1f} e-")
+    uint16: mean 3.0, variance 5.9 e-
     """
 
     read_noise_e: float | NDArray[np.float64] = 0.1

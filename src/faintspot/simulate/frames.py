@@ -75,6 +75,15 @@ def subapertures(
     ------
     InputError
         When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> images, truth = fs.simulate.subapertures(1000, flux_e=50.0, rng=np.random.default_rng(1))
+    >>> images.shape, truth.shape
+    ((1000, 16, 16), (1000, 2))
+    >>> round(float(images.sum((1, 2)).mean()))
+    50
     """
     n = int(number_between("n", n, 1, integer=True))
     ny, nx = image_shape("shape", shape)
@@ -169,6 +178,14 @@ def sensor_frames(
     ------
     InputError
         When a value is not finite, out of its range or of the wrong shape, or a window leaves the frame.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> grid = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5)
+    >>> frames, truth = fs.simulate.sensor_frames(grid.corners, grid.window, grid.frame_shape, 10)
+    >>> frames.shape, truth.shape
+    ((10, 112, 112), (10, 37, 2))
     """
     n_frames = int(number_between("n_frames", n_frames, 1, integer=True))
     rows, columns = image_shape("frame_shape", frame_shape)

@@ -126,6 +126,15 @@ def spots(
     ------
     InputError
         When a value is not finite or out of its range, or an array has another shape.
+
+    Examples
+    --------
+    >>> from faintspot.simulate import spots
+    >>> print(spots([[0.0, 0.0]], shape=(4, 4), flux_e=100.0, profile="gaussian").round(1)[0])
+    [[ 1.2  4.2  4.2  1.2]
+     [ 4.2 14.5 14.5  4.2]
+     [ 4.2 14.5 14.5  4.2]
+     [ 1.2  4.2  4.2  1.2]]
     """
     kind = _PROFILES[one_of("profile", profile, list(_PROFILES))]
     shapes = _spot_shapes(positions, flux_e, size, elongation, angle_deg, kind)

@@ -98,6 +98,16 @@ def speckled_spots(
     ------
     InputError
         When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from faintspot.simulate import speckled_spots
+    >>> rng = np.random.default_rng(1)
+    >>> sharp, _ = speckled_spots(100, d_over_r0=0.0, positions=np.zeros((100, 2)), rng=rng)
+    >>> speckled, _ = speckled_spots(100, d_over_r0=3.0, positions=np.zeros((100, 2)), rng=rng)
+    >>> round(float(speckled.max((1, 2)).mean() / sharp.max((1, 2)).mean()), 1)
+    0.5
     """
     n = int(number_between("n", n, 1, integer=True))
     which = one_of("truth", truth, _TRUTHS)

@@ -99,6 +99,15 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
     dict
         The variables of the study's dataset for this cell, see `faintspot.study.store.VARIABLES`, without
         the dimension cell; K = pixels^2 - 1. NaN in modes that keep more pixels than the window can.
+
+    Examples
+    --------
+    >>> from faintspot.study import StudySpecification, Sweep, measure_cell
+    >>> light = Sweep("light", flux_e=100, pixels=8)
+    >>> study = StudySpecification("mine", [light], realisations=400, arms=["brightest"], fixed_k=[])
+    >>> measured = measure_cell(study.cells()[0], study)
+    >>> print(f"R = {measured['error'][0, 0]:.2f} px, {measured['chosen_k'][0, 0]:.0f} pixels kept")
+    R = 0.07 px, 12 pixels kept
     """
     return results_of(cell, specification, score_cell(cell, specification))
 

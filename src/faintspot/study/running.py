@@ -65,6 +65,15 @@ def run(
         for a study on a GPU without one, with a scheduler, or with images of more than 32 x 32 pixels.
     MissingExtraError
         When Dask or, for a GPU, numba-cuda is needed and not installed.
+
+    Examples
+    --------
+    >>> from faintspot.study import StudySpecification, Sweep, run
+    >>> light = Sweep("light", flux_e=[30, 100], pixels=8)
+    >>> study = StudySpecification("mine", [light], realisations=200, arms=["brightest"], fixed_k=[])
+    >>> results = run(study, workers=0)
+    >>> dict(results.sizes)
+    {'cell': 2, 'arm': 1, 'mode': 1, 'arm2': 1, 'k': 63}
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")

@@ -82,6 +82,14 @@ class StudySpecification:
     InputError
         For a value out of its range, an empty list, an unknown arm, two sweeps of one name, a `fixed_k`
         that no window of the study has enough pixels for.
+
+    Examples
+    --------
+    >>> from faintspot.study import StudySpecification, Sweep
+    >>> light = Sweep("light", flux_e=[30, 100])
+    >>> study = StudySpecification("mine", [light], realisations=200, arms=["brightest", "tv"])
+    >>> len(study.cells()), study.modes
+    (2, ('best', 'fixed20', 'fixed40', 'fixed60'))
     """
 
     name: str

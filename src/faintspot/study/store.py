@@ -110,6 +110,16 @@ def open_study(path: str | Path) -> xarray.Dataset:
     ------
     InputError
         When there is no study, or the store is damaged.
+
+    Examples
+    --------
+    >>> from faintspot.study import StudySpecification, Sweep, open_study, run
+    >>> light = Sweep("light", flux_e=[30, 100], pixels=8)
+    >>> study = StudySpecification("mine", [light], realisations=200, arms=["brightest"], fixed_k=[])
+    >>> _ = run(study, "mine.zarr", workers=0)
+    >>> results = open_study("mine.zarr")
+    >>> bool(results["done"].all()), results["error"].dims
+    (True, ('cell', 'arm', 'mode'))
     """
     path = Path(path)
     attributes = study_attributes(path)

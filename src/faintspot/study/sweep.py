@@ -67,6 +67,13 @@ class Cell:
     d_over_r0 : float
         Side of the sub-aperture in units of the Fried parameter: above 0 turbulence speckles the spots, see
         `faintspot.simulate.subapertures`.
+
+    Examples
+    --------
+    >>> from faintspot.study import Sweep
+    >>> cell = list(Sweep("light", flux_e=[30, 100], pixels=8).cells())[0]
+    >>> cell.flux_e, cell.pixels, round(cell.pixel_noise_e, 2)
+    (30.0, 8, 0.69)
     """
 
     flux_e: float
@@ -120,6 +127,13 @@ class Sweep:
     InputError
         For a value out of its range, an empty sequence, an unknown profile, turbulence with other spots than
         round ones of profile "diffraction".
+
+    Examples
+    --------
+    >>> from faintspot.study import Sweep
+    >>> sweep = Sweep("light", flux_e=[30, 100, 300], read_noise_e=[0.1, 3.0], pixels=8)
+    >>> sweep.n_cells
+    6
     """
 
     name: str

@@ -191,6 +191,16 @@ def train_from_frames(
     ------
     InputError
         For images that are not finite or without light, too few images, or a value out of range.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.training import train_from_frames
+    >>> images, _ = fs.simulate.subapertures(4000, shape=(8, 8), flux_e=200.0, rng=np.random.default_rng(1))
+    >>> camera = fs.Calibration(read_noise_e=0.1)
+    >>> score = train_from_frames(images[:, None], camera, rng=np.random.default_rng(2))
+    >>> print(score.standard_error(200.0).round(2))
+    [[0.06 0.06]]
     """
     stack, home = _images_and_reference(images, calibration, layout, reference)
     half = 0.5 * max(stack.shape[2:]) if search_range_px is None else search_range_px

@@ -222,6 +222,16 @@ def train_estimator(
     ------
     InputError
         When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> rng = np.random.default_rng(1)
+    >>> score = fs.train_estimator(flux_e=50.0, shape=(8, 8), realisations=4000, rng=rng)
+    >>> print(score.standard_error(50.0).round(2))
+    [[0.11 0.11]]
+    >>> layout, settings = fs.Layout.grid((7, 7), pixels=8), fs.Settings("trained", flux_e=50.0)
+    >>> pipeline = fs.SlopePipeline(layout, settings, score=score)
     """
     spot_shapes, index = _kinds_of_spots(size, elongation, angle_deg)
     training = _checked_training(

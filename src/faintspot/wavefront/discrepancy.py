@@ -18,7 +18,23 @@ _NEGLIGIBLE = 1e-9  # of the largest singular value
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What of the slopes is not the gradient of any wavefront."""
+    """What of the slopes is not the gradient of any wavefront.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.wavefront import slope_discrepancy
+    >>> rng = np.random.default_rng(1)
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5)
+    >>> frames, _ = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 200, position_range_px=0.0, rng=rng
+    ... )
+    >>> settings = fs.Settings("window", flux_e=100.0, spot_fwhm_px=1.8)
+    >>> slopes = fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=0.1))(frames)
+    >>> discrepancy = slope_discrepancy(slopes, layout)
+    >>> discrepancy.rms_px.shape, discrepancy.degrees_of_freedom
+    ((200,), 24)
+    """
 
     rms_px: Floats
     """(n_frames,): per slope that could be compared, so that noise alone gives its own rms."""
@@ -52,6 +68,21 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     ------
     InputError
         When slopes and layout do not fit together, or every combination of slopes is that of a wavefront.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.wavefront import slope_discrepancy
+    >>> rng = np.random.default_rng(1)
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5)
+    >>> frames, _ = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 200, position_range_px=0.0, rng=rng
+    ... )
+    >>> settings = fs.Settings("window", flux_e=100.0, spot_fwhm_px=1.8)
+    >>> slopes = fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=0.1))(frames)
+    >>> discrepancy = slope_discrepancy(slopes, layout)
+    >>> print(f"{discrepancy.ratio:.1f} times what noise leaves")
+    1.0 times what noise leaves
     """
     if layout.geometry != "square":
         raise InputError(f"layout.geometry: expected 'square' for a discrepancy, got {layout.geometry!r}")

@@ -36,6 +36,18 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
         When the ending is another, or the file cannot be written.
     MissingExtraError
         When astropy is needed and not installed.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> from faintspot.wavefront import save_wavefront
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
+    >>> frames, _ = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
+    ... )
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
+    >>> save_wavefront("wavefront.csv", fs.fit_wavefront(slopes, layout, modes=5))
     """
     path = Path(path)
     check_ending(path)

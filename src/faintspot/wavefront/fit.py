@@ -31,6 +31,21 @@ class Wavefront:
     The wavefront is the path by which light arrives late or early, less its mean, and grows towards where
     spots are displaced to. All is over the whole disk of the pupil: a central obscuration has no modes of its
     own.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
+    >>> frames, _ = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
+    ... )
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
+    >>> wavefront = fs.fit_wavefront(slopes, layout, modes=5)
+    >>> wavefront.modes.tolist(), wavefront.coefficients.shape
+    ([2, 3, 4, 5, 6], (5, 5))
+    >>> print(f"tip {wavefront.mean[0]:.0f} {wavefront.unit}")
+    tip 774 nm
     """
 
     modes: NDArray[np.int64]
@@ -134,6 +149,20 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     InputError
         When slopes and layout do not fit together, no slope is valid, or the valid sub-apertures cannot tell
         so many modes apart.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
+    >>> frames, _ = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
+    ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
+    ... )
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
+    >>> wavefront = fs.fit_wavefront(slopes, layout, modes=5)
+    >>> tip, *others = wavefront.mean
+    >>> print(f"tip {tip:.0f} nm, no other mode more than {np.abs(others).max():.0f} nm")
+    tip 774 nm, no other mode more than 5 nm
     """
     x, y, valid = (np.atleast_2d(getattr(slopes, name)) for name in ("x", "y", "valid"))
     if x.ndim != 2 or x.shape[1] != len(layout):

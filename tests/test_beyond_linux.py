@@ -1,0 +1,91 @@
+"""What is not real time imports and works without what only Linux has; real time says that it needs Linux."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected, simulated
+
+from faintspot import InputError, extras
+from faintspot.cli.realtime import command as realtime
+
+SCRIPT = Path(__file__).with_name("beyond_linux.py")
+STUDY = """
+name = "small"
+realisations = 200
+
+[sweeps.flux]
+flux_e = [30, 100]
+"""
+OF_RECORDINGS = {"learn", "advise", "export"}
+
+
+def test_everything_imports_and_what_is_not_real_time_works(tmp_path: Path) -> None:
+    for package in ("hcipy", "pyshmem", "specula", "tornado", "xarray"):
+        pytest.importorskip(package)
+    frames = simulated()
+    np.save(tmp_path / "frames.npy", frames)
+    (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
+    (tmp_path / "study.toml").write_text(STUDY)
+    commands = (
+        "doctor",
+        "slopes frames.npy --config faintspot.toml -o slopes.zarr",
+        "tune --read-noise-e 3 --pixels 8 --fwhm-px 1.8 --flux-e 200 -o tuned.toml",
+        "study run study.toml --workers 2",
+        "realtime run",
+    )
+    done = subprocess.run(
+        [sys.executable, SCRIPT, *commands],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        stdin=subprocess.DEVNULL,
+    )
+    assert "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1] == "faintspot: error: faintspot realtime run needs Linux"
+    assert done.returncode == 2
+    assert int(done.stdout.split()[0]) > 400  # modules
+    assert "no /dev/shm" in done.stdout
+    assert "no real-time scheduling" in done.stdout
+    assert "cannot be found out" not in done.stdout
+    assert_equal(tmp_path / "slopes.zarr", expected(frames))
+    assert (tmp_path / "tuned.toml").exists()
+    assert "400/400" in done.stderr  # realisations of the study, in two processes
+
+
+def real_time_commands(group: click.Group) -> Iterator[tuple[str, click.Command]]:
+    """Return the commands that cannot do without Linux, with their names."""
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from real_time_commands(command)
+        elif name not in OF_RECORDINGS:
+            yield name, command
+
+
+def test_real_time_needs_linux(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert isinstance(realtime, click.Group)
+    commands = dict(real_time_commands(realtime))
+    assert {"run", "camera", "record", "close"} <= set(commands)
+    monkeypatch.delattr(os, "sched_setscheduler", raising=False)
+    for name, command in commands.items():
+        assert command.callback is not None
+        with click.Context(command, info_name=name), pytest.raises(InputError, match=f"^{name} needs Linux$"):
+            command.callback()
+
+
+def test_the_other_ways_into_real_time_say_so_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    run = Commands(capsys)
+    monkeypatch.setattr(extras, "SHARED_MEMORY", tmp_path / "none")
+    for line in ("live", "demo --live", "realtime advise"):
+        run.refused(*line.split(), naming=("needs shared memory", "which Linux has"))

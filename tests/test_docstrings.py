@@ -1,0 +1,66 @@
+"""Every public name has an example in its docstring, and the examples say what happens."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from faintspot.estimators import estimators, registry
+
+PAGES = Path(__file__).resolve().parents[1] / "docs/reference/modules"
+ROOMS = ["faintspot", *(f"faintspot.{page.stem}" for page in sorted(PAGES.glob("*.md")))]
+WITHOUT_EXAMPLE = {
+    "faintspot.SubapertureFlag": "in that of Slopes",
+    "faintspot.estimators.Sensor": "made by a pipeline, in that of Estimator",
+}
+NEEDED = {
+    "simulate_loop": ("hcipy",),
+    "LoopRecord": ("hcipy",),
+    "run": ("xarray",),
+    "open_study": ("xarray", "zarr"),
+}
+"""Packages of extras that examples need."""
+
+
+def public_names() -> dict[str, Any]:
+    """Return all classes and functions that the reference shows, by where they are shown first."""
+    found: dict[int, tuple[str, Any]] = {}
+    for room in ROOMS:
+        module = importlib.import_module(room)
+        for name in getattr(module, "__all__", dir(module)):
+            item = getattr(module, name)
+            documented = inspect.isclass(item) or inspect.isfunction(item)
+            if documented and not name.startswith("_") and item.__module__.startswith("faintspot"):
+                found.setdefault(id(item), (f"{room}.{name}", item))
+    return dict(found.values())
+
+
+NAMES = public_names()
+
+
+def test_public_names_have_examples() -> None:
+    assert len(NAMES) > 80
+    without = {name for name, item in NAMES.items() if ">>>" not in (inspect.getdoc(item) or "")}
+    assert without == set(WITHOUT_EXAMPLE)
+
+
+@pytest.mark.parametrize("name", [*sorted(NAMES.keys() - WITHOUT_EXAMPLE.keys()), "faintspot.doctor.examine"])
+def test_examples(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    room, _, short = name.rpartition(".")
+    for package in NEEDED.get(short, ()):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_kinds", estimators())  # a copy: an example registers one of its own
+    item = getattr(importlib.import_module(room), short)
+    said: list[str] = []
+    runner = doctest.DocTestRunner()
+    found = doctest.DocTestFinder().find(item, name)
+    assert any(each.examples for each in found)
+    for each in found:
+        runner.run(each, out=said.append)
+    assert not runner.failures, "".join(said)
