@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from benchmarks.live_page import client, page, read
 from benchmarks.measuring import Row, Table
 from benchmarks.realtime_processes import resident_bytes
+from faintspot.control.configuration import save_control
 from faintspot.errors import InputError
 from faintspot.live_page.demonstration import LiveDemonstration
 from faintspot.loop import LoopConfiguration, load_loop
@@ -146,9 +147,14 @@ def observe(name: str, folder: Path) -> None:
         sky.commands.close()
 
 
+def _ask(name: str, command: str, **fields: Any) -> dict[str, Any]:
+    """Ask the engine, with the patience that a busy machine needs."""
+    return request(socket_path(name), command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
+
+
 def _counted(name: str) -> int:
     """Return how many frames the engine says that it has measured or lost."""
-    counters = request(socket_path(name), "status")["counters"]
+    counters = _ask(name, "status")["counters"]
     return int(counters["processed"] + counters["dropped"])
 
 
@@ -179,7 +185,7 @@ class Changes:
 
     def next(self) -> None:
         """See how the loop is, and change something."""
-        loop = request(socket_path(self._name), "loop", action="status")["loop"]
+        loop = _ask(self._name, "loop", action="status")["loop"]
         state = loop["state"] if loop["opened_because"] is None else f"open ({loop['opened_because']})"
         self.states[state] = self.states.get(state, 0) + 1
         kind = next(self._kinds)
@@ -190,18 +196,16 @@ class Changes:
             self.refused[kind] = self.refused.get(kind, 0) + 1
 
     def _change(self, kind: str) -> None:
-        path = socket_path(self._name)
         if kind == "set":
-            request(path, "set", timeout_s=LENGTHY_TIMEOUT_S, changes={"flux_e": next(self._light)})
+            _ask(self._name, "set", changes={"flux_e": next(self._light)})
         elif kind == "refused":
-            request(path, "set", timeout_s=LENGTHY_TIMEOUT_S, changes={"flux_e": -1.0})
+            _ask(self._name, "set", changes={"flux_e": -1.0})
         elif kind == "gain":
-            request(path, "loop", action="gain", gain=next(self._gains))
+            _ask(self._name, "loop", action="gain", gain=next(self._gains))
         elif kind == "arms":
-            arms = next(self._turns)
-            request(path, "interleave", timeout_s=LENGTHY_TIMEOUT_S, arms=arms, every=TURN_FRAMES)
+            _ask(self._name, "interleave", arms=next(self._turns), every=TURN_FRAMES)
         else:
-            request(path, "loop", action="open" if kind == "opened" else "close")
+            _ask(self._name, "loop", action="open" if kind == "opened" else "close")
 
 
 async def _watch(
@@ -217,7 +221,7 @@ async def _watch(
         await asyncio.to_thread(changes.next)
         if time.monotonic() - looked > LOOK_S and sky.poll() is None:
             looked = time.monotonic()
-            frames = request(socket_path(name), "status")["counters"]["frames_in"]
+            frames = _ask(name, "status")["counters"]["frames_in"]
             looks.append((frames, {process: held(pid) for process, pid in pids.items()}))
             print(json.dumps(looks[-1]), flush=True)
     for task in reading:
@@ -257,6 +261,7 @@ def run() -> list[Table]:
     with tempfile.TemporaryDirectory() as place:
         shown = LiveDemonstration(Path(place), PHOTONS, RATE_HZ, name, 0, 1)
         _, configuration = shown.write_files()
+        save_control(configuration, largest_residual_px=_LARGEST_PX)  # lost frames are no reason to open it
         arms = list(shown.arms.values())
         turns = ["--interleave", ",".join(arms), "--every", str(TURN_FRAMES), "--images-every", "20"]
         command = ["faintspot", "realtime", "run", "--config", str(configuration), "--name", name, *turns]
@@ -269,7 +274,7 @@ def run() -> list[Table]:
                 looks, updates = asyncio.run(_watch(url, changes, sky, pids, name))
                 assert sky.stdout is not None
                 seen = json.loads(sky.stdout.read())
-                status = request(socket_path(name), "status")
+                status = _ask(name, "status")
     return _tables(seen, status, looks, changes, updates)
 
 
