@@ -32,7 +32,9 @@ _ORDER = (
     "live_page",
     "latency",
     "realtime_sustained",
+    "closed_loop_long",
     "pyrtc",
+    "pyrtc_loop",
     "loop",
     "control",
     "study",
@@ -41,8 +43,8 @@ _ORDER = (
     "schedules",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained", "schedules"}
-"""Run only when named, or with --full: 12 and 30 minutes."""
+LONG = {"realtime_sustained", "closed_loop_long", "schedules"}
+"""Run only when named, or with --full: 12, 40 and 30 minutes."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",

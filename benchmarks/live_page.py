@@ -40,8 +40,8 @@ def run() -> list[Table]:
     engine = ["--images-every", "30"]
     with engine_and_camera({**SMALL, **USUAL}, camera, engine) as processes:
         processes.until_processed(3 * RATE_HZ)
-        with _page(processes.name) as (page, url):
-            latencies, updates_hz = asyncio.run(_turns(processes.name, page, url))
+        with page(processes.name) as (server, url):
+            latencies, updates_hz = asyncio.run(_turns(processes.name, server, url))
     rows = []
     for name, percent in PERCENTILES.items():
         times: Times = {
@@ -69,18 +69,18 @@ def run() -> list[Table]:
 
 
 async def _turns(
-    name: str, page: subprocess.Popen[str], url: str
+    name: str, server: subprocess.Popen[str], url: str
 ) -> tuple[dict[str, list[NDArray[np.float64]]], float]:
     """Return latencies (us) of every turn by arm, and how often a client was told of new frames."""
     reader = TelemetryReader.attach(name)
-    clients = [await _client(url) for _ in range(READING + SLOW)]
+    clients = [await client(url) for _ in range(READING + SLOW)]
     counts = [0] * READING
-    reading = [asyncio.ensure_future(_read(client, counts, i)) for i, client in enumerate(clients[:READING])]
+    reading = [asyncio.ensure_future(read(each, counts, i)) for i, each in enumerate(clients[:READING])]
     found: dict[str, list[NDArray[np.float64]]] = {"alone": [], "watched": []}
     watched_s, updates = 0.0, 0
     for turn in range(2 * TURNS):
         arm = "watched" if turn % 2 else "alone"
-        os.kill(page.pid, signal.SIGCONT if arm == "watched" else signal.SIGSTOP)
+        os.kill(server.pid, signal.SIGCONT if arm == "watched" else signal.SIGSTOP)
         await asyncio.sleep(0.5)  # the page takes up what it missed
         before, cursor = sum(counts), reader.newest
         await asyncio.sleep(TURN_S)
@@ -91,38 +91,38 @@ async def _turns(
             updates += sum(counts) - before
     for task in reading:
         task.cancel()
-    for client in clients:
-        client.close()
+    for each in clients:
+        each.close()
     reader.close()
     return found, updates / READING / watched_s
 
 
-async def _client(url: str) -> WebSocketClientConnection:
+async def client(url: str) -> WebSocketClientConnection:
     """Open a web socket as the page does; one that is not read takes no more than one message."""
     host = urlsplit(url).netloc
     request = HTTPRequest(f"ws://{host}/stream", headers={"Origin": f"http://{host}"})
-    client = await websocket_connect(request, max_message_size=1 << 26)
-    await client.write_message(json.dumps({"do": "hello"}))
-    return client
+    opened = await websocket_connect(request, max_message_size=1 << 26)
+    await opened.write_message(json.dumps({"do": "hello"}))
+    return opened
 
 
-async def _read(client: WebSocketClientConnection, counts: list[int], place: int) -> None:
+async def read(connection: WebSocketClientConnection, counts: list[int], place: int) -> None:
     """Read for ever, and count the messages that say what the newest frame is."""
-    while (message := await client.read_message()) is not None:
+    while (message := await connection.read_message()) is not None:
         counts[place] += isinstance(message, bytes) and b'"kind": "now"' in message[:40]
 
 
 @contextmanager
-def _page(name: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def page(name: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Serve the page of an engine; return its process and address."""
     command = [sys.executable, "-m", "faintspot", "live", "--name", name, "--port", "0"]
-    page = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
-        assert page.stdout is not None
-        url = page.stdout.readline().strip()
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
         time.sleep(2.0)  # it has imported all that it needs
-        yield page, url
+        yield server, url
     finally:
-        page.send_signal(signal.SIGCONT)
-        page.terminate()
-        page.communicate()
+        server.send_signal(signal.SIGCONT)
+        server.terminate()
+        server.communicate()

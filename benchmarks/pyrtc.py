@@ -87,7 +87,7 @@ dark = {LEVEL_ADU}
 read_noise_e = 2.0
 """
 _PATIENCE_S = 120.0
-_MISSING = "pyrtcao and pyshmem are not installed: nothing to compare with"
+MISSING = "pyrtcao and pyshmem are not installed: nothing to compare with"
 
 
 def frames(count: int = 8) -> tuple[fs.Layout, NDArray[np.uint16]]:
@@ -348,7 +348,7 @@ def _streams() -> Table:
 def run() -> list[Table]:
     """Compare, where pyRTC is installed."""
     if not all(importlib.util.find_spec(package) for package in ("pyrtc", "pyshmem")):
-        return [Table("pyrtc", "pyRTC", [], [_MISSING])]
+        return [Table("pyrtc", "pyRTC", [], [MISSING])]
     return [_alone(), _streams()]
 
 

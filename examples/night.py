@@ -8,8 +8,8 @@ night and comes back, the seeing goes from 0.6 to 1.2 arcsec and back three time
 - a loop that begins with the first ones, asks itself for advice in every stretch as
   `faintspot realtime advise --apply` does, tries it in turn with what it has, and keeps what leaves less.
 
-The trials count, and take more than half of every stretch here. All follow the light. Some ten minutes on two
-processors that are free:
+The trials count; they take more than half of a stretch here, where they do not end early because what is
+tried is worse. All follow the light. Some ten minutes on two processors that are free:
 
     python examples/night.py [--stretches 10] [--frames 1000] [--nights 2]
 """
@@ -146,9 +146,15 @@ def tuned_night(
         arms = [present, arm(*other, loop)]
         turns = np.concatenate([np.zeros(LEARN, np.int64), np.arange(frames) // TURN % 2])
         record = observed(loop, frames, arms, turns, offset + number)
-        better = verdict(record, arms, loop, modes, turns)
-        told = "kept" if better.kept else "taken back"
-        journal.append(f"stretch {number}: {proposal.text}: {told} ({better.in_words(unit)})")
+        for end in range(LEARN + 4 * TURN, frames, 2 * TURN):
+            better = verdict(record, arms, loop, modes, turns, end)
+            if better.worse:  # it ends here, and the present settings have the rest
+                turns[end:] = 0
+                record = observed(loop, frames, arms, turns, offset + number)
+                break
+        else:
+            end, better = frames, verdict(record, arms, loop, modes, turns, frames)
+        journal.append(f"stretch {number}, {end - LEARN} frames: {proposal.text}: {better.in_words(unit)}")
         if better.kept:
             settings, gain = other
         strehl.append(float(record.strehl[record.scored].mean()))
@@ -163,12 +169,15 @@ def planned(images: Any, seen: Seen, sensor: Sensor, present: LoopArm, answers: 
     return new_estimators(present.settings, sensor, images, known[0].value, psf, rms, answers)
 
 
-def verdict(record: Any, arms: list[LoopArm], loop: LoopConfiguration, modes: Any, turns: Any) -> Any:
-    """Say which of two arms in turn has left less."""
-    seen = seen_in_record(record, arms)
+def verdict(
+    record: Any, arms: list[LoopArm], loop: LoopConfiguration, modes: Any, turns: Any, end: int
+) -> Any:
+    """Say which of two arms in turn has left less before a frame."""
+    whole = seen_in_record(record, arms)
+    seen = whole.chosen(np.arange(len(whole)) < end - SETTLE)
     gains = []
     for number, each in enumerate(arms):
-        own = [k for k in range(LEARN, record.frames, IMAGES_EVERY) if turns[k] == number]
+        own = [k for k in range(LEARN, end, IMAGES_EVERY) if turns[k] == number]
         pipeline = sensor_of(loop, each.settings).pipeline(each.settings)
         gains.append(shifted_gain(pipeline, frames_of_record(record, own)))
     same = arms[0].settings == arms[1].settings

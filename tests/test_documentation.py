@@ -1,4 +1,4 @@
-"""Every block of Python in README and docs runs, with what its page takes for granted."""
+"""Every block of Python in README and docs runs, with what its page takes for granted; tables are whole."""
 
 from __future__ import annotations
 
@@ -108,8 +108,18 @@ def write_slopes(path: Path, frames: Any, layout: fs.Layout, calibration: fs.Cal
 @pytest.mark.parametrize("page", blocks())
 def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
     for number, code in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
+        compiled = compile(code, f"{page.name}, block {number}", "exec")  # also what is not run is Python
         if not any(mark in code for mark in NOT_RUN):
-            exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+            exec(compiled, names)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_tables_have_a_head(page: Path) -> None:
+    """A blank line within a table would leave its other half as text."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    tables = [table.splitlines() for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)]
+    headless = [rows[0] for rows in tables if len(rows) < 2 or not re.fullmatch(r"[|\s:-]+", rows[1])]
+    assert headless == []
 
 
 def test_what_is_not_run_is_there() -> None:

@@ -41,6 +41,7 @@ class TestAgainstOracle:
         case = random_case(seed, estimator)
         assert_equals_oracle(case, case.measure())
 
+    @pytest.mark.portable
     @given(seed=SEEDS)
     @settings(max_examples=4)
     def test_random_spots_with_a_prior(self, seed: int) -> None:
@@ -61,7 +62,12 @@ class TestAgainstOracle:
 
     # Each is compiled anew: at 8 lanes the families, at the ends all.
     @pytest.mark.parametrize(
-        ("width", "estimator"), [*product((4, 16), QUICK), *product((8,), ("tv", "window", "ml", "trained"))]
+        ("width", "estimator"),
+        [
+            *(pytest.param(4, name, marks=pytest.mark.portable) for name in QUICK),
+            *product((8,), ("tv", "window", "ml", "trained")),
+            *product((16,), QUICK),
+        ],
     )
     def test_any_simd_width(self, estimator: str, width: int) -> None:
         case = random_case(width, estimator, n=7)
@@ -98,6 +104,7 @@ class TestAgainstOracle:
             np.testing.assert_allclose(found, expected, rtol=1e-4)  # float32 sums of a few hundred pixels
 
 
+@pytest.mark.portable
 class TestIndependence:
     """Slopes are the same bit by bit."""
 

@@ -78,4 +78,6 @@ def test_only_whole_turns_count() -> None:
     one = seen.chosen(seen.arm == 0)
     assert len(np.unique(one.turn)) == 5
     assert np.isnan(compared_residual(one, left[seen.arm == 0]).value)
+    few = np.where(seen.turn > 2, np.nan, left)  # where frames are lost, most turns may have nothing
+    assert compared_residual(seen, few).count < compared_residual(seen, left).count
     assert np.isnan(compared_residual(replace(seen, turn=np.zeros(600, np.int64)), left).value)

@@ -18,6 +18,7 @@ from faintspot.kernels.cached import cache_folder, kernel_cache
 @pytest.fixture(autouse=True)
 def _nothing_said_yet() -> None:
     cached._warn_once.cache_clear()
+    cached._tell_once.cache_clear()
 
 
 def plus_one(number: Any) -> Any:
@@ -96,3 +97,15 @@ def test_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = cache_folder()
     assert folder is not None
     assert folder.is_relative_to(tmp_path)
+
+
+def test_says_once_that_it_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "faintspot.kernels.cached")
+    compiled = dispatcher(tmp_path, monkeypatch)
+    assert (compiled(1), compiled(1.5)) == (2, 2.5)
+    assert [record.getMessage().split()[0] for record in caplog.records] == ["compiling"]
+    cached._tell_once.cache_clear()
+    assert dispatcher(tmp_path, monkeypatch)(1) == 2
+    assert len(caplog.records) == 1

@@ -8,6 +8,8 @@ from tests.estimate.image_cases import refused
 
 from faintspot.kernels.host import WIDTHS, aligned_zeros, lanes_for
 
+pytestmark = pytest.mark.portable
+
 
 def test_float64_has_half_the_lanes() -> None:
     for width in WIDTHS:

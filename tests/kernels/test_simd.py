@@ -25,6 +25,8 @@ from faintspot.kernels.simd import (
     width_of,
 )
 
+pytestmark = pytest.mark.portable
+
 
 @njit(error_model="numpy")
 def _apply_all(lanes: Any, a: Any, b: Any, results: Any) -> Any:

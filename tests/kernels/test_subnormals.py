@@ -12,6 +12,8 @@ import faintspot as fs
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
+pytestmark = pytest.mark.portable
+
 TINY = np.float32(1e-39)
 
 

@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 
 import faintspot
-from faintspot import Layout
+from faintspot import Calibration, Layout
 from faintspot.cli.realtime_camera import camera
 from faintspot.errors import InputError
 from faintspot.realtime import camera as camera_module
@@ -243,6 +243,27 @@ def test_command(config: Path, name: str) -> None:
     assert "overruns" in last
     assert not (FOLDER / name).exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_the_camera_is_the_one_that_the_configuration_describes(
+    config: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the engine, which has the same file, would take a level of 0 for -100 ADU: no light."""
+    seen: list[Detector] = []
+
+    def enough(*_: object, detector: Detector, **options: object) -> None:
+        seen.append(detector)
+        raise InputError("it is known")
+
+    monkeypatch.setattr(camera_module, "Camera", enough)
+    Calibration(100.0, gain_e_per_adu=0.5, em_gain=20.0, read_noise_e=30.0).save(config)
+    options = ["--config", str(config), "--name", name]
+    for more in ([], ["--offset-adu", "0", "--gain", "2", "--em-gain", "1", "--read-noise-e", "0"]):
+        assert CliRunner().invoke(camera, [*options, *more]).exit_code == 1
+    configured, given = seen
+    assert (configured.offset_adu, configured.gain_e_per_adu) == (100.0, 0.5)
+    assert (configured.em_gain, configured.read_noise_e) == (20.0, 30.0)
+    assert (given.offset_adu, given.gain_e_per_adu, given.em_gain, given.read_noise_e) == (0, 2, 1, 0)
 
 
 def test_command_refuses(config: Path, name: str) -> None:

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import faintspot as fs
+from faintspot.kernels.ordered import store
 from faintspot.realtime.frame_path import FramePath, Progress, last_rows_of_groups
 from faintspot.realtime.workers import Workers
 
@@ -21,6 +22,7 @@ SETTINGS = {
     "tv": fs.Settings(noise_std=1.0, keep_brightest=9),
     "fast": fs.Settings(noise_std=1.0, keep_brightest=9, preset="fast"),
     "plain": fs.Settings("brightest", keep_brightest=9),
+    "thresholded": fs.Settings("thresholded", threshold_e=2.0),
     "ml": fs.Settings(estimator="ml", search_range_px=1.5),
     "map": fs.Settings(estimator="map", flux_e=200.0),
 }
@@ -56,11 +58,11 @@ class Source:
 
     def write(self, number: int, frame: NDArray[Any], block: int = 5, pause_s: float = 0.0) -> None:
         slot = self.slots[number % SLOTS]
-        self.cells[1] = 0
-        self.cells[0] = number
+        store(self.cells, 1, 0)
+        store(self.cells, 0, number)
         for row in range(0, len(frame), block):
             slot[row : row + block] = frame[row : row + block]
-            self.cells[1] = min(row + block, len(frame))
+            store(self.cells, 1, min(row + block, len(frame)))
             time.sleep(pause_s)
 
 
@@ -95,6 +97,7 @@ def test_float_frames() -> None:
     assert_same(path.slopes, pipeline("tv")(data), 0)
 
 
+@pytest.mark.portable
 def test_a_frame_that_has_passed_counts_as_there() -> None:
     data, source = frames(2), Source()
     source.write(0, data[0])
@@ -104,6 +107,7 @@ def test_a_frame_that_has_passed_counts_as_there() -> None:
     assert_same(path.slopes, pipeline("plain")(data), 0)
 
 
+@pytest.mark.portable
 def test_waiting_ends_when_told() -> None:
     """Half of a frame arrives, and no more: the path stops, keeps what it has, and can go on."""
     data, source = frames(1), Source()

@@ -1,8 +1,10 @@
-"""What goes wrong around a closed loop: clocks that jump, and a stream of commands that is taken away."""
+"""What goes wrong around a closed loop: clocks, a stream of commands that is taken away, a full disk."""
 
 from __future__ import annotations
 
 import os
+import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 
 from faintspot.control.configuration import Control
+from faintspot.io import read_telemetry
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.shared_streams import _base
 
@@ -60,12 +63,13 @@ def test_the_clock_jumps(
     assert sky.loop.latencies.largest_ns < PATIENCE_S * 1e9
 
 
-def frames_until(sky: Sky, condition: Callable[[], bool]) -> None:
+def frames_until(sky: Sky, condition: Callable[[], bool], pause_s: float = 0.0) -> None:
     """Let frames come until something is so."""
     end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end
         sky.frame()
+        time.sleep(pause_s)
 
 
 def segments(sky: Sky) -> list[Path]:
@@ -130,4 +134,72 @@ def test_another_program_takes_the_stream_of_commands(
             other.kill()
     frames_until(sky, lambda: renewed(sky) == 1)
     sky.frames(5)
+    check_commands(sky, files[1])
+
+
+RECORD = [sys.executable, "-m", "faintspot", "realtime", "record", "night.zarr"]
+TMPFS = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs"]
+IN_A_SMALL_FILE_SYSTEM = f"""
+{" ".join(TMPFS)} "$0" && cd "$0" || exit
+"$@"
+code=$?
+cp -r night.zarr "$0.kept"
+exit $code
+"""
+"""In a mount namespace of its own, so that nobody else sees it, and it goes with the process."""
+UNSHARE = ["unshare", "--user", "--map-root-user", "--mount"]
+LARGEST_FILE, PAUSE_S = 20_000, 0.01
+REASONS = {"disk": "the disk is full", "file": "File too large"}
+
+
+def mounts(folder: Path) -> bool:
+    """Whether this user may mount a small file system."""
+    if shutil.which("unshare") is None:
+        return False
+    tried = subprocess.run([*UNSHARE, *TMPFS, str(folder)], capture_output=True, timeout=PATIENCE_S)
+    return tried.returncode == 0
+
+
+@pytest.mark.parametrize("full", ["disk", "file"])
+def test_no_space_for_a_recording(sky: Sky, files: tuple[Path, Control], full: str, tmp_path: Path) -> None:
+    """A file system of 300 kB is full, or files may not be larger than 20 kB.
+
+    The recorder says so in a line, what it had written before is whole, and the loop goes on.
+    """
+    pytest.importorskip("zarr")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command, store, limit = [*RECORD, "--name", sky.name], disk / "night.zarr", None
+    if full == "disk":
+        if not mounts(disk):
+            pytest.skip("needs the right to mount a file system")
+        command, store = (
+            [*UNSHARE, "sh", "-c", IN_A_SMALL_FILE_SYSTEM, str(disk), *command],
+            tmp_path / "disk.kept",
+        )
+    else:
+        limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))  # noqa: E731
+    first = len(sky.records)
+    with subprocess.Popen(
+        command, cwd=disk, preexec_fn=limit, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as recorder:
+        try:
+            frames_until(sky, lambda: recorder.poll() is not None, PAUSE_S)  # else records are overwritten
+            assert recorder.stderr is not None
+            said = recorder.stderr.read()
+        finally:
+            recorder.kill()
+    assert recorder.returncode == 2, said
+    kept = read_telemetry(store)
+    assert len(kept.frame) > 0
+    assert f"cannot be written: {REASONS[full]}" in said
+    assert said.rstrip().endswith(f"; {len(kept.frame)} frames are in the store")
+    assert len([line for line in said.splitlines() if "error" in line]) == 1
+    sky.frames(5)
+    records = sky.records
+    same = records[np.isin(records["frame"], kept.frame)]
+    assert kept.frame[0] >= first
+    np.testing.assert_array_equal(kept.frame, same["frame"])
+    np.testing.assert_array_equal(kept.commands, same["commands"])
+    np.testing.assert_array_equal(kept.x, same["x"])
     check_commands(sky, files[1])

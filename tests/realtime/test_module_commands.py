@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -33,8 +34,8 @@ class Host:
     def module_fault(self) -> str | None:
         return self.fault
 
-    def admit(self, name_or_path: str) -> Module:
-        return load_module(name_or_path)
+    def admit(self, name_or_path: str, *, isolate: bool = False) -> Module:
+        return replace(load_module(name_or_path), isolated=isolate)
 
     def load(self, module: Module) -> int | None:
         wanted = {**self.loaded, module.stage: module}
@@ -82,6 +83,16 @@ def test_load_swap_unload(name: str, host: Host, tmp_path: Path) -> None:
     assert "denoise: strong" in run(name, "swap", "strong.py")
     assert run(name, "unload", "strong") == "denoise: the built-in stage, taken at the next frame\n"
     assert host.loaded == {}
+
+
+def test_in_a_process_of_its_own(name: str, host: Host, tmp_path: Path) -> None:
+    write(tmp_path, "denoise", "return images", "gentle")
+    assert "), in a process of its own: in effect" in run(name, "load", "--isolate", "gentle.py")
+    assert host.loaded["denoise"].isolated
+    assert "in a process of its own\n" in run(name, "modules")
+    assert "process of its own" not in run(name, "swap", "gentle.py")
+    with pytest.raises(fs.InputError, match="isolate: expected true or false, got 'yes'"):
+        module_commands(host)["load"]({"source": "./gentle.py", "isolate": "yes"})
 
 
 def test_an_edited_file_is_taken_by_swap(name: str, host: Host, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,10 @@ from faintspot.errors import InputError
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.portable,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+]
 
 SHAPE = (24, 32)
 
@@ -108,8 +110,3 @@ def test_full_shared_memory_is_said(name: str, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(InputError, match=r"cannot be made, .* MiB \(No space left on device\)"):
         PixelRing.create(name, SHAPE, np.float32)
     assert not [path for path in FOLDER.iterdir() if name in path.name]
-
-
-def test_processors_that_reorder_stores_are_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    refused(name, "x86-64", "aarch64")

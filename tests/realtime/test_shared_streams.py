@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import errno
 import fcntl
 import os
+import platform
 import stat
 import subprocess
 import sys
@@ -21,7 +23,7 @@ import pytest
 from faintspot.errors import InputError
 from faintspot.realtime import shared_streams
 from faintspot.realtime.pixel_segment import FOLDER
-from faintspot.realtime.shared_streams import create_stream, lock_file
+from faintspot.realtime.shared_streams import create_stream, lock_file, pyshmem_module
 from faintspot.realtime.slope_streams import SlopeStreams
 
 pyshmem = pytest.importorskip("pyshmem")
@@ -186,6 +188,23 @@ def test_no_room_is_one_line(name: str, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(os, "posix_fallocate", full)
     assert "bytes, more than is left in /dev/shm" in refused(name)
     assert set(FOLDER.iterdir()) == before
+
+
+@pytest.mark.parametrize("library", ["libatomic.so.1", None])
+def test_pyshmem_needs_libatomic_on_other_processors(
+    library: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without it its readers wait for the lock, which an engine holds for good."""
+    monkeypatch.setattr(shared_streams, "_keeps_order", shared_streams._keeps_order.__wrapped__)
+    monkeypatch.setattr(ctypes.util, "find_library", lambda _: library)
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    assert pyshmem_module("publishing") is pyshmem
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    if library is None:
+        with pytest.raises(InputError, match="libatomic on aarch64, found none; install it"):
+            pyshmem_module("publishing")
+    else:
+        assert pyshmem_module("publishing") is pyshmem
 
 
 def test_of_three_streams_all_or_none(name: str) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.patience import LIMIT_S
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes_of, write, write_images
 
 from faintspot.errors import InputError
@@ -22,7 +23,10 @@ from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.telemetry import TelemetryReader, TelemetryRing
 from faintspot.sensor.layout import Layout
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.portable,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+]
 
 
 @pytest.fixture
@@ -162,12 +166,12 @@ def test_changes(name: str) -> None:
 def test_nothing_is_torn_between_processes(name: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, enough = spawn.Event(), spawn.Event()
-    writer = spawn.Process(target=write_on, args=(name, ready, enough))
+    writer = spawn.Process(target=write_on, args=(name, ready, enough), daemon=True)
     writer.start()
-    assert ready.wait(60)
+    assert ready.wait(LIMIT_S)
     reader = TelemetryReader.attach(name)
     cursor = image_cursor = seen = lost = 0
-    end = time.monotonic() + 60
+    end = time.monotonic() + LIMIT_S
     while (seen < 2000 or lost == 0 or image_cursor < 20) and time.monotonic() < end:
         records, cursor, dropped = reader.records_since(cursor)
         assert as_written(records)
@@ -180,7 +184,7 @@ def test_nothing_is_torn_between_processes(name: str) -> None:
     assert seen + lost == cursor
     assert seen >= 2000
     enough.set()
-    writer.join(30)
+    writer.join(LIMIT_S)
     assert writer.exitcode == 0
     writer.close()
     assert is_stale(reader)
@@ -189,14 +193,14 @@ def test_nothing_is_torn_between_processes(name: str) -> None:
 def test_the_ring_of_a_dead_engine_is_replaced(name: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, enough = spawn.Event(), spawn.Event()
-    writer = spawn.Process(target=write_on, args=(name, ready, enough))
+    writer = spawn.Process(target=write_on, args=(name, ready, enough), daemon=True)
     writer.start()
-    assert ready.wait(60)
+    assert ready.wait(LIMIT_S)
     reader = TelemetryReader.attach(name)
     with pytest.raises(InputError, match=f"telemetry of {name}: .*process {writer.pid} "):
         TelemetryRing.create(name, LAYOUT)
     os.kill(writer.pid or 0, signal.SIGKILL)
-    writer.join(30)
+    writer.join(LIMIT_S)
     writer.close()
     assert is_stale(reader)
     with TelemetryRing.create(name, LAYOUT) as ring:

@@ -23,7 +23,9 @@ def trial(source: Path, limit_s: float = 60.0) -> Trial:
 def test_what_passes(tmp_path: Path) -> None:
     """It runs in another process, which may print what it likes."""
     path = write(tmp_path, "denoise", "import os\nprint('{')\nos.environ['FS_TRIAL'] = 'x'\nreturn images")
-    assert trial(path).elsewhere() == hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    about = {"name": "module", "stage": "denoise", "source": str(path), "digest": digest}
+    assert trial(path).elsewhere() == about
     assert "FS_TRIAL" not in os.environ
 
 

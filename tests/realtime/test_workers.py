@@ -7,10 +7,11 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from tests.patience import LIMIT_S
 
 from faintspot.realtime.workers import Workers
 
-PATIENCE_S = 20.0
+pytestmark = pytest.mark.portable
 
 
 @pytest.fixture
@@ -60,10 +61,10 @@ def test_a_dead_one_is_replaced(workers: Workers) -> None:
     workers.post(deadly)
     waiting = threading.Thread(target=lambda: outcome.append(workers.wait()))
     waiting.start()
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + LIMIT_S
     while not workers.replace_dead():
         assert time.monotonic() < end
-    waiting.join(PATIENCE_S)
+    waiting.join(LIMIT_S)
     assert outcome == [False]
     assert workers.fault == "MemoryError: no more"
     workers.post(lambda share: True)

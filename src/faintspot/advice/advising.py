@@ -162,7 +162,7 @@ def apply(
     for proposal in advice.proposals:
         if stop.is_set():
             return
-        say(f"trying {proposal.text} for {seconds:g} s")
+        say(f"trying {proposal.text} for at most {seconds:g} s")
         verdict = try_on(loop, proposal, seconds, stop)
         advice.verdicts.append(verdict)
         say(f"  {verdict.in_words(loop.unit)}")

@@ -90,7 +90,7 @@ def compared_residual(seen: Seen, left: Floats, gain_errors: Sequence[float] = (
     kept = np.isfinite(left)
     count = np.bincount(of_frame, weights=kept, minlength=len(turns))
     sums = np.bincount(of_frame, weights=np.where(kept, left, 0.0), minlength=len(turns))
-    full = count >= 0.5 * np.median(count)
+    full = (count > 0) & (count >= 0.5 * np.median(count))  # most may have nothing, where frames are lost
     means, arm = sums[full] / count[full], seen.arm[first][full]
     if len(means) < _FEWEST_TURNS or len(set(arm.tolist())) < 2:
         return Estimate(math.nan)

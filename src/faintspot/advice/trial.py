@@ -43,6 +43,11 @@ class Verdict:
     """Whether the proposal is better beyond the error."""
     remark: str = ""
 
+    @property
+    def worse(self) -> bool:
+        """Whether it leaves more beyond the error: then no more frames are given to it."""
+        return self.difference.decided == 1
+
     def in_words(self, unit: str) -> str:
         """Return it as a line."""
         found = self.difference
@@ -51,7 +56,8 @@ class Verdict:
             if np.isfinite(found.standard_error)
             else ""
         )
-        return words + (self.remark or ("kept" if self.kept else "not better beyond the error, taken back"))
+        taken_back = f"{'worse' if self.worse else 'not better'} beyond the error, taken back"
+        return words + (self.remark or ("kept" if self.kept else taken_back))
 
 
 _INTERRUPTED = Verdict(Estimate(np.nan), np.nan, False, "interrupted; taken back")
@@ -111,6 +117,9 @@ def settings_of(values: dict[str, Any]) -> Settings:
 def try_on(loop: Loop, proposal: Proposal, seconds: float, stop: threading.Event) -> Verdict:
     """Have a proposal take turns with the present settings, and keep it where it is better.
 
+    The trial ends before its time when the proposal is worse beyond the error. It is never kept before: of
+    many looks one would find it better by chance.
+
     Whatever happens, no arms take turns afterwards; a proposal that is not better, that has the guard open
     the loop, or that is interrupted leaves everything as it was. A loop that somebody opens stays open.
 
@@ -142,16 +151,22 @@ def _settings_in_turn(loop: Loop, proposal: Proposal, seconds: float, stop: thre
         loop.ask("interleave", arms=f"{_PRESENT},{proposal.text}", every=_TURN_FRAMES)
     except InputError as error:
         return Verdict(Estimate(np.nan), np.nan, False, f"the engine refuses it: {error}")
+
+    def compared_so_far(telemetry: Telemetry) -> Verdict:
+        arms = telemetry.arm - telemetry.attributes["first_arm"]
+        own = (arms == 0) | (arms == 1)  # what came before its turns has a smaller number
+        in_turn = replace(telemetry, arm=np.where(own, arms, 0), loop=np.where(own, telemetry.loop, 0))
+        return _compared(loop, in_turn, [before, before.replace(**proposal.changes)])
+
     try:
-        telemetry = watch(loop.name, seconds, stop, _guarded(loop))
+        telemetry = watch(
+            loop.name, seconds, stop, _guarded(loop), lambda so_far: compared_so_far(so_far).worse
+        )
     finally:
         loop.ask("interleave", arms=_PRESENT, every=1)
     if stop.is_set():
         return _INTERRUPTED
-    arms = telemetry.arm - telemetry.attributes["first_arm"]
-    own = (arms == 0) | (arms == 1)  # what came before its turns has a smaller number
-    in_turn = replace(telemetry, arm=np.where(own, arms, 0), loop=np.where(own, telemetry.loop, 0))
-    verdict = _compared(loop, in_turn, [before, before.replace(**proposal.changes)])
+    verdict = compared_so_far(telemetry)
     if verdict.kept:
         loop.ask("set", changes=proposal.changes, where=None)
     return verdict
@@ -171,11 +186,14 @@ def _gains_in_turn(loop: Loop, gain: float, seconds: float, stop: threading.Even
             guard()
             turn()
 
-        telemetry = watch(loop.name, seconds, stop, meanwhile)
+        def compared_so_far(telemetry: Telemetry) -> Verdict:
+            in_turn = replace(telemetry, arm=_arms_of_gain(telemetry, gain))
+            return _compared(loop, in_turn, [settings, settings])
+
+        telemetry = watch(loop.name, seconds, stop, meanwhile, lambda so_far: compared_so_far(so_far).worse)
         if stop.is_set():
             return _INTERRUPTED
-        arms = _arms_of_gain(telemetry, gain)
-        verdict = _compared(loop, replace(telemetry, arm=arms), [settings, settings])
+        verdict = compared_so_far(telemetry)
     finally:
         kept = verdict is not None and verdict.kept
         loop.ask("loop", action="gain", gain=gain if kept else present)

@@ -20,12 +20,17 @@ from faintspot.toml_files import parse_text
 
 _LOOK_S = 0.05
 _MOST_IMAGES = 400
+_QUESTIONS = 10
 
 
 def watch(
-    name: str, seconds: float, stop: threading.Event, meanwhile: Callable[[], None] = lambda: None
+    name: str,
+    seconds: float,
+    stop: threading.Event,
+    meanwhile: Callable[[], None] = lambda: None,
+    enough: Callable[[Telemetry], bool] = lambda _: False,
 ) -> Telemetry:
-    """Return what an engine has measured from now on, for so long or until `stop` is set.
+    """Return what an engine has measured from now on, for so long or until `stop` is set or it is enough.
 
     Parameters
     ----------
@@ -35,6 +40,8 @@ def watch(
     stop : event
     meanwhile : function
         Called twenty times a second.
+    enough : function
+        Asked ten times in all whether what there is so far is enough.
 
     Raises
     ------
@@ -45,22 +52,26 @@ def watch(
     try:
         if not reader.description.get("commands"):
             raise InputError(f"{name}: this engine makes no commands; its configuration has no [control]")
-        return _watched(reader, seconds, stop, meanwhile)
+        return _watched(reader, seconds, stop, meanwhile, enough)
     finally:
         reader.close()
 
 
 def _watched(
-    reader: TelemetryReader, seconds: float, stop: threading.Event, meanwhile: Callable[[], None]
+    reader: TelemetryReader,
+    seconds: float,
+    stop: threading.Event,
+    meanwhile: Callable[[], None],
+    enough: Callable[[Telemetry], bool],
 ) -> Telemetry:
     cursors = [reader.newest, reader.newest_image, 0]
     records: list[NDArray[Any]] = [np.empty(0, reader.record_type)]
     images: list[NDArray[Any]] = [np.empty(0, reader.image_type)]
     changes: list[dict[str, Any]] = []
-    end = time.monotonic() + seconds
-    going_on = True
+    start = time.monotonic()
+    asked, going_on = 1, True
     while going_on:
-        going_on = not stop.wait(_LOOK_S) and time.monotonic() < end
+        going_on = not stop.wait(_LOOK_S) and time.monotonic() < start + seconds
         meanwhile()
         some, cursors[0], _ = reader.records_since(cursors[0])
         records.append(some)
@@ -71,15 +82,27 @@ def _watched(
         changes += new
         if reader.stale and not stop.is_set():
             raise InputError(f"{reader.name}: the engine has ended")
+        if going_on and time.monotonic() > start + asked * seconds / _QUESTIONS:
+            asked += 1
+            going_on = not enough(_gathered(reader, records, images, changes))
+    return _gathered(reader, records, images, changes)
+
+
+def _gathered(
+    reader: TelemetryReader,
+    records: list[NDArray[Any]],
+    images: list[NDArray[Any]],
+    changes: list[dict[str, Any]],
+) -> Telemetry:
+    """Return what was read as telemetry."""
     arrays = {
-        name: np.concatenate([each[name] for each in records]) for name in stored_names(records[0].dtype)
-    }
-    arrays |= {
-        name: np.concatenate([each[name] for each in images]) for name in stored_names(images[0].dtype)
+        name: np.concatenate([each[name] for each in parts])
+        for parts in (records, images)
+        for name in stored_names(parts[0].dtype)
     }
     arms, first = arms_after(reader.description["arms"], changes)
     attributes = {**reader.description, "settings": reader.settings, "arms": arms, "first_arm": first}
-    return Telemetry(**arrays, changes=changes, attributes=attributes)
+    return Telemetry(**arrays, changes=list(changes), attributes=attributes)
 
 
 def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Settings, float]:

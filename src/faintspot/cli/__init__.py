@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import warnings
@@ -89,11 +90,23 @@ def group(context: click.Context) -> None:
         click.echo(context.get_help())
 
 
+class _Terminal(logging.Handler):
+    """Says on standard error, also while a progress bar is there, what takes time."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one line."""
+        click.echo(f"faintspot: {record.getMessage()}", err=True)
+
+
 def main(arguments: list[str] | None = None) -> Any:
     """Run the command line; an error of the user's ends with one line and exit code 2."""
     # Before NumPy is loaded: small matrices gain nothing from BLAS threads, which get in the way of our own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.formatwarning = lambda message, *_: f"faintspot: warning: {' '.join(str(message).split())}\n"
+    if sys.stderr.isatty():
+        compiling = logging.getLogger("faintspot.kernels.cached")
+        compiling.addHandler(_Terminal())
+        compiling.setLevel(logging.INFO)
     try:
         return group.main(args=arguments, prog_name="faintspot", standalone_mode=False)
     except click.ClickException as error:

@@ -36,14 +36,12 @@ import click
 )
 @click.option("--motion-px", type=float, default=0.3, show_default=True, help="Standard deviation per axis.")
 @click.option("--motion-time", type=float, metavar="S", default=0.01, show_default=True, help="Correlation.")
-@click.option("--read-noise-e", type=float, default=1.0, show_default=True, help="At the output.")
+@click.option("--read-noise-e", type=float, help="At the output. Default: the configuration's, else 1.")
 @click.option("--background-e", type=float, default=0.0, show_default=True, help="Per pixel and frame.")
 @click.option("--dark-e", type=float, default=0.0, show_default=True, help="Per pixel and frame.")
-@click.option("--em-gain", type=float, default=1.0, show_default=True, help="1: no multiplication.")
-@click.option(
-    "--gain", type=float, metavar="E/ADU", default=1.0, show_default=True, help="Electrons per ADU."
-)
-@click.option("--offset-adu", type=float, default=0.0, show_default=True, help="Level of every pixel.")
+@click.option("--em-gain", type=float, help="1: no multiplication. Default: the configuration's.")
+@click.option("--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: the configuration's.")
+@click.option("--offset-adu", type=float, help="Level of every pixel. Default: the configuration's dark.")
 @click.option("--bits", type=int, help="Of the converter: whole ADU. Default: continuous values.")
 @click.option(
     "--readout-fraction", type=float, default=0.8, show_default=True, help="Part of the frame time."
@@ -57,7 +55,8 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
     """Simulate a camera that publishes frames row by row, for `faintspot realtime run`.
 
     Spots move about the centres of the sub-apertures; rows become readable one block after the other at the
-    pace of a real read-out. Ctrl-C stops it and removes its shared memory.
+    pace of a real read-out. Ctrl-C stops it and removes its shared memory. The camera is the one that
+    [calibration] describes, so that the slopes are right.
 
     \b
     Example:
@@ -67,17 +66,24 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
 
     from faintspot.realtime.camera import Camera, SpotMotion, readout_type
     from faintspot.realtime.pixel_ring import PixelRing
+    from faintspot.sensor.calibration import Calibration
     from faintspot.sensor.layout import Layout
     from faintspot.simulate import Detector
 
-    layout = Layout.load(config)
+    layout, known = Layout.load(config), Calibration.load(config)
+    dark = 0.0 if known.dark is None else float(np.nanmean(known.dark))
+
+    def given(option: str, otherwise: float) -> float:
+        value: float | None = options[option]
+        return otherwise if value is None else value
+
     detector = Detector(
-        options["read_noise_e"],
+        given("read_noise_e", 1.0 if known.read_noise_e is None else known.read_noise_e),
         dark_e=options["dark_e"],
         background_e=options["background_e"],
-        em_gain=options["em_gain"],
-        gain_e_per_adu=options["gain"],
-        offset_adu=options["offset_adu"],
+        em_gain=given("em_gain", known.em_gain),
+        gain_e_per_adu=given("gain", known.gain_e_per_adu),
+        offset_adu=given("offset_adu", dark),
         bits=options["bits"],
     )
     dtype = readout_type(detector)

@@ -13,33 +13,40 @@ from faintspot.realtime.private_socket import socket_path
 
 _NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
 
+_ISOLATE = click.option(
+    "--isolate", is_flag=True, help="Run it in a process of its own: 60 us a frame or more."
+)
+
 
 @click.command("load")
 @_NAME
+@_ISOLATE
 @click.argument("module", metavar="NAME_OR_PATH")
-def load(name: str, module: str) -> None:
+def load(name: str, module: str, isolate: bool) -> None:
     """Put a module in place of a stage of a running engine.
 
     A module is a Python file, or one that is installed under that name, which replaces one of the stages
     calibrate, denoise, background and centroid. It is tried in a process of its own, and refused where it
     fails, crashes, does not return what it must, or takes too long. It runs with all rights of the engine.
+    With --isolate, what crashes later, or never returns, does not take the engine along.
 
     \b
     Example:
       faintspot realtime load examples/median_module.py
     """
-    _show(_asked(name, "load", source=_source(module)))
+    _show(_asked(name, "load", source=_source(module), isolate=isolate))
 
 
 @click.command("swap")
 @_NAME
+@_ISOLATE
 @click.argument("module", metavar="NAME_OR_PATH")
-def swap(name: str, module: str) -> None:
+def swap(name: str, module: str, isolate: bool) -> None:
     """Put a module in the place of the one that is loaded in its stage, between two frames.
 
     A file is read anew: this also takes a changed version of a file that is loaded.
     """
-    _show(_asked(name, "swap", source=_source(module)))
+    _show(_asked(name, "swap", source=_source(module), isolate=isolate))
 
 
 @click.command("unload")
@@ -87,8 +94,9 @@ def _show(reply: dict[str, Any]) -> None:
     click.echo(f"{_line(reply['module'])}: {_since(reply['frame'])}")
 
 
-def _line(module: dict[str, str]) -> str:
-    return f"{module['stage']}: {module['name']} ({module['source']}, {module['digest'][:12]})"
+def _line(module: dict[str, Any]) -> str:
+    where = ", in a process of its own" if module["isolated"] else ""
+    return f"{module['stage']}: {module['name']} ({module['source']}, {module['digest'][:12]}){where}"
 
 
 def _since(frame: int | None) -> str:

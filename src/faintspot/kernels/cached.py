@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -45,12 +46,15 @@ class _KernelCache(FunctionCache):
 
     def load_overload(self, *arguments: Any) -> Any:
         """Return what is kept; None, and forget it, where it cannot be read: it is compiled anew then."""
+        kept = None
         try:
-            return super().load_overload(*arguments)
+            kept = super().load_overload(*arguments)
         except Exception:  # a damaged pickle raises anything
             with suppress(OSError):
                 self._cache_file.flush()
-            return None
+        if kept is None:
+            _tell_once()
+        return kept
 
     def save_overload(self, *arguments: Any) -> None:
         """Keep machine code if that can be done."""
@@ -73,6 +77,12 @@ class _KernelFiles(IndexDataCacheFile):
         name = f"{self._index_name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:24]}.nbc"
         self._save_data(name, data)
         self._save_index({**self._load_index(), key: name})
+
+
+@cache
+def _tell_once() -> None:
+    """Say, to who listens to this module's logger, why it takes longer this time."""
+    logging.getLogger(__name__).info("compiling what this machine has not used yet; later runs start at once")
 
 
 @cache

@@ -1,14 +1,22 @@
-"""How kernels are compiled: once per machine, kept on disk, anew whenever any kernel's source changes."""
+"""How kernels are compiled: once per machine, kept on disk, anew whenever any kernel's source changes.
+
+Numba makes machine code of every function, and optimises it anew with every function that calls it, which
+took half of the time of compiling a pipeline. Here a kernel is optimised and becomes machine code once, where
+Python calls it, together with all that it calls; what other kernels call is only a part of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import config, njit
 from numba.core import types as numba_types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.registry import CPUDispatcher
 
 from faintspot.kernels.cached import kernel_cache
 
@@ -31,7 +39,7 @@ def inlined(function: Callable[..., Any]) -> Any:
     Constant arguments become constants in the machine code, but not to Numba's typing: inlining by Numba
     would type the function's body anew at every call, which takes several times longer to compile.
     """
-    return njit(forceinline=True, nogil=True, error_model="numpy", _nrt=False)(function)
+    return _kernel(function, forceinline=True, _nrt=False)
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -41,26 +49,85 @@ def compiled(function: Callable[..., Any]) -> Any:
     atomic instructions at every call of one kernel by another, took half of the time of a plain centre of
     gravity. So it cannot make arrays: see `allocating`.
     """
-    return _dispatcher(function, _nrt=False)
+    return _kernel(function, _nrt=False)
 
 
 def compiled_with(function: Callable[..., Any], source: str) -> Any:
     """Compile as `compiled` does a function that calls one of another package, whose source file is given."""
     inside = Path(source).is_relative_to(Path(__file__).parent)
-    return _dispatcher(function, () if inside else (Path(source),), _nrt=False)
+    return _kernel(function, () if inside else (Path(source),), _nrt=False)
 
 
 def allocating(function: Callable[..., Any]) -> Any:
     """Compile as `compiled` does what makes arrays."""
-    return _dispatcher(function)
+    return _kernel(function)
 
 
-def _dispatcher(function: Callable[..., Any], others: tuple[Path, ...] = (), **options: Any) -> Any:
-    """Compile with a cache that asks for all kernels' sources."""
-    dispatcher: Any = njit(nogil=True, error_model="numpy", **options)(function)
-    if hasattr(dispatcher, "_cache"):  # where NUMBA_DISABLE_JIT is set, it is the function itself
-        dispatcher._cache = kernel_cache(function, _kernels_stamp() + tuple(_stamp(path) for path in others))
-    return dispatcher
+def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
+    """Compile now, for arguments of these types alone; return what calls it, in 0.1 us and without any check.
+
+    It keeps the GIL: given up for a moment, it may come back to a real-time thread milliseconds later.
+    """
+    whole = _kernel(function, nogil=False, _nrt=False).whole
+    whole.compile(kinds)
+    return whole.overloads[kinds].entry_point
+
+
+def _kernel(function: Callable[..., Any], sources: tuple[Path, ...] = (), **options: Any) -> Any:
+    """Return a function's kernel; `sources` are files besides the kernels' own that its code depends on."""
+    return function if config.DISABLE_JIT else _Kernel(function, sources, options)
+
+
+class _Kernel(CPUDispatcher):
+    """A function as kernels call it; called from Python, it is compiled once more, as a whole, and kept."""
+
+    def __init__(
+        self, function: Callable[..., Any], sources: tuple[Path, ...], options: dict[str, Any]
+    ) -> None:
+        self._sources = sources
+        self._options = {"nogil": True, "error_model": "numpy", **options}
+        wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        every = {"nopython": True, "boundscheck": None, **self._options, **wrappers}
+        super().__init__(function, targetoptions=every, pipeline_class=_PartCompiler)
+
+    @cached_property
+    def whole(self) -> Any:
+        """The same, to be called from Python: with machine code, on disk."""
+        dispatcher: Any = njit(**self._options)(self.py_func)
+        stamps = tuple(_stamp(path) for path in self._sources)
+        dispatcher._cache = kernel_cache(self.py_func, _kernels_stamp() + stamps)
+        return dispatcher
+
+    def add_overload(self, result: Any) -> None:
+        """Keep what kernels call; there is nothing that Python's call could find."""
+        self.overloads[tuple(result.signature.args)] = result
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call from Python."""
+        return self.whole(*arguments)
+
+
+class _PartCompiler(Compiler):
+    """Stop before optimisation and machine code, which come with the kernel that this is a part of."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        context = self.state.targetctx  # a copy, made for this compilation
+        context.get_executable = lambda library, description, environment: object()  # a name for callers
+        self.state.library = _PartLibrary(context.codegen(), "part")
+
+
+class _PartLibrary(JITCodeLibrary):
+    """LLVM's code of a part, as it was generated."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
 
 
 class Direct:
@@ -72,7 +139,7 @@ class Direct:
     """
 
     def __init__(self, kernel: Any) -> None:
-        self._kernel = kernel
+        self._kernel = kernel.whole
         self._entry: Any = None
 
     def __call__(self, *arguments: Any) -> Any:

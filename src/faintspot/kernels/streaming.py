@@ -15,6 +15,7 @@ from numba.core import types
 
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import copied
+from faintspot.kernels.ordered import look_at
 from faintspot.kernels.simd import intrinsic
 
 LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to give up
@@ -32,18 +33,6 @@ class Arrival(NamedTuple):
     control: Any
     """int64 array: waiting ends when the number at `stop_cell` is not 0."""
     stop_cell: Any
-
-
-@intrinsic
-def look_at(typing_context: Any, cells: Any, offset: Any) -> Any:
-    """One whole number that another process writes; what that process wrote before it is seen after it."""
-
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place = context.cast(builder, args[1], sig.args[1], types.intp)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.load_atomic(builder.gep(data, [place]), "acquire", 8)
-
-    return types.int64(cells, offset), emit
 
 
 @intrinsic

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Mapping
 
 from faintspot.errors import InputError
+from faintspot.realtime.isolation import isolated
 from faintspot.realtime.live import LiveSettings
 from faintspot.realtime.module_loading import Module, load_module
 from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
@@ -42,8 +43,10 @@ class EngineModules:
         """Return why modules were taken out last, None where they never were."""
         return self._fault
 
-    def admit(self, name_or_path: str) -> Module:
+    def admit(self, name_or_path: str, *, isolate: bool = False) -> Module:
         """Try a module in a process of its own, and load it into this one when it has passed.
+
+        With `isolate` it is not loaded here: it stays in processes of its own.
 
         Raises
         ------
@@ -51,9 +54,11 @@ class EngineModules:
             When it is refused; then this process has not run any of it.
         """
         settings = self._preparer.of_arms(self._live.settings)
-        digest = Trial(name_or_path, self._preparer.make_pipeline, settings).elsewhere()
+        about = Trial(name_or_path, self._preparer.make_pipeline, settings).elsewhere()
+        if isolate:
+            return isolated(name_or_path, about)
         module = load_module(name_or_path)
-        if module.digest != digest:
+        if module.digest != about["digest"]:
             raise InputError(f"module {name_or_path}: was changed while it was tried; load it again")
         return module
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintspot.errors import InputError
+from faintspot.kernels.ordered import fence, load, store
 from faintspot.realtime.image_layout import (
     COUNTER,
     DAO,
@@ -52,7 +53,7 @@ class _Mapped:
         self.fields = np.ndarray((), METADATA[kind], memory)
         """Metadata; each an array that changes as others write."""
         self.memory, self.places = memory, places
-        self.counter = np.ndarray((), np.uint64, memory, COUNTER[kind])
+        self.counter = np.ndarray((1,), np.int64, memory, COUNTER[kind])
         self.writing = np.ndarray((), np.uint8, memory, WRITING[kind])
         dtype = np.dtype(TYPES[int(self.fields["datatype"])])
         self.values: NDArray[Any] = np.ndarray(shape, dtype, memory, places.values)
@@ -117,7 +118,8 @@ class ImageStream:
     @property
     def count(self) -> int:
         """How much was published."""
-        return int(self._mapped.counter)
+        count: int = load(self._mapped.counter, 0) % 2**64  # the file has it without a sign
+        return count
 
     @property
     def number(self) -> int:
@@ -161,10 +163,12 @@ class ImageStream:
         mapped, end = self._mapped, time.monotonic() + limit_s
         target = np.empty(self.shape, self.dtype) if out is None else out
         while os.fstat(self._descriptor).st_size == self._size:  # memory beyond a file's end is none
-            count = self.count
-            if not mapped.writing:
+            count, writing = self.count, bool(mapped.writing)
+            fence()
+            if not writing:
                 newest = mapped.values[int(mapped.fields["cnt1"]) % len(mapped.values)]
                 np.copyto(target, newest if self._circular else mapped.values, casting="unsafe")
+                fence()
                 if not mapped.writing and self.count == count:
                     return Publication(target, _number(count), count)
             if time.monotonic() >= end:
@@ -240,6 +244,7 @@ class ImageStreamWriter:
         """Publish values of a frame."""
         mapped, fields = self._mapped, self._mapped.fields
         mapped.writing[...] = 1
+        fence()
         mapped.values[...] = values.reshape(self.shape)
         if self._keyword is not None:
             self._keyword["value"] = number
@@ -248,7 +253,8 @@ class ImageStreamWriter:
             fields["atime"] = fields["writetime"] = _clock()
         else:
             fields["atime"][1] = time.time_ns()
-        mapped.counter[...] += 1
+        store(mapped.counter, 0, load(mapped.counter, 0) + 1)
+        fence()
         mapped.writing[...] = 0
         for semaphore in self._semaphores:
             semaphore.post(MOST_POSTED[self.kind])

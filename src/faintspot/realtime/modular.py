@@ -23,6 +23,7 @@ from faintspot.realtime.frame_path import check_real_time
 from faintspot.realtime.module_loading import STAGES, Module, StageFunction
 from faintspot.realtime.module_trial import trial_frames, typical_frame
 from faintspot.realtime.time_limit import call_within, one_line
+from faintspot.sensor.layout import Layout
 from faintspot.slopes import Slopes
 
 TRIAL_LIMIT_S = 60.0  # a module may compile
@@ -210,15 +211,10 @@ class ModularPipeline:
         try:
             with np.errstate(all="ignore"):
                 result = self._functions[stage](images)
+            self.called_s, self.took_s[stage] = math.inf, time.perf_counter() - begin
+            check_result(result, result_shape(stage, self.pipeline.layout))
         except BaseException as error:  # also what would end the process
             raise InputError(f"{title}: {one_line(error)}") from None
-        self.called_s, self.took_s[stage] = math.inf, time.perf_counter() - begin
-        shape = (len(images), 2) if stage == "centroid" else (len(images), *self.pipeline.layout.window)
-        if not isinstance(result, np.ndarray) or result.dtype not in (np.float32, np.float64):
-            kind = result.dtype if isinstance(result, np.ndarray) else type(result).__name__
-            raise InputError(f"{title}: expected an array of float32 or float64, got {kind}")
-        if result.shape != shape:
-            raise InputError(f"{title}: expected shape {shape}, got {result.shape}")
         with np.errstate(over="ignore"):
             checked = result.astype(np.float32, copy=False)
         bad = ~np.isfinite(checked).all(axis=tuple(range(1, checked.ndim)))
@@ -275,6 +271,26 @@ class ModularPipeline:
             f"{title_of(self.modules[slowest])}: a frame takes {1e6 * shortest:.0f} us, "
             f"{1e6 * self.took_s[slowest]:.0f} us of it there; expected at most {1e6 * budget_s:.0f} us"
         )
+
+
+def result_shape(stage: str, layout: Layout) -> tuple[int, ...]:
+    """Return the shape of what a stage's function returns."""
+    return (len(layout), 2) if stage == "centroid" else (len(layout), *layout.window)
+
+
+def check_result(result: Any, shape: tuple[int, ...]) -> None:
+    """Refuse what is no array of float32 or float64 of that shape.
+
+    Raises
+    ------
+    InputError
+        It does not name the module.
+    """
+    if not isinstance(result, np.ndarray) or result.dtype not in (np.float32, np.float64):
+        kind = result.dtype if isinstance(result, np.ndarray) else type(result).__name__
+        raise InputError(f"expected an array of float32 or float64, got {kind}")
+    if result.shape != shape:
+        raise InputError(f"expected shape {shape}, got {result.shape}")
 
 
 def title_of(module: Module) -> str:

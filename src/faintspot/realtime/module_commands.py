@@ -20,8 +20,8 @@ class ModuleHost(Protocol):
     def module_fault(self) -> str | None:
         """Return why modules were taken out last, None where they never were."""
 
-    def admit(self, name_or_path: str) -> Module:
-        """Try a module where it can do no harm, and load it when it has passed.
+    def admit(self, name_or_path: str, *, isolate: bool = False) -> Module:
+        """Try a module where it can do no harm, and load it when it has passed; `isolate`: elsewhere.
 
         Raises
         ------
@@ -43,7 +43,10 @@ class ModuleHost(Protocol):
 
 
 def module_commands(host: ModuleHost) -> dict[str, Handler]:
-    """Return the commands: load, swap (both {"source"}), unload ({"stage"}: a stage or a name), modules."""
+    """Return the commands.
+
+    load, swap (both {"source", "isolate"}), unload ({"stage"}: a stage or a name), modules.
+    """
 
     def load(fields: dict[str, Any]) -> Mapping[str, Any]:
         return loaded(fields, replace=False)
@@ -52,11 +55,14 @@ def module_commands(host: ModuleHost) -> dict[str, Handler]:
         return loaded(fields, replace=True)
 
     def loaded(fields: dict[str, Any], replace: bool) -> Mapping[str, Any]:
-        module = host.admit(_text(fields, "source"))
+        isolate = fields.get("isolate", False)
+        if not isinstance(isolate, bool):
+            raise InputError(f"isolate: expected true or false, got {isolate!r:.40}")
+        module = host.admit(_text(fields, "source"), isolate=isolate)
         there = host.modules().get(module.stage)
         if there is not None and not replace:
             raise InputError(f"{module.stage}: module {there.name} is loaded there; swap takes its place")
-        return {"module": module.describe(), "frame": host.load(module)}
+        return {"module": _described(module), "frame": host.load(module)}
 
     def unload(fields: dict[str, Any]) -> Mapping[str, Any]:
         stage = _stage_of(_text(fields, "stage"), host.modules())
@@ -65,11 +71,15 @@ def module_commands(host: ModuleHost) -> dict[str, Handler]:
     def modules(fields: dict[str, Any]) -> Mapping[str, Any]:
         return {
             "installed": installed_modules(),
-            "loaded": [module.describe() for module in host.modules().values()],
+            "loaded": [_described(module) for module in host.modules().values()],
             "fault": host.module_fault(),
         }
 
     return {"load": load, "unload": unload, "swap": swap, "modules": modules}
+
+
+def _described(module: Module) -> dict[str, Any]:
+    return {**module.describe(), "isolated": module.isolated}
 
 
 def _text(fields: dict[str, Any], name: str) -> str:

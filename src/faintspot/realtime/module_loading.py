@@ -54,26 +54,40 @@ class Module:
     """Path of the file, or what the entry point names."""
     digest: str
     """SHA-256 of the source text, which tells one version from another."""
+    isolated: bool = False
+    """Whether its functions run in processes of their own; see `faintspot.realtime.isolation`."""
 
     def describe(self) -> dict[str, str]:
         """Return what there is to say about it, as plain values."""
         return {"name": self.name, "stage": self.stage, "source": self.source, "digest": self.digest}
 
 
-def load_module(name_or_path: str | Path) -> Module:
+def is_path(name_or_path: str | Path) -> bool:
+    """Return whether it is a path of a file, and not the name of an installed module."""
+    text = str(name_or_path)
+    return text.endswith(".py") or "/" in text
+
+
+def load_module(name_or_path: str | Path, text: bytes | None = None) -> Module:
     """Load a module: an installed one by its name, or a Python file, which is read anew every time.
 
-    What ends in ".py" or holds a "/" is a path. The code runs with all rights of this process.
+    The code runs with all rights of this process.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        What ends in ".py" or holds a "/" is a path.
+    text : bytes, optional
+        Of a file, in place of what it holds now.
 
     Raises
     ------
     InputError
         When it is not found, is not Python, fails when it is imported, or does not say what a module must.
     """
-    text = str(name_or_path)
-    if text.endswith(".py") or "/" in text:
-        return _from_file(Path(text))
-    return _from_entry_point(text)
+    if is_path(name_or_path):
+        return _from_file(Path(name_or_path), text)
+    return _from_entry_point(str(name_or_path))
 
 
 def installed_modules() -> dict[str, str]:
@@ -82,11 +96,22 @@ def installed_modules() -> dict[str, str]:
     return {point.name: point.value for point in sorted(points, key=lambda each: each.name)}
 
 
-def _from_file(path: Path) -> Module:
+def read_module(path: Path) -> bytes:
+    """Return the text of a module's file.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
     try:
-        text = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"module {path}: {error.strerror or error}") from None
+
+
+def _from_file(path: Path, text: bytes | None) -> Module:
+    text = read_module(path) if text is None else text
     digest = hashlib.sha256(text).hexdigest()
     try:
         code = compile(text, str(path), "exec")

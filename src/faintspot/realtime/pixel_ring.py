@@ -12,8 +12,8 @@ Memory, in bytes from the segment's start::
     then   the slots, each of (rows, columns) pixels; frame n lies in slot n % slots
 
 Nothing is locked. The writer stores pixels first and progress afterwards, each cell as one aligned store of
-8 bytes; the reader loads progress first. On x86-64 other processors see stores, and make loads, in program
-order, which makes this right without a barrier. Other processors reorder both, so that they are refused.
+8 bytes; the reader loads progress first, and looks at the slot's cell again after its use of the pixels.
+`faintspot.kernels.ordered` keeps this order on processors that do not keep it by themselves, too.
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.errors import InputError
+from faintspot.kernels.ordered import fence, load, store
 from faintspot.realtime.pixel_segment import (
     ARRIVALS,
+    CELL_BYTES,
     CLOSED,
     FIRST_SLOT,
     FOLDER,
@@ -62,6 +64,7 @@ __all__ = [
 ]
 
 _SPIN_S, _NAP_S = 200e-6, 50e-6
+_LINE = CELL_BYTES // 8
 
 
 class PixelRing:
@@ -95,6 +98,7 @@ class PixelRing:
         self.generation, self.creator_pid = header.generation, header.pid
         self._creator_start, self._identity = header.start, identity
         self.cells = cells_of(memory, header)
+        self._flat = self.cells.reshape(-1)
         itemsize = self.dtype.itemsize
         self.pixels: NDArray[Any] = np.ndarray(
             (header.slots, *self.shape),
@@ -156,38 +160,38 @@ class PixelRing:
         """
         if not (self._writes and self._open):
             raise InputError(f"pixel ring {self.name}: only its open creator writes into it")
-        cells = self.cells
-        number = int(cells[FRAME, 0]) + 1 if frame_number is None else int(frame_number)
+        flat = self._flat
+        number = self._look(FRAME) + 1 if frame_number is None else int(frame_number)
         if number < 0:
             raise InputError(f"frame_number = {number}: expected a number of at least 0")
         slot = number % self.slots
-        arrival = int(cells[ARRIVALS, 0]) + 1
+        held = (FIRST_SLOT + slot) * _LINE
+        arrival = self._look(ARRIVALS) + 1
         # The order is the protocol: the old frame is disowned first, and the new one named last.
-        cells[FIRST_SLOT + slot, SLOT_FRAME] = -1
-        cells[FIRST_SLOT + slot, SLOT_TIME] = 0
-        cells[FIRST_SLOT + slot, SLOT_ARRIVAL] = arrival
-        cells[ROWS, 0] = 0
-        cells[FIRST_SLOT + slot, SLOT_FRAME] = number
-        cells[FRAME, 0] = number
-        cells[ARRIVALS, 0] = arrival
+        store(flat, held + SLOT_FRAME, -1)
+        store(flat, held + SLOT_TIME, 0)
+        store(flat, held + SLOT_ARRIVAL, arrival)
+        store(flat, ROWS * _LINE, 0)
+        store(flat, held + SLOT_FRAME, number)
+        store(flat, FRAME * _LINE, number)
+        store(flat, ARRIVALS * _LINE, arrival)
+        fence()  # before its first pixel is overwritten
         view: NDArray[Any] = self.pixels[slot]
         return view
 
     def rows_ready(self, rows: int) -> None:
         """Say that the first `rows` rows of the frame that was begun are complete."""
-        cells = self.cells
-        number = int(cells[FRAME, 0])
-        if number < 0 or not cells[ROWS, 0] <= rows <= self.shape[0]:
-            raise InputError(
-                f"rows = {rows}: expected {int(cells[ROWS, 0])} to {self.shape[0]} rows of a frame begun"
-            )
+        number, before = self._look(FRAME), self._look(ROWS)
+        if number < 0 or not before <= rows <= self.shape[0]:
+            raise InputError(f"rows = {rows}: expected {before} to {self.shape[0]} rows of a frame begun")
         if rows == self.shape[0]:
-            cells[FIRST_SLOT + number % self.slots, SLOT_TIME] = time.monotonic_ns()
-        cells[ROWS, 0] = rows
+            held = FIRST_SLOT + number % self.slots
+            store(self._flat, held * _LINE + SLOT_TIME, time.monotonic_ns())
+        store(self._flat, ROWS * _LINE, rows)
 
     def end(self) -> None:
         """Say that the frame that was begun is complete."""
-        if self.cells[ROWS, 0] < self.shape[0]:
+        if self._look(ROWS) < self.shape[0]:
             self.rows_ready(self.shape[0])
 
     def publish(self, frame: ArrayLike, frame_number: int | None = None) -> None:
@@ -209,12 +213,12 @@ class PixelRing:
     @property
     def arrivals(self) -> int:
         """Frames begun since the ring was created: goes up when a frame number repeats, too."""
-        return int(self.cells[ARRIVALS, 0])
+        return self._look(ARRIVALS)
 
     @property
     def closed(self) -> bool:
         """Whether the writer has ended in order."""
-        return bool(self.cells[CLOSED, 0])
+        return bool(self._look(CLOSED))
 
     @property
     def stale(self) -> bool:
@@ -234,10 +238,9 @@ class PixelRing:
         For an instant between two frames it is the last number with 0 rows: whether a frame that is no longer
         arriving is complete, `last_row_time_ns` says.
         """
-        cells = self.cells
         while True:
-            arrivals, frame, rows = int(cells[ARRIVALS, 0]), int(cells[FRAME, 0]), int(cells[ROWS, 0])
-            if cells[FRAME, 0] == frame and cells[ARRIVALS, 0] == arrivals:
+            arrivals, frame, rows = self._look(ARRIVALS), self._look(FRAME), self._look(ROWS)
+            if self._look(FRAME) == frame and self._look(ARRIVALS) == arrivals:
                 return frame, rows
 
     def slot(self, frame: int) -> NDArray[Any]:
@@ -250,22 +253,21 @@ class PixelRing:
 
         Where frame numbers may repeat, give the value that `arrival(frame)` had before the use.
         """
-        cell = self.cells[FIRST_SLOT + frame % self.slots]
-        held = bool(cell[SLOT_FRAME] == frame)
-        return held and (arrival is None or bool(cell[SLOT_ARRIVAL] == arrival))
+        fence()  # after the last pixel was read
+        return self._holds(frame, arrival)
 
     def arrival(self, frame: int) -> int:
         """Return which arrival, from 1, put that frame into its slot; -1 when the slot does not hold it."""
-        cell = self.cells[FIRST_SLOT + frame % self.slots]
-        arrival = int(cell[SLOT_ARRIVAL])
-        return arrival if cell[SLOT_FRAME] == frame else -1
+        slot = FIRST_SLOT + frame % self.slots
+        arrival = self._look(slot, SLOT_ARRIVAL)
+        return arrival if self._look(slot, SLOT_FRAME) == frame else -1
 
     def number_of(self, arrival: int) -> int:
         """Return the number of the frame that arrived as this one, from 1; -1 when no slot holds it."""
-        for cell in self.cells[FIRST_SLOT:]:
-            if cell[SLOT_ARRIVAL] == arrival:
-                number = int(cell[SLOT_FRAME])
-                return number if cell[SLOT_ARRIVAL] == arrival else -1
+        for slot in range(FIRST_SLOT, FIRST_SLOT + self.slots):
+            if self._look(slot, SLOT_ARRIVAL) == arrival:
+                number = self._look(slot, SLOT_FRAME)
+                return number if self._look(slot, SLOT_ARRIVAL) == arrival else -1
         return -1
 
     def last_row_time_ns(self, frame: int, arrival: int | None = None) -> int:
@@ -273,10 +275,8 @@ class PixelRing:
 
         Where frame numbers may repeat, `arrival` says which one is meant.
         """
-        cell = self.cells[FIRST_SLOT + frame % self.slots]
-        moment = int(cell[SLOT_TIME])
-        held = cell[SLOT_FRAME] == frame and (arrival is None or cell[SLOT_ARRIVAL] == arrival)
-        return moment if held else 0
+        moment = self._look(FIRST_SLOT + frame % self.slots, SLOT_TIME)
+        return moment if self._holds(frame, arrival) else 0
 
     def wait(self, frame: int, rows: int, timeout_s: float) -> bool:
         """Wait until the first `rows` rows of a frame are there; False when they do not come.
@@ -296,7 +296,17 @@ class PixelRing:
             if elapsed > _SPIN_S:
                 time.sleep(_NAP_S)
 
+    def _holds(self, frame: int, arrival: int | None) -> bool:
+        slot = FIRST_SLOT + frame % self.slots
+        held = self._look(slot, SLOT_FRAME) == frame
+        return held and (arrival is None or self._look(slot, SLOT_ARRIVAL) == arrival)
+
     # ---- both
+
+    def _look(self, row: int, column: int = 0) -> int:
+        """Return a cell; what its writer had written before is seen from here on."""
+        value: int = load(self._flat, row * _LINE + column)
+        return value
 
     def close(self) -> None:
         """Let go of the ring; its creator also removes its name, and tells readers. Harmless when repeated.
@@ -307,7 +317,7 @@ class PixelRing:
             return
         self._open = False
         if self._writes and self.creator_pid == os.getpid():
-            self.cells[CLOSED, 0] = 1
+            store(self._flat, CLOSED * _LINE, 1)
             path = FOLDER / self.name
             with suppress(OSError):
                 if identity_of(path.stat()) == self._identity:

@@ -8,17 +8,20 @@ else in.
 
 from __future__ import annotations
 
+import ctypes.util
 import errno
 import fcntl
 import hashlib
 import math
 import os
+import platform
 import secrets
 import stat
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +46,24 @@ def pyshmem_module(purpose: str) -> Any:
     ------
     MissingExtraError
         Without it; `purpose` says what for.
+    InputError
+        Where it cannot keep its numbers in order.
     """
     try:
         import pyshmem
     except ImportError:
         raise MissingExtraError("pyshmem", "realtime", purpose) from None
+    if not _keeps_order(platform.machine().lower()):
+        raise InputError(
+            f"pyshmem: expected GCC's libatomic on {platform.machine()}, found none; install it (libatomic1)"
+        )
     return pyshmem
+
+
+@cache
+def _keeps_order(machine: str) -> bool:
+    """Whether pyshmem's readers can do without locks, which publishing programs hold for good."""
+    return machine in ("x86_64", "amd64") or ctypes.util.find_library("atomic") is not None
 
 
 def lock_file(name: str) -> Path:

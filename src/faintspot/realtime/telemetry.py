@@ -11,8 +11,8 @@ so that it is created, found stale and replaced in the same way. The slot holds:
     three counts, 128 bytes apart: records, images, changes ever written
     the three rings, item k of a ring in place k % length
 
-An item is written first and counted afterwards, on x86-64 seen in this order by all processors. The item
-that comes next overwrites the oldest, which is why a reader counts that one as lost already.
+An item is written first and counted afterwards (`faintspot.kernels.ordered`). The item that comes next
+overwrites the oldest, which is why a reader counts that one as lost already.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import number_between
 from faintspot.errors import InputError
+from faintspot.kernels.ordered import fence
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import Header, create_segment, segment_path
 from faintspot.realtime.processes import process_start
@@ -373,5 +374,6 @@ def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]
     slot = ring.pixels[0, 0]
     slot[::PAGE] = 0  # every page is there before the first frame
     slot[_START.size : _START.size + len(text)] = np.frombuffer(text, np.uint8)
+    fence()
     _START.pack_into(slot.data, 0, _MAGIC, len(text), zlib.crc32(text))  # last: now it may be read
     return ring, begin

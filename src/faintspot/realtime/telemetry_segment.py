@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.kernels.ordered import fence, load, store
 from faintspot.sensor.layout import Layout
 
 CHANGE_BYTES = 4096
@@ -59,11 +60,13 @@ class Ring:
     @property
     def written(self) -> int:
         """Items ever written."""
-        return int(self._cell[0])
+        count: int = load(self._cell, 0)
+        return count
 
     def count(self, written: int) -> None:
         """Say how many items have been written."""
-        self._cell[0] = written
+        store(self._cell, 0, written)
+        fence()  # before the next item overwrites the oldest
 
     def since(self, cursor: int, most: int | None) -> tuple[NDArray[Any], int, int]:
         """Copies of the items from number `cursor` on, the next cursor, how many were lost."""
@@ -71,6 +74,7 @@ class Ring:
         first = max(cursor, written - places + 1)  # one place is being written to at any time
         last = max(first, written if most is None else min(written, first + most))
         copies = self.items[np.arange(first, last) % places]
+        fence()  # before looking what was overwritten meanwhile
         overwritten = min(max(self.written - places + 1 - first, 0), len(copies))
         return copies[overwritten:], last, first - cursor + overwritten
 

@@ -53,8 +53,9 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error's name and text in one line of bounded length."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}".removesuffix(": ")
+    """Return an error's name and text in one line of bounded length; of an `InputError` the text alone."""
+    text = " ".join(str(error).split())[:300]
+    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 def call_is_under_way() -> bool:

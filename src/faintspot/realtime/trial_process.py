@@ -28,10 +28,6 @@ from faintspot.settings import Settings
 
 LIMIT_S = 90.0
 _GRACE_S = 5.0  # for the process to end by itself
-_PROGRAM = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from faintspot.realtime.trial_process import main; main()"
-)
 
 
 @dataclass(frozen=True)
@@ -55,8 +51,8 @@ class Trial:
     settings: Sequence[Settings]
     limit_s: float = LIMIT_S
 
-    def here(self) -> str:
-        """Try the module in this process; return the digest of its source.
+    def here(self) -> dict[str, str]:
+        """Try the module in this process; return what it is, as `Module.describe`.
 
         Raises
         ------
@@ -66,10 +62,10 @@ class Trial:
         module = load_module(self.source)
         for settings in self.settings:
             ModularPipeline(self.make_pipeline(settings), {module.stage: module})
-        return module.digest
+        return module.describe()
 
-    def elsewhere(self) -> str:
-        """Try the module in a process of its own; return the digest of its source.
+    def elsewhere(self) -> dict[str, str]:
+        """Try the module in a process of its own; return what it is, as `Module.describe`.
 
         Where `make_pipeline` cannot be given to another process, as a lambda cannot, it is tried here.
 
@@ -82,11 +78,11 @@ class Trial:
             pickle.dumps(self.make_pipeline)
         except (pickle.PicklingError, AttributeError, TypeError):
             return self.here()
-        job = _pickled(sys.path) + _pickled(self)
+        job = pickled(sys.path) + pickled(self)
         late = f"module {self.source}: did not return within {self.limit_s:g} s in its trial"
         try:
             done = subprocess.run(
-                [sys.executable, "-P", "-c", _PROGRAM],
+                [sys.executable, "-P", "-c", program(__name__)],
                 input=job,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -104,9 +100,9 @@ class Trial:
         if done.returncode < 0:
             name = signal.Signals(-done.returncode).name
             raise InputError(f"module {self.source}: crashed in its trial ({name})")
-        return self._digest(done.stdout, done.returncode)
+        return self._about(done.stdout, done.returncode)
 
-    def _digest(self, output: bytes, status: int) -> str:
+    def _about(self, output: bytes, status: int) -> dict[str, str]:
         """What the process has answered."""
         try:
             reply = parse_json(output)
@@ -115,7 +111,8 @@ class Trial:
             raise InputError(message) from None
         if reply["error"] is not None:
             raise InputError(reply["error"])
-        return str(reply["digest"])
+        about: dict[str, str] = reply["about"]
+        return about
 
 
 def main() -> None:
@@ -125,9 +122,9 @@ def main() -> None:
     trial: Trial = pickle.load(sys.stdin.buffer)
     signal.alarm(max(1, round(trial.limit_s)))  # ends compiled code as well
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a crash leaves no file behind
-    reply: dict[str, str | None] = {"digest": None, "error": None}
+    reply: dict[str, Any] = {"about": None, "error": None}
     try:
-        reply["digest"] = trial.here()
+        reply["about"] = trial.here()
     except BaseException as error:
         refused = isinstance(error, InputError)
         reply["error"] = str(error) if refused else f"module {trial.source}: {type(error).__name__}: {error}"
@@ -147,7 +144,17 @@ def _read_only(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
     return MappingProxyType(values)
 
 
-def _pickled(value: Any) -> bytes:
+def program(module: str) -> str:
+    """Return the program of a Python process that calls a module's `main`.
+
+    On its standard input come, pickled, sys.path and then what `main` reads.
+    """
+    path = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer)"
+    return f"{path}; from {module} import main; main()"
+
+
+def pickled(value: Any) -> bytes:
+    """Return a value as another process of this program reads it."""
     buffer = io.BytesIO()
     _Pickler(buffer).dump(value)
     return buffer.getvalue()

@@ -10,6 +10,7 @@ from contextlib import suppress
 import numpy as np
 
 from faintspot.kernels import streaming
+from faintspot.kernels.ordered import load, store
 
 _LINE = 16  # int64 numbers from one cell to the next: no two share a cache line
 _POSTED = 0
@@ -34,7 +35,7 @@ class Workers:
 
     def __init__(self, count: int, cpus: Sequence[int] | None = None) -> None:
         self.count, self._cpus = count, list(cpus or ())
-        self._cells = np.zeros((1 + count, _LINE), np.int64)
+        self._cells = np.zeros((1 + count) * _LINE, np.int64)
         self._control = np.zeros(1, np.int64)
         self._whole = [False] * (1 + count)
         self._task: Task | None = None
@@ -47,11 +48,11 @@ class Workers:
     def post(self, task: Task) -> None:
         """Let all begin a task; `wait` before the next one."""
         self._task = task
-        self._cells[_POSTED, 0] += 1
+        store(self._cells, _POSTED, load(self._cells, _POSTED) + 1)
 
     def wait(self) -> bool:
         """Wait until all have done their share; return whether every share came to its end."""
-        job = self._cells[_POSTED, 0]
+        job = self._cells[_POSTED]
         for number in range(1, 1 + self.count):
             cell = number * _LINE
             streaming.wait_for_rows(self._cells, cell, cell + 1, job, 0, _NEVER, _STOP_CELL)
@@ -73,7 +74,7 @@ class Workers:
         for index in dead:
             number = index + 1
             self._whole[number] = False
-            self._cells[number, 0] = self._cells[_POSTED, 0]
+            store(self._cells, number * _LINE, load(self._cells, _POSTED))
             self._threads[index] = self._started(number)
         return len(dead)
 
@@ -97,7 +98,7 @@ class Workers:
             with suppress(OSError):  # said already where the caller's own processors were asked for
                 os.sched_setaffinity(0, {self._cpus[number % len(self._cpus)]})
         cells = self._cells
-        done = int(cells[number, 0])
+        done = int(cells[number * _LINE])
         while not self._closed:
             if not streaming.wait_for_rows(cells, 0, 1, done + 1, 0, self._control, _STOP_CELL):
                 self._awake.wait()
@@ -109,7 +110,7 @@ class Workers:
                 self.fault = f"{type(error).__name__}: {error}".split("\n")[0]
                 return
             done += 1
-            cells[number, 0] = done
+            store(cells, number * _LINE, done)
 
 
 _NEVER = np.zeros(1, np.int64)
