@@ -14,7 +14,9 @@ from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.interleaved import ObservingPlan
 from faintspot.loop.tuning import Search
 
-SEARCH = Search(coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, rounds=1)
+SEARCH = Search(
+    coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, climbs=1, rounds=1
+)
 PLAN = ObservingPlan(
     block_frames=60,
     settle_in_block=20,

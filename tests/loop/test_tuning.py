@@ -14,6 +14,7 @@ from faintspot.loop.tuning import FIRST_TUNING_REALISATION, Search, stored_choic
 BRIGHTEST = arm_kind("brightest")
 KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
 BEST = KEPT.values[2]
+GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
 
 
 class _Record:
@@ -45,6 +46,18 @@ def test_finds_the_top(hill: list[int]) -> None:
     assert found.strehl == pytest.approx(1)
     assert min(hill) >= FIRST_TUNING_REALISATION
     assert told == sorted(told)
+
+
+def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = dict(zip(GAINS.values, (0.0, 0.1, 0.45, 0.6, 0.49, 0.3, 0.4, 0.5, 0.4, 0.3), strict=True))
+
+    def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
+        kept = arms[0].settings.keep_brightest
+        return _Record(heights[arms[0].gain] - (kept != KEPT.first[0]))
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    assert tune(BRIGHTEST, small(), Search(climbs=1)).choice[LOOP_GAIN] == 0.7  # the best of the coarse ones
+    assert tune(BRIGHTEST, small(), Search()).choice[LOOP_GAIN] == 0.3
 
 
 def test_looks_at_no_choice_twice(hill: list[int]) -> None:

@@ -35,7 +35,7 @@ _FIRST_NOISE_SCALES = (0.6,)
 _LOOP_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _FIRST_LOOP_GAINS = (0.2, 0.4, 0.7)
 # Of control that learns it is only the gain at which telemetry is taken, which takes long.
-_TELEMETRY_GAINS = (0.1, 0.2, 0.3, 0.4)
+_TELEMETRY_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4)
 _FIRST_TELEMETRY_GAINS = (0.2,)
 # How far spots are from where a prior expects them is the loop's to say: parts of their range.
 PRIOR = "prior_std_px"

@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -39,8 +39,10 @@ class Search:
         Of the refined search.
     finalists : int
         Coarse combinations that are looked at again.
+    climbs : int
+        Finalists from which steps are taken, the best ones: the best of all may stand on the lower hill.
     rounds : int
-        Most steps away from the best of them; 0: none.
+        Most steps away from each of them; 0: none.
 
     Raises
     ------
@@ -53,12 +55,14 @@ class Search:
     settle_frames: int = 60
     realisations: int = 2
     finalists: int = 4
+    climbs: int = 2
     rounds: int = 5
 
     def __post_init__(self) -> None:
         lowest = {"coarse_frames": self.settle_frames + 1, "frames": self.settle_frames + 1, "rounds": 0}
-        for name in ("settle_frames", "coarse_frames", "frames", "realisations", "finalists", "rounds"):
-            number_between(f"search.{name}", getattr(self, name), lowest.get(name, 1), 10**6, integer=True)
+        for each in fields(self):
+            value = getattr(self, each.name)
+            number_between(f"search.{each.name}", value, lowest.get(each.name, 1), 10**6, integer=True)
 
 
 QUICK = Search(coarse_frames=160, frames=160, settle_frames=40, realisations=1, finalists=1, rounds=0)
@@ -85,7 +89,7 @@ def tune(
 ) -> Tuned:
     """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
 
-    All combinations of a few values of each option first, then steps from the best of them to
+    All combinations of a few values of each option first, then steps from the best ones to
     neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
     which takes much longer than a run, the estimator's options and the gain at which telemetry is taken are
     those that are best with the integrator, and only what is the control's own is sought with it. All see
@@ -134,13 +138,23 @@ def _sought(
     ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
     if search.rounds == 0:
         return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
-    best = max(ranked[: search.finalists], key=trials.fine)
-    for _ in range(search.rounds):
+    finalists = sorted(ranked[: search.finalists], key=trials.fine, reverse=True)
+    tops = [_climbed(start, tuned, trials, search.rounds) for start in finalists[: search.climbs]]
+    best = max(tops, key=trials.fine)
+    return Tuned(best, trials.fine(best), trials.tried)
+
+
+def _climbed(
+    start: dict[str, Any], tuned: Mapping[str, Tunable], trials: _Trials, rounds: int
+) -> dict[str, Any]:
+    """Return where steps to the best neighbour end."""
+    best = start
+    for _ in range(rounds):
         better = max(_neighbours(best, tuned), key=trials.fine, default=best)
         if trials.fine(better) <= trials.fine(best):
             break
         best = better
-    return Tuned(best, trials.fine(best), trials.tried)
+    return best
 
 
 def tuning_unit(
@@ -168,7 +182,8 @@ def tuning_frames(kind: ArmKind, configuration: LoopConfiguration, search: Searc
         options = with_integrator(kind).tuned(configuration)
         tuned = {name: each for name, each in tuned.items() if name not in options}
     combinations = math.prod(len(each.first) for each in tuned.values())
-    looks = search.finalists + 2 * len(tuned) * min(2, search.rounds) if search.rounds else 0
+    climbs = min(search.climbs, search.finalists if kind.control == INTEGRATOR else 1)
+    looks = search.finalists + 2 * len(tuned) * climbs * min(2, search.rounds) if search.rounds else 0
     return combinations * search.coarse_frames + looks * search.frames * search.realisations
 
 
