@@ -381,10 +381,12 @@ def test_command_both_ways(folder: Path, name: str) -> None:
         ring = PixelRing.attach(name)
         for number in range(3):
             file.write(np.full((3, 5), number))
-            wait_for(lambda number=number: ring.progress()[0] >= number or ring.closed)
+            # The whole frame: one that is written while this is copied would replace it.
+            wait_for(lambda number=number: ring.progress() >= (number, 3) or ring.closed)
         out, errors = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
+        process.communicate()
         slopes.unlink()
     assert (process.returncode, errors) == (0, "")
     assert f"{name}: 3 frames, 0 missed" in out
