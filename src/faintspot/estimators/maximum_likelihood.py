@@ -9,7 +9,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.matched import Fitted
@@ -84,7 +83,7 @@ class LikelihoodPrepared(PSFPrepared):
         noise = sensor.calibration.read_noise_photoelectrons
         if self.rounds_electrons and noise is not None:
             # What rounding leaves: an electron too much or too little where the noise is beyond one half.
-            self.variance = float(erfc(0.5 / (noise * math.sqrt(2.0)))) if noise > 0 else 0.0
+            self.variance = math.erfc(0.5 / (noise * math.sqrt(2.0))) if noise > 0 else 0.0
 
     @property
     def rounds_electrons(self) -> bool:

@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
-from scipy.special import ndtri
 
 from faintspot.kernels.located import SMALLEST_VARIANCE
 from faintspot.kernels.profiles import MARGIN, PHASES
@@ -125,6 +122,8 @@ def _profile_tables(
     terms: Floats, oversampling: int, window: tuple[int, int], width: int
 ) -> NDArray[np.float32]:
     """Profiles (n, rank, nodes) and their derivatives in the position, (n, rank, 2, PHASES, length)."""
+    from scipy.interpolate import CubicSpline  # here: importing it takes longer than the first slopes
+
     _, offsets = _places(window, width)
     half = (terms.shape[2] - 1) / 2 / oversampling
     nodes = np.linspace(-half, half, terms.shape[2])
@@ -187,6 +186,9 @@ def least_light(
     ratio of the spot against no spot. To that 0.9 is added, found by simulation: errors beyond 1 px come from
     neighbouring places as well.
     """
+    from scipy.optimize import brentq  # here: importing them takes longer than the first slopes
+    from scipy.special import ndtri
+
     reach = min(search_range_px, 0.5 * side)
     places = max(1.0, (2.0 * reach / float(psf.fwhm_px[plane].mean())) ** 2)
     wanted = 0.5 * (math.sqrt(2.0) * -float(ndtri(_OUTLIER_FRACTION / places)) + _NEAR_OUTLIERS) ** 2

@@ -411,10 +411,10 @@ def _check_centres(offsets: NDArray[np.float64], window: tuple[int, int]) -> Non
 
 def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
     """Windows share a pixel when their corners are less than a window apart on both axes."""
-    from scipy.spatial import KDTree  # 0.1 s, which `import faintspot` does not need
-
-    if len(corners) == 1:
+    if _on_a_grid(corners, window):
         return
+    from scipy.spatial import KDTree  # 0.2 s, which a plain grid does not need
+
     apart, nearest = KDTree(corners / np.array(window)).query(corners / np.array(window), 2, p=np.inf)
     overlapping = np.flatnonzero(apart[:, 1] < 1 - 1e-9)
     if overlapping.size:
@@ -424,3 +424,11 @@ def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
             f"layout: sub-apertures {min(index, other)} and {max(index, other)} overlap; use smaller windows "
             f"than {window}"
         )
+
+
+def _on_a_grid(corners: NDArray[np.int64], window: tuple[int, int]) -> bool:
+    """Whether these are cells of a grid whose lines are a window apart, none of them twice."""
+    for axis, size in enumerate(window):
+        if np.diff(np.unique(corners[:, axis])).min(initial=size) < size:
+            return False
+    return len(np.unique(corners, axis=0)) == len(corners)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from faintspot.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.errors import InputError
@@ -161,6 +160,8 @@ class PSF:
     @cached_property
     def _spline(self) -> Floats:
         """Spline coefficients, a border of zeros included so that the PSF falls smoothly to zero."""
+        from scipy.ndimage import spline_filter  # here, as below: importing it takes longer than first slopes
+
         return np.stack([spline_filter(np.pad(plane, 2), 3, mode="mirror") for plane in self.samples])
 
     def images(
@@ -192,6 +193,8 @@ class PSF:
         InputError
             For positions that are not finite or of the wrong shape, a PSF that does not exist.
         """
+        from scipy.ndimage import map_coordinates
+
         place = position_array(positions)
         ny, nx = image_shape("shape", shape)
         n = len(place)
@@ -235,6 +238,8 @@ class PSF:
             When it is negative or NaN.
         """
         std = number_between("std_px", std_px, 0.0, 100.0) * self.oversampling
+        from scipy.ndimage import gaussian_filter
+
         samples = gaussian_filter(self.samples, std, mode="constant", axes=(-2, -1))
         return PSF(samples, self.oversampling, self.index)
 

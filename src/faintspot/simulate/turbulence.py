@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gamma, kv
 
 from faintspot.checks import finite_array, number_between, numbers_between, one_of
 from faintspot.errors import InputError
@@ -192,6 +191,8 @@ def _structure(r: Floats, outer_scale: float) -> Floats:
     Kolmogorov, or von Karman: D(r) = 2 (B(0) - B(r)) with B(r) proportional to
     (L0 / r0)^(5/3) (2 pi r / L0)^(5/6) K_5/6(2 pi r / L0) (Conan 2008, JOSA A 25, 526).
     """
+    from scipy.special import gamma, kv  # here: importing it takes 0.1 s, which slopes do not need
+
     if math.isinf(outer_scale):
         kolmogorov: Floats = 6.88 * r ** (5 / 3)
         return kolmogorov
