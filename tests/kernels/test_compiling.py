@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from numba.core.caching import NullCache
 
+from faintspot.kernels import compiling
 from faintspot.kernels.compiling import Direct, allocating, compiled, inlined
 
 pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
@@ -40,6 +43,14 @@ def doubled(values: Any) -> Any:
 
 
 VALUES = np.arange(5.0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _nothing_kept() -> Iterator[None]:
+    """What comes from disk as a whole has no parts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiling, "kernel_cache", lambda *arguments: NullCache())
+        yield
 
 
 def test_a_part_has_neither_machine_code_nor_an_entry_from_python() -> None:
