@@ -73,7 +73,7 @@ ARMS: dict[str, tuple[dict[str, Any], float | None]] = {
     ),
 }
 """Settings, and the largest allowed ratio to pyRTC's time."""
-_CONFIGURATION = f"""
+CONFIGURATION = f"""
 [layout.grid]
 shape = [{SIDE}, {SIDE}]
 pixels = {PIXELS}
@@ -145,6 +145,19 @@ def streams_in(name: str, shape: tuple[int, int]) -> Iterator[tuple[Any, Any]]:
         )
     finally:
         clear_shms([f"{name}_{stream}" for stream in ("wfs", "wfs_raw", "signal", "signal_2d")])
+
+
+def end_processes(processes: list[subprocess.Popen[bytes]]) -> None:
+    """End processes, also halted ones."""
+    for process in processes:
+        process.send_signal(signal.SIGCONT)
+        process.terminate()
+    for process in processes:
+        try:
+            process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def pyrtc_kernel(component: Any, image: NDArray[np.int32]) -> Candidate:
@@ -228,7 +241,7 @@ class _Systems:
     """Both systems running, each to be fed by `latencies_us`."""
 
     def __init__(self, name: str, folder: str, theirs: Any, ours: Any, stack: NDArray[np.uint16]) -> None:
-        (Path(folder) / "faintspot.toml").write_text(_CONFIGURATION)
+        (Path(folder) / "faintspot.toml").write_text(CONFIGURATION)
         command = [sys.executable, "-m", "faintspot", "realtime"]
         self._started = [
             subprocess.Popen(arguments, cwd=where, stdout=subprocess.DEVNULL)
@@ -287,15 +300,7 @@ class _Systems:
 
     def end(self) -> None:
         """End all processes."""
-        self.halt(False)
-        for process in self._started:
-            process.terminate()
-        for process in self._started:
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        end_processes(self._started)
 
 
 def _spread_of_rounds(rounds: Times, arm: str) -> float:

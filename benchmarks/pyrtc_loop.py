@@ -57,19 +57,7 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 PLAIN = "plain"
 _PATIENCE_S, _MOST_LATE = 120.0, 0.5
-_CONFIGURATION = f"""
-[layout.grid]
-shape = [{SIDE}, {SIDE}]
-pixels = {PIXELS}
-
-[settings]
-estimator = "thresholded"
-threshold_e = 0.0
-
-[calibration]
-dark = {LEVEL_ADU}
-read_noise_e = 2.0
-
+_CONFIGURATION = f"""{pyrtc.CONFIGURATION}
 [psf]
 profile = "diffraction"
 
@@ -217,15 +205,7 @@ class _Bench:
 
     def end(self) -> None:
         """End all processes."""
-        for process in self.processes:
-            process.send_signal(signal.SIGCONT)
-            process.terminate()
-        for process in self.processes:
-            try:
-                process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        pyrtc.end_processes(self.processes)
 
 
 @cache
