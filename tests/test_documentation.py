@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,20 @@ def test_tables_have_a_head(page: Path) -> None:
     tables = [table.splitlines() for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)]
     headless = [rows[0] for rows in tables if len(rows) < 2 or not re.fullmatch(r"[|\s:-]+", rows[1])]
     assert headless == []
+
+
+def test_package_page_links_to_no_file() -> None:
+    """The page of a package index has no file beside the README."""
+    hooks = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["metadata"][
+        "hooks"
+    ]
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    for substitution in hooks["fancy-pypi-readme"]["substitutions"]:
+        page = re.sub(substitution["pattern"], substitution["replacement"], page)
+    assert "docs/start.md" in page
+    assert re.findall(r"\]\((?!https://)[^)]*\)", page) == []
+    assert "A noisy frame" not in page
+    assert "200 electrons a spot" not in page  # what the picture shows
 
 
 def test_what_is_not_run_is_there() -> None:
