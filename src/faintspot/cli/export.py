@@ -12,7 +12,7 @@ _CONFIG = click.option(
 _REFERENCE = click.option(
     "--reference",
     metavar="FILE",
-    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE or FILE:ARRAY.",
+    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
 )
 
 

@@ -86,7 +86,7 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
 @click.option(
     "--dark",
     metavar="FILE|ADU",
-    help="Dark frame, or several (averaged), as FILE or FILE:ARRAY, or a number of ADU.",
+    help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU.",
 )
 @click.option("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
 @click.option(
