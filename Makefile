@@ -50,7 +50,7 @@ bench: $(VENV)/installed-benchmarks
 bench-compare: $(VENV)/installed
 	$(BIN)/python -m benchmarks compare $(OLD) $(NEW)
 
-# What users of recorded frames need: a third of what tests do.
+# What users with recorded frames need; tests need much more.
 $(VENV)/installed-demo: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "faintspot needs Python 3.11 or newer: make PYTHON=/path/to/python3"; exit 2; }
