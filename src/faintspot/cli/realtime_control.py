@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
+from faintspot.cli.engine_requests import asked_at_length
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
+from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
 
 _NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
@@ -54,7 +55,7 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
 
     where = None if subapertures is None else parse_subapertures(subapertures)
     wanted = {"changes": parse_changes(changes), "where": where}
-    reply = request(socket_path(name), "set", timeout_s=LENGTHY_TIMEOUT_S, **wanted)
+    reply = asked_at_length(name, "set", **wanted)
     click.echo(_since(reply["frame"]))
 
 
@@ -69,7 +70,7 @@ def interleave(name: str, arms: str, every: int) -> None:
     Example:
       faintspot realtime interleave none,tv --every 100
     """
-    reply = request(socket_path(name), "interleave", timeout_s=LENGTHY_TIMEOUT_S, arms=arms, every=every)
+    reply = asked_at_length(name, "interleave", arms=arms, every=every)
     click.echo(_since(reply["frame"]))
 
 
