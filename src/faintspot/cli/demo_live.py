@@ -37,7 +37,9 @@ def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
             show_default=True,
             help="Live: port of the page; 0: any that is free.",
         ),
-        click.option("--name", default="faintspot", show_default=True, help="Live: name of the engine and its streams."),
+        click.option(
+            "--name", default="faintspot", show_default=True, help="Live: name of the engine and its streams."
+        ),
         click.option(
             "--photons",
             type=float,

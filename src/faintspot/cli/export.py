@@ -32,7 +32,7 @@ def command() -> None:
     type=click.Choice(["fits", "npy"]),
     default="fits",
     show_default=True,
-    help="Of arrays.",
+    help="Format of arrays.",
 )
 def darc(config: str, output: str, reference: str | None, no_control: bool, form: str) -> None:
     """Write the parameters that users of DARC set by hand.

@@ -10,7 +10,7 @@ import click
 
 from faintspot.cli.engine_requests import asked_at_length
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 
 _ISOLATE = click.option(
     "--isolate", is_flag=True, help="Run it in a process of its own: 60 us a frame or more."
@@ -36,7 +36,7 @@ def load(name: str, module: str, isolate: bool) -> None:
     _show(asked_at_length(name, "load", source=_source(module), isolate=isolate))
 
 
-@click.command("swap")
+@click.command("swap", short_help="Put a module in the place of the one that is loaded.")
 @_NAME
 @_ISOLATE
 @click.argument("module", metavar="NAME_OR_PATH")
@@ -57,7 +57,7 @@ def unload(name: str, stage: str) -> None:
     click.echo(f"{reply['stage']}: the built-in stage, {_since(reply['frame'])}")
 
 
-@click.command("modules")
+@click.command("modules", short_help="List the modules that are installed and loaded.")
 @_NAME
 @click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def modules(name: str, as_json: bool) -> None:

@@ -52,7 +52,7 @@ from faintspot.written_changes import parse_changes
     "--unit",
     type=click.Choice(UNITS),
     default="px",
-    help="Of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
+    help="Unit of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
 )
 @click.option(
     "--mean-light",
