@@ -55,7 +55,7 @@ class Stored:
                 f"{path}: {cls.WHAT} of an earlier version of faintspot: measure again, in another folder"
             )
         if found != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
-            raise InputError(f"{path}: not {cls.WHAT} of format {cls.FORMAT}")
+            raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
         return cls(**{name: _restored(value) for name, value in values.items()})
 
 
