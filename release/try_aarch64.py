@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build" / "aarch64"
 SYSTEM, PACKAGES, PYTHON = FOLDER / "system", FOLDER / "packages", FOLDER / "python"
 LIBRARIES = ("python3", "libstdc++6", "libatomic1")
-EXTRAS = ("io", "realtime")
+EXTRAS = ("io", "realtime", "web")
 TOOLS = ("hypothesis", "pytest", "pytest-timeout")
 LIMIT_S = 7200
 """Of one test: the first that needs a kernel compiles it."""

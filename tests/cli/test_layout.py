@@ -58,7 +58,7 @@ def is_png(path: Path) -> bool:
     return content.startswith(b"\x89PNG\r\n") and len(content) > 5000
 
 
-@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+@pytest.mark.parametrize("geometry", [pytest.param("square", marks=pytest.mark.portable), "hexagonal"])
 def test_simulated_frames(folder: Path, run: Commands, geometry: str) -> None:
     """Lattice points within 0.2 px: 3 frames of 49 spots leave 0.01 px, the fit of a common grid less."""
     np.save("a.npy", frames(geometry))

@@ -12,6 +12,8 @@ import pytest
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import available_cpus, run_groups
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.mark.parametrize("threads", [None, 1, 2, 5])
 @pytest.mark.parametrize("n_groups", [1, 15, 16, 33, 1000])
