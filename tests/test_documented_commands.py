@@ -38,12 +38,12 @@ def commands(block: str) -> list[list[str]]:
 def parse(words: list[str]) -> None:
     """Find the command and parse its options, without doing anything."""
     command: click.Command = group
-    context = click.Context(command, info_name="faintspot")
+    context = command.make_context("faintspot", [], resilient_parsing=True)
     while isinstance(command, click.Group) and words:
         found = command.get_command(context, words[0])
         assert found is not None, words[0]
         command, words = found, words[1:]
-        context = click.Context(command, parent=context, info_name=command.name)
+        context = command.make_context(command.name, [], parent=context, resilient_parsing=True)
     command.make_parser(context).parse_args(list(words))
 
 
