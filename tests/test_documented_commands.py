@@ -21,11 +21,15 @@ import faintspot as fs
 from faintspot.cli import group
 from faintspot.data import mmt_frame
 
-SHELL = re.compile(r"^```(?:sh)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
-TOML = re.compile(r"^```toml\n(.*?)^```", re.DOTALL | re.MULTILINE)
+BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 IN_TEXT = re.compile(r"`(faintspot [a-z][^`|]*)`")
 RUN = {"doctor", "estimators", "layout", "report", "slopes", "wavefront"}
 """What runs in a second; others take minutes, end never or need another program: their own tests run them."""
+
+
+def blocks(text: str, *languages: str) -> list[str]:
+    """Return the blocks of a page that are in one of the languages."""
+    return [block for language, block in BLOCK.findall(text) if language in languages]
 
 
 def commands(block: str) -> list[list[str]]:
@@ -38,12 +42,12 @@ def commands(block: str) -> list[list[str]]:
 def parse(words: list[str]) -> None:
     """Find the command and parse its options, without doing anything."""
     command: click.Command = group
-    context = click.Context(command, info_name="faintspot")
+    context = click.Context(command, info_name="faintspot", **command.context_settings)
     while isinstance(command, click.Group) and words:
         found = command.get_command(context, words[0])
         assert found is not None, words[0]
         command, words = found, words[1:]
-        context = click.Context(command, parent=context, info_name=command.name)
+        context = click.Context(command, context, command.name, **command.context_settings)
     command.make_parser(context).parse_args(list(words))
 
 
@@ -60,8 +64,8 @@ def pages_to_run() -> list[Any]:
     """Return of each page the commands of those blocks that can be run here, `tune` left out."""
     found = []
     for page in PAGES:
-        blocks = map(commands, SHELL.findall(page.read_text(encoding="utf-8")))
-        can_run = [block for block in blocks if {words[0] for words in block} <= {*RUN, "tune"}]
+        called_in = map(commands, blocks(page.read_text(encoding="utf-8"), "", "sh"))
+        can_run = [block for block in called_in if {words[0] for words in block} <= {*RUN, "tune"}]
         called = [words for block in can_run for words in block if words[0] != "tune"]
         if called:
             found.append(pytest.param(called, id=str(page.relative_to(ROOT))))
@@ -70,17 +74,24 @@ def pages_to_run() -> list[Any]:
 
 @pytest.mark.parametrize("text", texts())
 def test_commands_and_options_are_there(text: str) -> None:
-    for block in SHELL.findall(text):
+    for block in blocks(text, "", "sh"):
         for words in commands(block):
             parse(words)
-    for called in IN_TEXT.findall(re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)):
+    for called in IN_TEXT.findall(BLOCK.sub("", text)):
         with contextlib.suppress(click.BadOptionUsage):  # in a sentence an option may stand without its value
             parse(shlex.split(called)[1:])
 
 
+@pytest.mark.parametrize("line", ["faintspot sloops", "faintspot slopes --nonsense", "$ faintspot loop shut"])
+def test_what_is_not_there_is_found(line: str) -> None:
+    (words,) = commands(line)
+    with pytest.raises((AssertionError, click.NoSuchOption)):
+        parse(words)
+
+
 @pytest.mark.parametrize("text", texts())
 def test_toml_is_toml(text: str) -> None:
-    for block in TOML.findall(text):
+    for block in blocks(text, "toml"):
         tomllib.loads(block)
 
 
