@@ -2,7 +2,7 @@
 
 Fetches Debian's Python and wheels of the pinned versions for aarch64 into build/aarch64, installs nothing,
 and runs the tests under qemu-aarch64 (Debian: apt-get install qemu-user). Kernels are compiled in
-the emulator, too, which takes most of an hour of one core; they are kept in the folder. Arguments go to
+the emulator, too, which takes half an hour of one core; they are kept in the folder. Arguments go to
 pytest: `python release/try_aarch64.py tests/realtime`.
 
 On an aarch64 machine it is `pytest -m portable`.
@@ -21,6 +21,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build" / "aarch64"
 SYSTEM, PACKAGES, PYTHON = FOLDER / "system", FOLDER / "packages", FOLDER / "python"
+LIBRARIES = ("python3", "libstdc++6", "libatomic1")
+EXTRAS = ("io", "realtime", "web")
 TOOLS = ("hypothesis", "pytest", "pytest-timeout")
 LIMIT_S = 7200
 """Of one test: the first that needs a kernel compiles it."""
@@ -34,14 +36,23 @@ def main() -> None:
     if missing:
         sys.exit(f"try_aarch64: expected Debian with qemu-user, found no {', '.join(missing)}")
     if not SYSTEM.is_dir():
+        print("fetching Debian's Python for aarch64 ...", flush=True)
         fetch_system()
     python = next((SYSTEM / "usr/bin").glob("python3.*"))
     if not PACKAGES.is_dir():
+        print("fetching wheels for aarch64 ...", flush=True)
         fetch_packages(python.name.removeprefix("python"))
     write_wrapper(python)
     options = ["-m", "portable", "-p", "no:cacheprovider", "-o", f"timeout={LIMIT_S}", "--durations=20"]
+    options += ["-o", f"testpaths={' '.join(portable_files())}"]
     command = [str(PYTHON), "-m", "pytest", *options, *sys.argv[1:]]
     sys.exit(subprocess.run(command, cwd=ROOT).returncode)
+
+
+def portable_files() -> list[str]:
+    """Return the files of tests marked `portable`: others may need packages that are not fetched."""
+    files = (ROOT / "tests").rglob("test_*.py")
+    return sorted(str(file.relative_to(ROOT)) for file in files if "mark.portable" in file.read_text("utf-8"))
 
 
 def fetch_system() -> None:
@@ -63,7 +74,7 @@ def fetch_system() -> None:
         *(part for name, value in options.items() for part in ("-o", f"{name}={value}")),
     ]
     run([*command, "update"])
-    wanted = run([*command, "install", "--simulate", "--no-install-recommends", "python3", "libstdc++6"])
+    wanted = run([*command, "install", "--simulate", "--no-install-recommends", *LIBRARIES])
     names = [line.split()[1] for line in wanted.splitlines() if line.startswith("Inst ")]
     run([*command, "download", *names], archives)
     unpacked = SYSTEM.with_suffix(".part")
@@ -88,7 +99,10 @@ def fetch_packages(version: str) -> None:
     ]
     options += [part for platform in platforms for part in ("--platform", platform)]
     options += ["--constraint", str(ROOT / "constraints.txt")]
-    run([sys.executable, "-m", "pip", "download", *options, *project["dependencies"], *TOOLS])
+    wanted = [*project["dependencies"], *TOOLS]
+    wanted += [name for extra in EXTRAS for name in project["optional-dependencies"][extra]]
+    wanted = [name for name in wanted if not name.startswith("faintspot")]
+    run([sys.executable, "-m", "pip", "download", *options, *wanted])
     for wheel in wheels.glob("*.whl"):
         with zipfile.ZipFile(wheel) as archive:
             archive.extractall(unpacked)

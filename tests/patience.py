@@ -9,6 +9,5 @@ import pytest
 LIMIT_S = 60.0 * float(os.environ.get("FAINTSPOT_PATIENCE", "1"))
 """How long to wait for what must come."""
 not_emulated = pytest.mark.skipif(
-    "FAINTSPOT_PATIENCE" in os.environ,
-    reason="qemu-user tells a process another time of its start than it tells others",
+    "FAINTSPOT_PATIENCE" in os.environ, reason="qemu-user 7.2 fails in processes that fork beside threads"
 )

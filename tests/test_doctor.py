@@ -42,6 +42,7 @@ def _without_a_process(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
         monkeypatch.setattr(doctor, "_real_time", lambda: Finding("real time", "not tried"))
 
 
+@pytest.mark.portable
 def test_everything_is_looked_at_in_one_line_each() -> None:
     findings = examine()
     assert [finding.name for finding in findings] == NAMES
@@ -53,6 +54,7 @@ def test_everything_is_looked_at_in_one_line_each() -> None:
     assert f"numba {numba.__version__}" in findings[2].value
 
 
+@pytest.mark.portable
 def test_command(capsys: pytest.CaptureFixture[str]) -> None:
     run = Commands(capsys)
     text = run.ok("doctor").out
@@ -120,6 +122,7 @@ def test_shared_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "Linux" in str(named("shared memory").advice)
 
 
+@pytest.mark.portable
 @pytest.mark.skipif(sys.platform != "linux", reason="scheduling of Linux")
 def test_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
     before = os.sched_getscheduler(0)

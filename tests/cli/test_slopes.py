@@ -17,6 +17,7 @@ fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")
 
 
+@pytest.mark.portable
 @pytest.mark.parametrize("name", ["a.fits", "a.fits.gz", "a.npy", "a.npz", "a.zarr"])
 def test_formats_in(folder: Path, run: Commands, name: str) -> None:
     frames = simulated()
@@ -32,6 +33,7 @@ def test_formats_in(folder: Path, run: Commands, name: str) -> None:
     assert result.out.splitlines()[-1] == "Next: faintspot report slopes.zarr"
 
 
+@pytest.mark.portable
 @pytest.mark.parametrize("name", ["s.zarr", "s.fits", "s.fits.gz", "s.npz", "s.csv", "with space.npz"])
 def test_formats_out(folder: Path, run: Commands, name: str) -> None:
     frames = simulated()

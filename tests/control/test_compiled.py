@@ -12,6 +12,8 @@ from faintspot.control.integrator import Integrator
 from faintspot.control.reconstructor import make_reconstructor
 from faintspot.flags import SubapertureFlag
 
+pytestmark = pytest.mark.portable
+
 N = 9
 
 

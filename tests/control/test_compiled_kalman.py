@@ -17,6 +17,8 @@ from faintspot.control.kalman import SlopePredictor
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive
 
+pytestmark = pytest.mark.portable
+
 M, COMMANDS = INTERACTION.shape
 USUAL_PX2, GAIN, FRAMES = 0.25, 0.4, telemetry(500)
 Both = list[tuple[Any, CommandLine]]

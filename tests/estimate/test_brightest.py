@@ -11,6 +11,8 @@ from tests.estimate.image_cases import BAD_IMAGES, images, refused
 
 import faintspot as fs
 
+pytestmark = pytest.mark.portable
+
 RULES = ("subtract_next", "threshold", "subtract_kth")
 every_rule = pytest.mark.parametrize("rule", RULES)
 every_dtype = pytest.mark.parametrize("dtype", [np.float32, np.float64])

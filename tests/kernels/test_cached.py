@@ -14,6 +14,8 @@ from faintspot.errors import CacheWarning
 from faintspot.kernels import cached
 from faintspot.kernels.cached import cache_folder, kernel_cache
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.fixture(autouse=True)
 def _nothing_said_yet() -> None:

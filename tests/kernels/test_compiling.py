@@ -13,7 +13,10 @@ from numba.core.caching import NullCache
 from faintspot.kernels import compiling
 from faintspot.kernels.compiling import Direct, allocating, compiled, inlined
 
-pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
+pytestmark = [
+    pytest.mark.portable,
+    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled"),
+]
 
 
 @inlined

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.patience import LIMIT_S, not_emulated
 
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import available_cpus, run_groups
+
+pytestmark = pytest.mark.portable
 
 
 @pytest.mark.parametrize("threads", [None, 1, 2, 5])
@@ -110,8 +113,10 @@ assert np.array_equal(pipeline(frame).vector, before)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a system without fork")
+@not_emulated
 def test_a_process_that_forks_after_its_threads_have_worked() -> None:
     """The child has none of the threads, and makes its own."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    done = subprocess.run([sys.executable, "-c", _FORKED], env=environment, capture_output=True, text=True)
+    command = [sys.executable, "-c", _FORKED]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=2 * LIMIT_S)
     assert done.returncode == 0, done.stderr

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 import faintspot as fs
 from faintspot.kernels import scoring
 
+pytestmark = pytest.mark.portable
+
 FLOOR = 1e-4
 RULES = {"subtract_next": scoring.SUBTRACT_NEXT, "threshold": scoring.THRESHOLD}
 

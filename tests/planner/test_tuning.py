@@ -16,6 +16,7 @@ from faintspot.planner import Question, tune
 from faintspot.planner.tuning import _ranked
 
 
+@pytest.mark.portable
 def test_every_arm_is_scored_on_the_same_spots() -> None:
     answer = answered()
     assert [result.arm.name for result in answer.results] == list(estimators())
@@ -24,6 +25,7 @@ def test_every_arm_is_scored_on_the_same_spots() -> None:
     assert all(result.settings.search_range_px == 1.0 for result in answer.results)
 
 
+@pytest.mark.portable
 def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
     """The bound is for unbiased estimators; 512 spots tell R to 3 %."""
     answer = answered()

@@ -9,6 +9,7 @@ from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
+from tests.patience import LIMIT_S
 
 import faintspot as fs
 from faintspot.realtime.engine import Engine
@@ -18,7 +19,6 @@ from faintspot.realtime.telemetry import TelemetryReader
 LAYOUT = fs.Layout.grid((4, 4), pixels=8)
 CALIBRATION = fs.Calibration(100.0, read_noise_e=1.0)
 SETTINGS = fs.Settings(noise_std=1.0, keep_brightest=9)
-PATIENCE_S = 20.0
 
 
 def make(settings: fs.Settings) -> fs.SlopePipeline:
@@ -52,7 +52,7 @@ class Bench:
         return PixelRing.create(self.name, shape, dtype)
 
     def until(self, condition: Any) -> None:
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + LIMIT_S
         while not condition():
             assert time.monotonic() < end, self.engine.status()
             time.sleep(0.001)
@@ -84,5 +84,5 @@ class Bench:
 
     def close(self) -> None:
         self.engine.stop()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(LIMIT_S)
         assert not self._thread.is_alive()

@@ -14,6 +14,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from tests.patience import LIMIT_S
 
 import faintspot as fs
 from faintspot.realtime.pixel_ring import PixelRing
@@ -34,7 +35,6 @@ keep_brightest = 9
 dark = 100.0
 read_noise_e = 1.0
 """
-PATIENCE_S = 60.0  # the engine may have to compile
 COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
 
 
@@ -58,7 +58,7 @@ def processes(name: str, tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes
     for process in started:
         process.send_signal(signal.SIGINT)  # so that it removes its shared memory; nothing where it has ended
         try:
-            process.wait(PATIENCE_S)
+            process.wait(LIMIT_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -70,7 +70,7 @@ def ask(name: str, *arguments: str) -> str:
 
 
 def wait_for(what: object, condition: object) -> None:
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + LIMIT_S
     while not condition():  # type: ignore[operator]
         assert time.monotonic() < end, what
         time.sleep(0.01)
@@ -95,6 +95,7 @@ def captured(name: str, count: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+@pytest.mark.portable
 def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
     wait_for("the engine", lambda: socket_path(name).exists())
     wait_for("frames", lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10)
@@ -111,9 +112,9 @@ def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tm
 
     engine, camera = processes
     camera.send_signal(signal.SIGINT)
-    assert camera.wait(PATIENCE_S) == 0
+    assert camera.wait(LIMIT_S) == 0
     ask(name, "stop")
-    assert engine.wait(PATIENCE_S) == 0
+    assert engine.wait(LIMIT_S) == 0
     assert "frames measured" in (tmp_path / "run.log").read_text()
     assert not socket_path(name).exists()
 
@@ -135,4 +136,4 @@ def test_a_killed_engine_is_replaced(
     for frame, slopes in captured(name, 10).values():
         assert np.array_equal(slopes, pipeline(frame).vector)
     ask(name, "stop")
-    assert again.wait(PATIENCE_S) == 0
+    assert again.wait(LIMIT_S) == 0

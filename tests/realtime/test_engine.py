@@ -23,6 +23,7 @@ from faintspot.realtime.replay import Replay
 pyshmem = pytest.importorskip("pyshmem")
 
 
+@pytest.mark.portable
 def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     data = simulated(6)
     expected = make(SETTINGS)(data).vector
@@ -37,6 +38,7 @@ def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     assert bench.engine.latencies.count == 6
 
 
+@pytest.mark.portable
 def test_what_is_published(bench: Bench) -> None:
     """Slopes, details and marks, stamped with the frame's number."""
     data = simulated(1)
@@ -75,6 +77,7 @@ def test_arms_take_turns() -> None:
         assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
 
 
+@pytest.mark.portable
 def test_settings_change_between_two_frames(bench: Bench) -> None:
     data = simulated(4)
     other = SETTINGS.replace(noise_std=2.5, keep_brightest=5)
@@ -98,6 +101,7 @@ def test_an_invalid_change_is_refused_whole(bench: Bench) -> None:
     assert bench.engine.live.settings == SETTINGS
 
 
+@pytest.mark.portable
 def test_source_restarts(bench: Bench) -> None:
     data = simulated(2)
     expected = make(SETTINGS)(data).vector
@@ -132,6 +136,7 @@ def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:
         Engine(bench.name, make, SETTINGS)
 
 
+@pytest.mark.portable
 def test_frames_of_a_stream() -> None:
     """The engine follows a pyshmem stream itself, also when it comes back with another size."""
     data = simulated(4)
@@ -158,6 +163,7 @@ def test_frames_of_a_stream() -> None:
         bench.close()
 
 
+@pytest.mark.portable
 def test_recorded_frames_give_the_slopes_that_they_give_offline(bench: Bench, tmp_path: Path) -> None:
     """Replayed row by row: what the engine does with frames of a file is what the pipeline does."""
     data = simulated(20)

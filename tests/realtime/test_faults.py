@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.realtime.bench import PATIENCE_S, SETTINGS, Bench, make, simulated
+from tests.patience import LIMIT_S
+from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
 from faintspot.realtime.pixel_ring import PixelRing
@@ -172,7 +173,7 @@ def test_the_clock_is_set_back(bench: Bench, monkeypatch: pytest.MonkeyPatch) ->
     records = bench.records
     assert (np.diff(records["last_row_time_ns"]) > 0).all()
     assert (records["published_time_ns"] > records["last_row_time_ns"]).all()
-    assert bench.engine.latencies.largest_ns < PATIENCE_S * 1e9
+    assert bench.engine.latencies.largest_ns < LIMIT_S * 1e9
 
 
 def test_a_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:

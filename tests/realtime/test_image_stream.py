@@ -15,6 +15,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from tests.patience import LIMIT_S
 from tests.realtime.image_files import DaoFile, IsioFile
 
 import faintspot
@@ -28,8 +29,10 @@ from faintspot.realtime.stream import Follower, open_stream
 from faintspot.realtime.stream_out import StreamOut
 
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it")
-PATIENCE_S = 60.0
+pytestmark = [
+    pytest.mark.portable,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs shared memory as Linux has it"),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +52,7 @@ def name() -> Iterator[str]:
 
 
 def wait_for(condition: Any, what: str = "") -> None:
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + LIMIT_S
     while not condition():
         assert time.monotonic() < end, what
         time.sleep(0.001)
@@ -113,9 +116,9 @@ def test_waiting_ends_with_a_post_or_the_counter(folder: Path, posts: bool) -> N
     timer = threading.Timer(0.05, lambda: file.write(np.ones((3, 5)), posts=posts))
     timer.daemon = True
     timer.start()
-    assert stream.wait(0, PATIENCE_S)
+    assert stream.wait(0, LIMIT_S)
     assert stream.count == 1
-    timer.join(PATIENCE_S)
+    timer.join(LIMIT_S)
 
 
 def test_a_semaphore_is_taken_and_given_back(folder: Path) -> None:
@@ -383,7 +386,7 @@ def test_command_both_ways(folder: Path, name: str) -> None:
             file.write(np.full((3, 5), number))
             # The whole frame: one that is written while this is copied would replace it.
             wait_for(lambda number=number: ring.progress() >= (number, 3) or ring.closed)
-        out, errors = process.communicate(timeout=PATIENCE_S)
+        out, errors = process.communicate(timeout=LIMIT_S)
     finally:
         process.kill()
         process.communicate()

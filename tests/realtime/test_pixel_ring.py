@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.patience import LIMIT_S, not_emulated
+from tests.patience import LIMIT_S
 
 import faintspot
 from faintspot.errors import InputError
@@ -295,7 +295,6 @@ def killed_writer(name: str) -> subprocess.Popen[bytes]:
     return process
 
 
-@not_emulated
 @pytest.mark.parametrize("reaped", [False, True])
 def test_the_ring_of_a_killed_writer_is_replaced(name: str, reaped: bool) -> None:
     process = killed_writer(name)
@@ -312,7 +311,6 @@ def test_the_ring_of_a_killed_writer_is_replaced(name: str, reaped: bool) -> Non
     process.wait()
 
 
-@not_emulated
 def test_a_cut_ring_of_a_killed_writer_is_replaced(name: str) -> None:
     process = killed_writer(name)
     os.truncate(FOLDER / name, 4096)
@@ -323,7 +321,6 @@ def test_a_cut_ring_of_a_killed_writer_is_replaced(name: str) -> None:
     process.wait()
 
 
-@not_emulated
 def test_of_many_that_replace_a_dead_ring_one_wins(name: str) -> None:
     process = killed_writer(name)
     made: list[PixelRing] = []

@@ -6,7 +6,11 @@ import os
 import subprocess
 import time
 
+import pytest
+
 from faintspot.realtime.processes import process_age_s, process_lives, process_start
+
+pytestmark = pytest.mark.portable
 
 
 def test_which_processes_live() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.patience import LIMIT_S, not_emulated
+from tests.patience import LIMIT_S
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes_of, write, write_images
 
 from faintspot.errors import InputError
@@ -190,7 +190,6 @@ def test_nothing_is_torn_between_processes(name: str) -> None:
     assert is_stale(reader)
 
 
-@not_emulated
 def test_the_ring_of_a_dead_engine_is_replaced(name: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, enough = spawn.Event(), spawn.Event()

@@ -14,7 +14,8 @@ def process_start(pid: int) -> int:
     not yet asked for (a zombie) is dead. See proc_pid_stat(5), fields 3 and 22.
     """
     try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+        # Of its first thread, which is the same: qemu-user makes up /proc/PID/stat for the process itself.
+        text = Path(f"/proc/{pid}/task/{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:
         return -1
     # The second field is the program's name in parentheses, which may hold blanks and parentheses.
