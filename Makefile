@@ -18,7 +18,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: demo test lint types unit fuzz docs release bench bench-compare clean
 
-demo: $(VENV)/installed
+demo: $(VENV)/installed-demo
 	$(BIN)/faintspot demo
 
 test: lint types unit
@@ -50,11 +50,17 @@ bench: $(VENV)/installed-benchmarks
 bench-compare: $(VENV)/installed
 	$(BIN)/python -m benchmarks compare $(OLD) $(NEW)
 
-$(VENV)/installed: pyproject.toml constraints.txt
+# What users with recorded frames need; tests need much more.
+$(VENV)/installed-demo: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "faintspot needs Python 3.11 or newer: make PYTHON=/path/to/python3"; exit 2; }
 	@echo "installing faintspot and its pinned dependencies into $(VENV) ..."
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable '.[io,web]'
+	@touch $@
+
+$(VENV)/installed: $(VENV)/installed-demo
+	@echo "installing what develops and tests it ..."
 	$(BIN)/python -m pip install --quiet --editable '.[develop]'
 	@touch $@
 

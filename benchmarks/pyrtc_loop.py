@@ -66,7 +66,8 @@ interaction_matrix = "interaction.npy"
 gain = {GAIN}
 leak = {LEAK}
 """
-_FIRST = ["chrt", "--fifo", "50"]
+_FIRST = ["chrt", "--fifo"]
+_PRIORITY = "50"
 """Real-time priority for all of them, where it is permitted."""
 Send = Callable[[int, int], float]
 
@@ -120,6 +121,10 @@ class System:
         """Halt its engine, or let it go on."""
         if self.engine is not None:
             self.engine.send_signal(signal.SIGSTOP if halted else signal.SIGCONT)
+
+    def choose(self, arm: str) -> None:
+        """Set its engine to one of ARMS."""
+        request(socket_path(self.control), "set", timeout_s=LENGTHY_TIMEOUT_S, changes=ARMS[arm])
 
     def latencies_us(self, count: int) -> NDArray[np.float64]:
         """Publish frames at the rate; return times to slopes and commands, (count, 2), NaN if not in time."""
@@ -192,16 +197,20 @@ class _Bench:
             self.systems[label] = System(send, f"{own}_slopes", f"{own}_commands", engine, own)
 
     def _start(self, module: list[str], folder: Path | None) -> subprocess.Popen[bytes]:
-        command = [*(_FIRST if first() else []), sys.executable, "-m", *module]
+        command = [sys.executable, "-m", *module]
         process = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         self.processes.append(process)
         return process
 
     def wait(self) -> None:
-        """Wait for one after the other."""
+        """Wait for one after the other, until all have compiled; then give them priority."""
         for system in self.systems.values():
             system.wait()
+            for arm in ARMS if system.control else ():
+                system.choose(arm)
             system.halt(True)
+        for process in self.processes if first() else ():
+            subprocess.run([*_FIRST, "--all-tasks", "--pid", _PRIORITY, str(process.pid)], check=True)
 
     def end(self) -> None:
         """End all processes."""
@@ -211,7 +220,8 @@ class _Bench:
 @cache
 def first() -> bool:
     """Whether real-time priority is permitted."""
-    return shutil.which(_FIRST[0]) is not None and subprocess.run([*_FIRST, "true"]).returncode == 0
+    permitted = [*_FIRST, _PRIORITY, "true"]
+    return shutil.which(_FIRST[0]) is not None and subprocess.run(permitted).returncode == 0
 
 
 def stream_name(name: str, label: str) -> str:
@@ -259,8 +269,7 @@ def measured() -> tuple[dict[str, NDArray[np.float64]], float]:
                 system.halt(False)
                 for arm in ARMS if system.control else ("",):
                     if arm:
-                        where = socket_path(system.control)
-                        request(where, "set", timeout_s=LENGTHY_TIMEOUT_S, changes=ARMS[arm])
+                        system.choose(arm)
                     system.latencies_us(SETTLE)
                     name = f"faintspot, {arm}, {label}" if arm else label
                     found.setdefault(name, []).append(system.latencies_us(FRAMES_A_ROUND))

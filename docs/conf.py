@@ -8,6 +8,10 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxTranslator
 from sphinx_gallery.scrapers import figure_rst
 from sphinx_gallery.sorting import FileNameSortKey
 
@@ -24,13 +28,12 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx_click",
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["tutorials/GALLERY_HEADER.rst", "sg_execution_times.rst"]
+exclude_patterns = ["tutorials/GALLERY_HEADER.rst", "**sg_execution_times.rst"]
 nitpicky = False
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
@@ -38,9 +41,15 @@ myst_heading_anchors = 4
 # The option tables have marks for the test that compares them with the declarations.
 suppress_warnings = ["config.cache", "myst.header"]
 
+templates_path = ["_templates"]
+smartquotes_action = "qe"  # "--option" stays as it is typed
+default_role = "py:obj"
+html_math_renderer = "mathml"
+
 autosummary_generate = True
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
+toc_object_entries_show_parents = "hide"
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
@@ -73,7 +82,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "faintspot"
 html_static_path = ["_static"]
 html_css_files = ["house.css"]
-html_copy_source = html_show_sourcelink = False
+html_copy_source = html_show_sourcelink = html_use_index = False
 html_theme_options = {
     "show_prev_next": True,
     "navigation_with_keys": False,
@@ -82,10 +91,12 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-html_sidebars: dict[str, list[str]] = {"index": [], "start": []}
+# Pages of the first level that have none below them
+html_sidebars: dict[str, list[str]] = {
+    page: [] for page in ("index", "start", "install", "realtime", "tune", "environments")
+}
 copybutton_prompt_text = r"\$ |>>> "
 copybutton_prompt_is_regexp = True
-# Formulas are drawn by MathJax, which a browser fetches; nothing is fetched while the pages are built.
 
 
 def _links_to_the_house(app: object, document: str, source: list[str]) -> None:
@@ -97,6 +108,15 @@ def _links_to_the_house(app: object, document: str, source: list[str]) -> None:
     )
 
 
-def setup(app: object) -> None:
+def _formula(translator: SphinxTranslator, node: nodes.math | nodes.math_block) -> None:
+    """Write a formula as MathML, which browsers draw by themselves, also where nothing can be fetched."""
+    block = isinstance(node, nodes.math_block)
+    formula = convert(node.astext(), display="block" if block else "inline")
+    translator.body.append(f'<div class="formula">{formula}</div>' if block else formula)
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
-    app.connect("source-read", _links_to_the_house)  # type: ignore[attr-defined]
+    app.connect("source-read", _links_to_the_house)
+    app.add_html_math_renderer("mathml", (_formula, None), (_formula, None))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,10 @@ import numpy as np
 import pytest
 
 import faintspot as fs
+from faintspot.estimators import estimators, registry
+from faintspot.io import read_telemetry, write_aot
+from faintspot.io.telemetry import TelemetryStore
+from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -34,9 +39,6 @@ NOT_RUN = {
     "study.run(": "starts processes of its own",
     "PixelRing.create": "needs a camera",
     "pyshmem.open": "needs a running engine",
-    "read_telemetry(": "needs a recording",
-    "read_aot(": "needs a recording",
-    "...\n": "a sketch",
 }
 """What marks a block that is not run here, and why."""
 
@@ -52,8 +54,9 @@ def blocks() -> list[Any]:
 
 @pytest.fixture
 def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Return what pages take for granted: a sensor, frames of it, and files of slopes."""
+    """Return what pages take for granted: a sensor, frames of it, files of slopes and a recorded night."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_kinds", estimators())  # a copy: a page registers an estimator of its own
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     rng = np.random.default_rng(1)
     layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
@@ -75,6 +78,7 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     slopes = pipeline(frames)
     for ending in ("npz", "fits", "zarr"):
         write_slopes(tmp_path / f"slopes.{ending}", frames[:20], layout, calibration)
+    write_night(tmp_path / "night", layout)
     return {
         "fs": fs,
         "np": np,
@@ -105,6 +109,24 @@ def write_slopes(path: Path, frames: Any, layout: fs.Layout, calibration: fs.Cal
     measure_recorded([path.parent / "frames.npy"], toml, path)
 
 
+def write_night(path: Path, layout: fs.Layout) -> None:
+    """Write telemetry of 20 frames with two arms in turn, in both formats."""
+    records = np.zeros(20, record_type(len(layout)))
+    records["frame"] = np.arange(20)
+    records["arm"] = records["frame"] % 2
+    kinds = record_type(len(layout)), image_type(layout.frame_shape, len(layout), layout.window)
+    told = {
+        "name": "night",
+        "layout": layout_values(layout),
+        "settings": "",
+        "arms": ["none", "tv"],
+        "dropped_records": 0,
+    }
+    store = TelemetryStore(path.with_suffix(".zarr"), *kinds, told)
+    store.append(records, np.zeros(1, kinds[1]), {"changes": []})
+    write_aot(path.with_suffix(".fits"), read_telemetry(store.path))
+
+
 @pytest.mark.parametrize("page", blocks())
 def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
     for number, code in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
@@ -120,6 +142,20 @@ def test_tables_have_a_head(page: Path) -> None:
     tables = [table.splitlines() for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)]
     headless = [rows[0] for rows in tables if len(rows) < 2 or not re.fullmatch(r"[|\s:-]+", rows[1])]
     assert headless == []
+
+
+def test_package_page_links_to_no_file() -> None:
+    """The page of a package index has no file beside the README."""
+    hooks = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["metadata"][
+        "hooks"
+    ]
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    for substitution in hooks["fancy-pypi-readme"]["substitutions"]:
+        page = re.sub(substitution["pattern"], substitution["replacement"], page)
+    assert "docs/start.md" in page
+    assert re.findall(r"\]\((?!https://)[^)]*\)", page) == []
+    assert "A noisy frame" not in page
+    assert "200 electrons a spot" not in page  # what the picture shows
 
 
 def test_what_is_not_run_is_there() -> None:

@@ -72,4 +72,5 @@ axes.barh(list(found), list(found.values()), color="#4477aa")
 axes.invert_yaxis()
 
 # %%
-# `learnt.save("psf.npz")` keeps it; `faintspot slopes` finds it beside faintspot.toml.
+# `learnt.save("psf.npz")` keeps it. For `faintspot slopes`, name it in faintspot.toml: a table `[psf]` with
+# `file = "psf.npz"`.

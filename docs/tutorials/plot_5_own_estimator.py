@@ -49,19 +49,28 @@ except fs.InputError as error:
     print(error)
 
 # %%
-# Against the built-in ones, on 2,000 simulated spots:
+# Against the built-in ones, on 2,000 simulated spots of 1,000 electrons:
+
+from matplotlib.figure import Figure
 
 images, truth = fs.simulate.subapertures(
     2000, flux_e=1000, detector=fs.simulate.Detector(read_noise_e=1.0), rng=np.random.default_rng(1)
 )
+errors_px = {}
 for settings in (
-    fs.Settings("power", power=2.0),
     fs.Settings("centroid"),
     fs.Settings("brightest", keep_brightest=20),
+    *(fs.Settings("power", power=power) for power in (1.5, 2.0, 3.0)),
 ):
     found = fs.estimators.measure(images, settings)
-    error_px = np.abs(np.column_stack([found.x, found.y]) - truth).mean()
-    print(f"{settings.estimator.name}: R = {error_px:.3f} px")
+    name = f"{settings.estimator.label} {getattr(settings.estimator, 'power', '')}".strip()
+    errors_px[name] = np.abs(np.column_stack([found.x, found.y]) - truth).mean()
+    print(f"{name}: R = {errors_px[name]:.3f} px")
+
+figure = Figure(figsize=(7, 2.6), layout="constrained")
+axes = figure.add_subplot(xlabel="slope error R, px")
+axes.barh(list(errors_px), list(errors_px.values()), color="#4477aa")
+axes.invert_yaxis()
 
 # %%
 # `faintspot.testing.EstimatorTests` has the tests that it should pass; a package of yours makes it known by

@@ -78,9 +78,9 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
 
 
 def read_arrays(
-    path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
+    path: str | Path, what: str, names: Sequence[str] | None = None, optional: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return the arrays of these names from a NumPy file (.npz) that should hold `what`.
+    """Return the arrays of these names, or all, from a NumPy file (.npz) that should hold `what`.
 
     Raises
     ------
@@ -89,12 +89,13 @@ def read_arrays(
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            values: dict[str, Any] = {name: stored[name] for name in names if name in stored}
+            wanted = list(stored) if names is None else names
+            values: dict[str, Any] = {name: stored[name] for name in wanted if name in stored}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception:  # a damaged archive raises whatever its decoder meets
         raise InputError(f"{path}: expected {what} (.npz), got something else") from None
-    for name in names:
+    for name in names or ():
         if name not in values and name not in optional:
             raise InputError(f"{path}: expected {what}, but {name} is missing")
     return values

@@ -80,7 +80,7 @@ def linked(text: str) -> str:
     ],
 )
 def test_nothing_spills(
-    window: tuple[int, int], before: int, algorithm: int, monkeypatch: pytest.MonkeyPatch
+    window: tuple[int, int], before: int, algorithm: bool | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("numba_cuda", reason="needs the extra gpu")
     from faintspot.cuda.fused import slopes_kernel

@@ -45,6 +45,23 @@ def doubled(values: Any) -> Any:
     return result
 
 
+@compiled
+def with_sign(number: Any, upwards: Any) -> Any:
+    return number if upwards else -number
+
+
+@compiled
+def with_both(values: Any, more: Any) -> Any:
+    return total_twice(values) + 0.5 * total_twice(more)
+
+
+@compiled
+def total_of(values: Any, more: Any) -> Any:
+    if more is not None:
+        return with_both(values, more)
+    return 0.0
+
+
 VALUES = np.arange(5.0)
 
 
@@ -95,3 +112,27 @@ def test_read_only_arrays_do_not_compile_anew_where_types_are_found_once() -> No
     frozen = VALUES.copy()
     frozen.flags.writeable = False
     assert direct(frozen) == direct(VALUES) == 20.0
+
+
+def test_a_part_is_not_compiled_anew_for_what_is_written_out() -> None:
+    @compiled
+    def three(offset: Any, upwards: Any) -> Any:
+        return with_sign(1, True) + with_sign(offset, upwards) + with_sign(2, False)
+
+    assert three(4, True) == 3
+    assert len(with_sign.overloads) == 1
+
+
+def test_of_what_is_none_nothing_is_compiled() -> None:
+    @compiled
+    def without(values: Any) -> Any:
+        return total_of(values, None)
+
+    @compiled
+    def twofold(values: Any) -> Any:
+        return total_of(values, values)
+
+    assert without(VALUES) == 0.0
+    assert not with_both.overloads
+    assert twofold(VALUES) == 30.0
+    assert with_both.overloads

@@ -46,11 +46,11 @@ def test_files_that_are_no_records_are_refused(tmp_path: Path) -> None:
         LoopRecord.load(tmp_path / "none.npz")
     text = tmp_path / "text.npz"
     text.write_text("hello")
-    with pytest.raises(InputError, match="not a record of a loop"):
+    with pytest.raises(InputError, match="expected a record of a loop"):
         LoopRecord.load(text)
     other = tmp_path / "other.npz"
     np.savez(other, a=1)
-    with pytest.raises(InputError, match="not a record of a loop"):
+    with pytest.raises(InputError, match="expected a record of a loop"):
         LoopRecord.load(other)
 
 

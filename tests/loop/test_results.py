@@ -68,11 +68,11 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         MagnitudeResult.load(path)
     path.write_bytes(b"nothing")
-    with pytest.raises(InputError, match="not a magnitude experiment") as error:
+    with pytest.raises(InputError, match="expected a magnitude experiment") as error:
         MagnitudeResult.load(path)
     assert "\n" not in str(error.value)
     magnitude_result().save(path)
-    with pytest.raises(InputError, match="not an error budget of format 2"):
+    with pytest.raises(InputError, match="expected an error budget of format 2"):
         BudgetResult.load(path)
 
 

@@ -124,6 +124,7 @@ def test_a_killed_engine_is_replaced(
 ) -> None:
     """What it leaves in shared memory is recognised and cleaned up; the camera does not notice."""
     wait_for("the engine", lambda: socket_path(name).exists())
+    wait_for("frames", lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10)
     captured(name, 3)
     processes[0].kill()
     processes[0].wait()

@@ -10,6 +10,7 @@ import gc
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from faintspot.realtime.module_loading import load_module
 
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
 FEW = max(50, 20 * TIMES)
+PATIENCE_S = 10.0  # for threads that are about to end
 FIRST = 12  # changes before the count begins: everything is compiled, and the heap has its size
 MODULE = """
 STAGE = "denoise"
@@ -76,6 +78,9 @@ class Changing:
         for number in range(FIRST, FIRST + count):
             change(number)
             self.send()
+        end = time.monotonic() + PATIENCE_S
+        while held()["threads"] > before["threads"] + 1 and time.monotonic() < end:
+            time.sleep(0.01)
         return {name: value - before[name] for name, value in held().items()}
 
     def close(self) -> None:

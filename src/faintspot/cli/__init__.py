@@ -45,8 +45,9 @@ class _LazyGroup(click.Group):
         """Import one command."""
         if name not in _COMMANDS:
             return None
-        module = __import__(f"faintspot.cli.{name}", fromlist=["command"])
-        return module.command  # type: ignore[no-any-return]
+        command: click.Command = __import__(f"faintspot.cli.{name}", fromlist=["command"]).command
+        command.name = name  # in the modules all are called "command"
+        return command
 
     def invoke(self, context: click.Context) -> Any:
         """Run a command."""

@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 @click.option(
     "--frames", type=click.IntRange(20), default=600, show_default=True, help="Frames at each flux."
 )
-@click.option("--seed", type=click.IntRange(0), default=2015, show_default=True, help="Of the simulation.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=2015, show_default=True, help="Seed of the simulation."
+)
 @demo_live.live_options
 @click.pass_context
 def command(context: click.Context, /, live: bool, output: str, frames: int, seed: int, **_: Any) -> None:

@@ -35,15 +35,17 @@ def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.IntRange(0, 65535),
             default=8642,
             show_default=True,
-            help="Live: of the page; 0: any.",
+            help="Live: port of the page; 0: any that is free.",
         ),
-        click.option("--name", default="faintspot", show_default=True, help="Live: of the engine."),
+        click.option(
+            "--name", default="faintspot", show_default=True, help="Live: name of the engine and its streams."
+        ),
         click.option(
             "--photons",
             type=float,
             default=100.0,
             show_default=True,
-            help="Live: per sub-aperture and frame.",
+            help="Live: photons per sub-aperture and frame.",
         ),
         click.option(
             "--rate",
@@ -51,16 +53,16 @@ def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="HZ",
             default=100.0,
             show_default=True,
-            help="Live: frames a second.",
+            help="Live: frames per second.",
         ),
         click.option(
             "--seconds",
             type=click.FloatRange(0, min_open=True),
             default=60.0,
             show_default=True,
-            help="Live: with a closed loop; then there is a table.",
+            help="Live: how long the loop is closed; then there is a table.",
         ),
-        click.option("--live", is_flag=True, help="Telescope, real-time engine and its page, instead."),
+        click.option("--live", is_flag=True, help="Run telescope, real-time engine and its page instead."),
     ):
         command = option(command)
     return command

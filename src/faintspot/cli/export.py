@@ -12,7 +12,7 @@ _CONFIG = click.option(
 _REFERENCE = click.option(
     "--reference",
     metavar="FILE",
-    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE or FILE:ARRAY.",
+    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
 )
 
 
@@ -32,7 +32,7 @@ def command() -> None:
     type=click.Choice(["fits", "npy"]),
     default="fits",
     show_default=True,
-    help="Of arrays.",
+    help="Format of arrays.",
 )
 def darc(config: str, output: str, reference: str | None, no_control: bool, form: str) -> None:
     """Write the parameters that users of DARC set by hand.

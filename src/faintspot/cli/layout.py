@@ -86,7 +86,7 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
 @click.option(
     "--dark",
     metavar="FILE|ADU",
-    help="Dark frame, or several (averaged), as FILE or FILE:ARRAY, or a number of ADU.",
+    help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU.",
 )
 @click.option("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
 @click.option(
@@ -105,12 +105,12 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
     "--pixel-scale",
     type=float,
     metavar="ARCSEC",
-    help="Of a pixel on the sky: for slopes in arcsec, wavefronts.",
+    help="Side of a pixel on the sky: for slopes in arcsec, wavefronts.",
 )
 @click.option(
     "--subaperture-size", type=float, metavar="M", help="Side of a sub-aperture in the telescope's pupil."
 )
-@click.option("--diameter", type=float, metavar="M", help="Of the telescope's pupil.")
+@click.option("--diameter", type=float, metavar="M", help="Diameter of the telescope's pupil.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option(
     "--overwrite",

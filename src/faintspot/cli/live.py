@@ -24,12 +24,20 @@ _NICENESS = 5  # the engine comes first
 @needs("live", "tornado", "pyshmem", "zarr")
 @click.command(short_help="Show a running engine, or a recording, as a web page.")
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
-@click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+@click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 @click.option(
-    "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Of this machine, to listen on."
+    "--bind",
+    default="127.0.0.1",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Address of this machine to listen on.",
 )
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=8642, show_default=True, help="0: any that is free."
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=8642,
+    show_default=True,
+    help="Port of the page; 0: any that is free.",
 )
 @click.option("--private", is_flag=True, help="Watching needs the token also on this machine.")
 @click.option(

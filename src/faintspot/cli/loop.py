@@ -198,7 +198,7 @@ def budget(
     default=".",
     show_default=True,
     metavar="FOLDER",
-    help="Gets faintspot.toml and matrices.",
+    help="Folder for faintspot.toml and matrices.",
 )
 @click.option(
     "--control",

@@ -21,15 +21,20 @@ if TYPE_CHECKING:
 @needs("realtime", "pyshmem", "zarr")
 @click.command("advise", short_help="Say what telemetry tells, and what would be better.")
 @click.option(
-    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Of the engine."
+    "-c",
+    "--config",
+    default="faintspot.toml",
+    show_default=True,
+    metavar="TOML",
+    help="Configuration of the engine.",
 )
-@click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+@click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 @click.option(
     "--seconds",
     type=click.FloatRange(1),
     default=10.0,
     show_default=True,
-    help="Of telemetry to look at; each trial takes three times as long.",
+    help="Seconds of telemetry to look at; each trial takes three times as long.",
 )
 @click.option(
     "--from",

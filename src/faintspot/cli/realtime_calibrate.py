@@ -13,28 +13,44 @@ from faintspot.errors import InputError, MissingExtraError
 @needs("realtime", "pyshmem")
 @click.command("calibrate", short_help="Measure interaction matrix and reference slopes.")
 @click.option(
-    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Gets [control]."
+    "-c",
+    "--config",
+    default="faintspot.toml",
+    show_default=True,
+    metavar="TOML",
+    help="Configuration that gets [control].",
 )
-@click.option("--name", default="faintspot", show_default=True, help="Of the engine and the streams.")
+@click.option("--name", default="faintspot", show_default=True, help="Name of the engine and the streams.")
 @click.option(
-    "--commands", type=click.IntRange(1), metavar="N", help="Of the mirror. Default: as before, or simulated."
+    "--commands",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Commands of the mirror. Default: as before, or as simulated.",
 )
 @click.option(
-    "--amplitude", type=float, default=50.0, show_default=True, help="Of a poke, in the mirror's unit."
+    "--amplitude",
+    type=float,
+    default=50.0,
+    show_default=True,
+    help="Amplitude of a poke, in the mirror's unit.",
 )
 @click.option(
     "--error",
     type=click.FloatRange(0, 1, min_open=True),
     default=0.05,
     show_default=True,
-    help="Of an actuator's slopes, as a part of them, that half of the actuators must reach.",
+    help="Relative error of an actuator's slopes that half of the actuators must reach.",
 )
-@click.option("--rounds", type=click.IntRange(4), default=100, show_default=True, help="At most.")
+@click.option("--rounds", type=click.IntRange(4), default=100, show_default=True, help="Most rounds.")
 @click.option(
-    "--settle-frames", type=click.IntRange(1), default=3, show_default=True, help="Until a command acts."
+    "--settle-frames",
+    type=click.IntRange(1),
+    default=3,
+    show_default=True,
+    help="Frames until a command acts.",
 )
 @click.option(
-    "--frames", type=click.IntRange(2), default=2, show_default=True, help="Averaged for each poke."
+    "--frames", type=click.IntRange(2), default=2, show_default=True, help="Frames averaged for each poke."
 )
 @click.option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
 def calibrate(

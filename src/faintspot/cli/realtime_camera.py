@@ -21,7 +21,9 @@ import click
     show_default=True,
     help="Configuration; its layout says where the spots are.",
 )
-@click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring, in shared memory.")
+@click.option(
+    "--name", default="faintspot", show_default=True, help="Name of the pixel ring, in shared memory."
+)
 @click.option("--rate", type=float, metavar="HZ", default=500.0, show_default=True, help="Frames a second.")
 @click.option("--flux-e", type=float, default=200.0, show_default=True, help="Per sub-aperture and frame.")
 @click.option(
@@ -29,10 +31,10 @@ import click
     type=click.Choice(["diffraction", "gaussian"]),
     default="diffraction",
     show_default=True,
-    help="Of the spots.",
+    help="Shape of the spots.",
 )
 @click.option(
-    "--size", type=float, default=1.0, show_default=True, help="Of the spots; 1 is Nyquist sampling."
+    "--size", type=float, default=1.0, show_default=True, help="Width of the spots; 1 is Nyquist sampling."
 )
 @click.option("--motion-px", type=float, default=0.3, show_default=True, help="Standard deviation per axis.")
 @click.option("--motion-time", type=float, metavar="S", default=0.01, show_default=True, help="Correlation.")
@@ -42,15 +44,19 @@ import click
 @click.option("--em-gain", type=float, help="1: no multiplication. Default: the configuration's.")
 @click.option("--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: the configuration's.")
 @click.option("--offset-adu", type=float, help="Level of every pixel. Default: the configuration's dark.")
-@click.option("--bits", type=int, help="Of the converter: whole ADU. Default: continuous values.")
+@click.option("--bits", type=int, help="Bits of the converter, for whole ADU. Default: continuous values.")
 @click.option(
-    "--readout-fraction", type=float, default=0.8, show_default=True, help="Part of the frame time."
+    "--readout-fraction",
+    type=float,
+    default=0.8,
+    show_default=True,
+    help="Read-out, as a part of the frame time.",
 )
 @click.option("--rows-per-block", type=int, default=4, show_default=True, help="Rows published together.")
 @click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
 @click.option("--distinct", type=int, default=200, show_default=True, help="Frames simulated, then repeated.")
 @click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
-@click.option("--seed", type=click.IntRange(0), help="Of the simulation. Default: another each time.")
+@click.option("--seed", type=click.IntRange(0), help="Seed of the simulation. Default: another each time.")
 def camera(config: str, name: str, rate: float, frames: int | None, slots: int, **options: Any) -> None:
     """Simulate a camera that publishes frames row by row, for `faintspot realtime run`.
 

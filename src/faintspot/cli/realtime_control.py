@@ -7,11 +7,12 @@ from typing import Any
 
 import click
 
+from faintspot.cli.engine_requests import asked_at_length
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
+from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 _REFRESH_S = 0.5
 
 
@@ -36,7 +37,7 @@ def get(name: str, settings: tuple[str, ...]) -> None:
         click.echo(f"{key} = {json.dumps(value)}")
 
 
-@click.command("set")
+@click.command("set", short_help="Change settings of a running engine, between two frames.")
 @_NAME
 @click.option("--subapertures", metavar="LIST", help="Which, such as 4,5,10-20. Default: all.")
 @click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
@@ -54,16 +55,14 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
 
     where = None if subapertures is None else parse_subapertures(subapertures)
     wanted = {"changes": parse_changes(changes), "where": where}
-    reply = request(socket_path(name), "set", timeout_s=LENGTHY_TIMEOUT_S, **wanted)
+    reply = asked_at_length(name, "set", **wanted)
     click.echo(_since(reply["frame"]))
 
 
-@click.command("interleave")
+@click.command("interleave", short_help="Have settings take turns in a running engine.")
 @_NAME
 @click.argument("arms")
-@click.option(
-    "--every", type=click.IntRange(1), default=50, show_default=True, help="Frames until the next one's turn."
-)
+@click.option("--every", type=click.IntRange(1), default=50, show_default=True, help="Frames of each turn.")
 def interleave(name: str, arms: str, every: int) -> None:
     """Have settings take turns in a running engine: ARMS as of run --interleave; "set" ends it.
 
@@ -71,7 +70,7 @@ def interleave(name: str, arms: str, every: int) -> None:
     Example:
       faintspot realtime interleave none,tv --every 100
     """
-    reply = request(socket_path(name), "interleave", timeout_s=LENGTHY_TIMEOUT_S, arms=arms, every=every)
+    reply = asked_at_length(name, "interleave", arms=arms, every=every)
     click.echo(_since(reply["frame"]))
 
 
@@ -82,7 +81,7 @@ def stop_engine(name: str) -> None:
     _asked(name, "stop")
 
 
-@click.command("top")
+@click.command("top", short_help="Watch a running engine in the terminal.")
 @_NAME
 def top(name: str) -> None:
     """Watch a running engine in the terminal; Ctrl-C ends watching."""

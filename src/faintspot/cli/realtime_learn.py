@@ -25,7 +25,11 @@ from faintspot.errors import InputError
     help="What learns.",
 )
 @click.option(
-    "--wind-speeds", default="5,10,20", show_default=True, metavar="LIST", help="Of the theory's layers, m/s."
+    "--wind-speeds",
+    default="5,10,20",
+    show_default=True,
+    metavar="LIST",
+    help="Wind speeds of the theory's layers, m/s.",
 )
 @click.option(
     "--layer",

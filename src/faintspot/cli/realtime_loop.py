@@ -11,10 +11,10 @@ from faintspot.cli.realtime_control import loop_in_words
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 
 
-@click.group("loop")
+@click.group("loop", short_help="Open or close the loop of a running engine.")
 def loop() -> None:
     """Open or close the loop of a running engine, whose configuration has [control].
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import click
 
-from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
-from faintspot.realtime.private_socket import socket_path
+from faintspot.cli.engine_requests import asked_at_length
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 
 _ISOLATE = click.option(
     "--isolate", is_flag=True, help="Run it in a process of its own: 60 us a frame or more."
@@ -34,10 +33,10 @@ def load(name: str, module: str, isolate: bool) -> None:
     Example:
       faintspot realtime load examples/median_module.py
     """
-    _show(_asked(name, "load", source=_source(module), isolate=isolate))
+    _show(asked_at_length(name, "load", source=_source(module), isolate=isolate))
 
 
-@click.command("swap")
+@click.command("swap", short_help="Put a module in the place of the one that is loaded.")
 @_NAME
 @_ISOLATE
 @click.argument("module", metavar="NAME_OR_PATH")
@@ -46,7 +45,7 @@ def swap(name: str, module: str, isolate: bool) -> None:
 
     A file is read anew: this also takes a changed version of a file that is loaded.
     """
-    _show(_asked(name, "swap", source=_source(module), isolate=isolate))
+    _show(asked_at_length(name, "swap", source=_source(module), isolate=isolate))
 
 
 @click.command("unload")
@@ -54,16 +53,16 @@ def swap(name: str, module: str, isolate: bool) -> None:
 @click.argument("stage", metavar="STAGE_OR_NAME")
 def unload(name: str, stage: str) -> None:
     """Put a built-in stage back in place of a module."""
-    reply = _asked(name, "unload", stage=stage)
+    reply = asked_at_length(name, "unload", stage=stage)
     click.echo(f"{reply['stage']}: the built-in stage, {_since(reply['frame'])}")
 
 
-@click.command("modules")
+@click.command("modules", short_help="List the modules that are installed and loaded.")
 @_NAME
 @click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def modules(name: str, as_json: bool) -> None:
     """List the modules that are installed and loaded, and the last fault."""
-    reply = _asked(name, "modules")
+    reply = asked_at_length(name, "modules")
     if as_json:
         click.echo(json.dumps(reply, indent=1))
         return
@@ -84,10 +83,6 @@ def _source(name_or_path: str) -> str:
     """A path as the engine finds it, whose working directory is another one; a name as it is."""
     is_path = name_or_path.endswith(".py") or "/" in name_or_path
     return str(Path(name_or_path).expanduser().resolve()) if is_path else name_or_path
-
-
-def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
-    return request(socket_path(name), what, timeout_s=LENGTHY_TIMEOUT_S, **fields)
 
 
 def _show(reply: dict[str, Any]) -> None:

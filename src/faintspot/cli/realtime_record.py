@@ -27,7 +27,7 @@ _AO_MODE = click.option(
 @needs("realtime", "zarr")
 @click.command("record", short_help="Record the telemetry of a running engine.")
 @click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
-@click.option("--name", default="faintspot", show_default=True, help="Of the engine.")
+@click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many.")
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
 @_AO_MODE

@@ -23,42 +23,43 @@ from faintspot.realtime.private_socket import socket_path
     "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Configuration."
 )
 @click.option(
-    "--name", default="faintspot", show_default=True, help="Of the pixel ring, the streams and the engine."
+    "--name",
+    default="faintspot",
+    show_default=True,
+    help="Name of the pixel ring, the streams and the engine.",
 )
 @click.option(
     "--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE."
 )
-@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Workers.")
+@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Worker threads.")
 @click.option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
 @click.option(
     "--priority",
     type=click.IntRange(0, 99),
     default=0,
-    help="Of SCHED_FIFO, with locked memory. Default: the ordinary scheduler.",
+    help="Priority of SCHED_FIFO, with locked memory. Default: the ordinary scheduler.",
 )
 @click.option(
     "--interleave",
     metavar="ARMS",
     help="Settings, and controllers, that take turns, such as none,tv or ml+integrator,map+kalman.",
 )
-@click.option(
-    "--every", type=click.IntRange(1), default=50, show_default=True, help="Frames until the next one's turn."
-)
+@click.option("--every", type=click.IntRange(1), default=50, show_default=True, help="Frames of each turn.")
 @click.option(
     "--deadline",
     type=click.FloatRange(0, min_open=True),
     default=1000.0,
     show_default=True,
-    help="From the last row, us; slopes that come later count as late.",
+    help="Slopes count as late so long after the last row, us.",
 )
 @click.option(
     "--images-every",
     type=click.IntRange(0),
     default=100,
     show_default=True,
-    help="Of so many frames, telemetry keeps one's images; 0: of none.",
+    help="Telemetry keeps the images of one frame in so many; 0: of none.",
 )
-@click.option("--close-loop", is_flag=True, help="With the first frame; see loop.")
+@click.option("--close-loop", is_flag=True, help="Close the loop with the first frame; see loop.")
 @click.option("--no-control", is_flag=True, help="Make no commands, whatever [control] says.")
 @click.option(
     "--mean-light",
@@ -66,7 +67,9 @@ from faintspot.realtime.private_socket import socket_path
     metavar="FRAMES",
     help="Tell estimators the light of every sub-aperture, averaged over so many frames.",
 )
-@click.option("--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="To begin with; see load.")
+@click.option(
+    "--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="Module to begin with; see load."
+)
 @click.option("--isolate", is_flag=True, help="Run these modules in processes of their own; see load.")
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
 @click.option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")

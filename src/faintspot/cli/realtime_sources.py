@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _HEAD_START_S = 0.5
 _ENDS_S = 5.0  # a thread looks at whether to stop many times a second
-_RING = click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring.")
+_RING = click.option("--name", default="faintspot", show_default=True, help="Name of the pixel ring.")
 _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
 
 
@@ -32,7 +32,7 @@ _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="F
 @click.option(
     "--rows-per-block", type=int, metavar="K", help="Row by row, K at a time. Default: whole frames."
 )
-@click.option("--first", type=int, default=0, show_default=True, help="Where to begin, counted from 0.")
+@click.option("--first", type=int, default=0, show_default=True, help="First frame, counted from 0.")
 @click.option("--frames", "count", type=int, metavar="N", help="How many from there on. Default: all.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @_SLOTS
@@ -108,7 +108,10 @@ def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable
 @click.option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
 @click.option("--commands", metavar="STREAM", help="Publish the commands so, too.")
 @click.option(
-    "--name", default="faintspot", show_default=True, help="Of the pixel ring, and of the engine's streams."
+    "--name",
+    default="faintspot",
+    show_default=True,
+    help="Name of the pixel ring and of the engine's streams.",
 )
 @click.option("--frames", type=int, metavar="N", help="Stop after that many came in. Default: at Ctrl-C.")
 @_SLOTS

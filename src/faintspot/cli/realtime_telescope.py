@@ -12,12 +12,14 @@ from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import TELESCOPE, socket_path
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Of the telescope.")
+_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the telescope.")
 
 
 @click.command("telescope", short_help="Simulate a telescope whose mirror follows a command stream.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
-@click.option("--name", default="faintspot", show_default=True, help="Of the pixel ring and the streams.")
+@click.option(
+    "--name", default="faintspot", show_default=True, help="Name of the pixel ring and the streams."
+)
 @click.option("--rate", type=float, metavar="HZ", help="Frames a second. Default: the configuration's.")
 @click.option(
     "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."
@@ -27,18 +29,27 @@ _NAME = click.option("--name", default="faintspot", show_default=True, help="Of 
     default="integrator",
     show_default=True,
     metavar="KIND",
-    help="That --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
+    help="Control that --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
 )
 @click.option(
-    "--readout-fraction", type=float, default=0.8, show_default=True, help="Part of the frame time."
+    "--readout-fraction",
+    type=float,
+    default=0.8,
+    show_default=True,
+    help="Read-out, as a part of the frame time.",
 )
 @click.option(
     "--rows-per-block", type=int, metavar="K", help="Rows published together. Default: a sub-aperture's."
 )
 @click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
 @click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
-@click.option("--seed", type=click.IntRange(0), help="Of air and noise. Default: the configuration's.")
-@click.option("--realisation", type=click.IntRange(0), default=0, help="Others have other air and noise.")
+@click.option("--seed", type=click.IntRange(0), help="Seed of air and noise. Default: the configuration's.")
+@click.option(
+    "--realisation",
+    type=click.IntRange(0),
+    default=0,
+    help="Number of the realisation; each has other air and noise.",
+)
 def telescope(
     configuration: str,
     name: str,
@@ -91,7 +102,7 @@ def telescope(
     )
 
 
-@click.command("telescope-set")
+@click.command("telescope-set", short_help="Change star or air of a simulated telescope.")
 @_NAME
 @click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
 def telescope_set(name: str, changes: tuple[str, ...]) -> None:
@@ -116,7 +127,7 @@ def telescope_set(name: str, changes: tuple[str, ...]) -> None:
     click.echo(f"{first}: {_in_words(conditions)}")
 
 
-@click.command("telescope-status")
+@click.command("telescope-status", short_help="Say what a simulated telescope sees.")
 @_NAME
 @click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def telescope_status(name: str, as_json: bool) -> None:

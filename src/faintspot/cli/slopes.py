@@ -52,7 +52,7 @@ from faintspot.written_changes import parse_changes
     "--unit",
     type=click.Choice(UNITS),
     default="px",
-    help="Of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
+    help="Unit of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
 )
 @click.option(
     "--mean-light",
@@ -63,7 +63,7 @@ from faintspot.written_changes import parse_changes
 @click.option(
     "--reference",
     metavar="FILE",
-    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE or FILE:ARRAY.",
+    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
 )
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option("--threads", type=click.IntRange(1), help="Most threads to use. Default: all processors.")

@@ -111,7 +111,7 @@ def _values(command: Callable[..., Any]) -> Callable[..., Any]:
     help="Configuration to write.",
 )
 @click.option("--picture", metavar="PNG", help="The plot. Default: beside the output, with -tune.png.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Of the simulation.")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the simulation.")
 @click.option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
 @tune_loop.loop_options
 @click.pass_context

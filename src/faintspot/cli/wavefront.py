@@ -35,10 +35,10 @@ from faintspot.wavefront.words import mode_table, remarks, rms_table
     help="How many, from tip and tilt on. Default: by the sensor.",
 )
 @click.option(
-    "--pixel-scale", type=float, metavar="ARCSEC", help="Of a detector pixel, instead of the layout's."
+    "--pixel-scale", type=float, metavar="ARCSEC", help="Side of a pixel on the sky, instead of the layout's."
 )
 @click.option("--subaperture-size", type=float, metavar="M", help="Side of a sub-aperture in the pupil.")
-@click.option("--diameter", type=float, metavar="M", help="Of the telescope's pupil.")
+@click.option("--diameter", type=float, metavar="M", help="Diameter of the telescope's pupil.")
 def command(
     slopes: str,
     output: tuple[str, ...],

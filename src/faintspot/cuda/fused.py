@@ -164,7 +164,7 @@ def make_locate(strips: Strips) -> Any:
 
 
 @cache
-def slopes_kernel(window: tuple[int, int], before: int, algorithm: int, warps: int = WARPS) -> Any:
+def slopes_kernel(window: tuple[int, int], before: int, algorithm: bool | None, warps: int = WARPS) -> Any:
     """Return the kernel for a window (ny, nx).
 
     Launch it with `warps` * 32 threads a block; blocks along x are a frame's, along y the frames. It takes

@@ -70,11 +70,11 @@ def advance_chambolle(q: Any, p: Any, r: Any, step_x: Any, step_y: Any, momentum
     q[1, r] = (q[1, r] + step_y) * shrink
 
 
-def make_sweep(strips: Strips, algorithm: int) -> Any:
+def make_sweep(strips: Strips, algorithm: bool | None) -> Any:
     """Return the function that makes one iteration on all pixels, and sums ||div q||^2 of this thread's."""
     rows, last, nx = strips.rows, strips.last_row, strips.nx
-    advance = advance_fgp if algorithm == FGP else advance_chambolle
-    step = float(FGP_STEP if algorithm == FGP else CHAMBOLLE_STEP)
+    advance = advance_fgp if algorithm is FGP else advance_chambolle
+    step = float(FGP_STEP if algorithm is FGP else CHAMBOLLE_STEP)
     mask = WARP - 1
 
     @device
@@ -120,11 +120,11 @@ def make_divergence(strips: Strips) -> Any:
     return divergence
 
 
-def make_change(strips: Strips, algorithm: int) -> Any:
+def make_change(strips: Strips, algorithm: bool | None) -> Any:
     """Return the convergence test: ||div p - div previous p||^2 <= tolerance^2 ||div p - g / lambda||^2."""
     rows = strips.rows
     divergence = make_divergence(strips)
-    fgp = algorithm == FGP
+    fgp = algorithm is FGP
 
     @device
     def has_converged(q: Any, p: Any, g: Any, lane: Any, inverse: Any, momentum: Any, tolerance: Any) -> Any:
@@ -143,10 +143,10 @@ def make_change(strips: Strips, algorithm: int) -> Any:
     return has_converged
 
 
-def make_iterations(strips: Strips, algorithm: int) -> Any:
+def make_iterations(strips: Strips, algorithm: bool | None) -> Any:
     """Return the function that iterates on p and q until the image has converged or the limit is reached."""
     sweep, has_converged = make_sweep(strips, algorithm), make_change(strips, algorithm)
-    divergence, rows, chambolle = make_divergence(strips), strips.rows, algorithm == CHAMBOLLE
+    divergence, rows, chambolle = make_divergence(strips), strips.rows, algorithm is CHAMBOLLE
 
     @device
     def iterate(
@@ -216,12 +216,12 @@ def make_normalise(strips: Strips) -> Any:
     return normalise
 
 
-def make_denoise(strips: Strips, algorithm: int) -> Any:
+def make_denoise(strips: Strips, algorithm: bool | None) -> Any:
     """Return the function that denoises an image, (rows,) per thread, in place."""
     rows, pixels = strips.rows, strips.ny * strips.nx
     normalise, divergence = make_normalise(strips), make_divergence(strips)
     start, iterate = make_start_flat(strips), make_iterations(strips, algorithm)
-    chambolle = algorithm == CHAMBOLLE
+    chambolle = algorithm is CHAMBOLLE
 
     @device
     def denoise(

@@ -57,7 +57,7 @@ def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtrac
 
     References
     ----------
-    .. [1] A. G. Basden, R. M. Myers & E. Gendron, 2012, MNRAS 419, 1628, and Basden et al. 2015,
+    .. [1] Basden, A. G., Myers, R. M. & Gendron, E., 2012, MNRAS 419, 1628, and Basden et al. 2015,
        arXiv:1503.06043.
 
     Examples

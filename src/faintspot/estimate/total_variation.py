@@ -131,9 +131,9 @@ def tv_denoise(
 
     References
     ----------
-    .. [1] A. Chambolle, 2004, J. Math. Imaging Vis. 20, 89.
-    .. [2] A. Beck & M. Teboulle, 2009, IEEE Trans. Image Process. 18, 2419.
-    .. [3] A. G. Basden, T. J. Morris, D. Gratadour & E. Gendron, 2015, MNRAS; arXiv:1503.06043.
+    .. [1] Chambolle, A., 2004, J. Math. Imaging Vis. 20, 89.
+    .. [2] Beck, A. & Teboulle, M., 2009, IEEE Trans. Image Process. 18, 2419.
+    .. [3] Basden, A. G., Morris, T. J., Gratadour, D. & Gendron, E., 2015, MNRAS; arXiv:1503.06043.
 
     Examples
     --------

@@ -19,7 +19,6 @@ from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Ne
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
-from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.groups import Task
 from faintspot.options import is_auto, option
 
@@ -132,22 +131,17 @@ class GravityPrepared(Prepared):
         automatic = self._keeping is not None and self._keeping.is_automatic
         self.needs_light = automatic and bool(np.isnan(sensor.flux_e).all())
 
-    # What the kernel, and that of the GPU, reads ------------------------------------------------------
+    # What the kernels read -------------------------------------------------------------------------------
 
     @property
     def before(self) -> int:
-        """What is done before the background subtraction, as the kernel calls it."""
+        """What is done before the background subtraction."""
         return gravity.NOTHING
 
     @property
-    def algorithm(self) -> int:
+    def algorithm(self) -> bool | None:
         """Of the denoising."""
         return next(iter(ALGORITHMS.values()))
-
-    @property
-    def flat_start(self) -> NDArray[np.float32]:
-        """What the denoising's start is computed from; no elements where there is none."""
-        return NO_TABLE
 
     @cached_property
     def taps(self) -> NDArray[np.float32]:
@@ -155,9 +149,14 @@ class GravityPrepared(Prepared):
         return np.ones((self.sensor.n, 2, 1), np.float32)  # not used
 
     @cached_property
+    def first_step(self) -> gravity.GravityTables:
+        """Tables of what is done before the background subtraction."""
+        return gravity.GravityTables()
+
+    @property
     def tables(self) -> Any:
         """See `Prepared`."""
-        return gravity.GravityTables(self.before, self.algorithm, self.flat_start, self.taps)
+        return self.first_step
 
     @property
     def own_scratch(self) -> Any:
@@ -168,8 +167,7 @@ class GravityPrepared(Prepared):
         """Return the kernel and its task for some of the stages: others before and after do the rest."""
         if background and (denoise or self.before == gravity.NOTHING):
             return self.kernel, task
-        before = self.before if denoise else gravity.NOTHING
-        tables = gravity.GravityTables(before, self.algorithm, self.flat_start, self.taps)
+        tables = self.first_step if denoise else gravity.GravityTables()
         settings = task.settings
         if not background:
             settings = settings.copy()

@@ -13,7 +13,6 @@ from faintspot.estimators.gravity import keep_all
 from faintspot.estimators.sensor import Sensor
 from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.kernels import gravity, groups
-from faintspot.kernels.flat_start import NO_TABLE
 from faintspot.kernels.groups import SlopeArrays
 
 _NO_LIGHT = np.uint8(SubapertureFlag.NO_LIGHT)
@@ -49,13 +48,11 @@ class PythonPrepared(Prepared):
             raise InputError(
                 f"estimator {estimator.name!r}: expected a class with `locate` or `prepared`, got neither"
             )
-        ones = np.ones((sensor.n, 2, 1), np.float32)
-        self._tables = gravity.GravityTables(gravity.NOTHING, 0, NO_TABLE, ones)
 
     @property
     def tables(self) -> Any:
         """See `Prepared`."""
-        return self._tables
+        return gravity.GravityTables()
 
     @property
     def own_scratch(self) -> Any:

@@ -96,3 +96,8 @@ class _Prepared(GravityPrepared):
         """See `GravityPrepared`."""
         std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
         return gaussian_taps(std, self.sensor.window)
+
+    @cached_property
+    def first_step(self) -> gravity.GravityTables:
+        """See `GravityPrepared`."""
+        return gravity.GravityTables(taps=self.taps)

@@ -163,14 +163,14 @@ class _Prepared(GravityPrepared):
         return gravity.DENOISE
 
     @property
-    def algorithm(self) -> int:
+    def algorithm(self) -> bool | None:
         """Of the denoising."""
         return ALGORITHMS[self.estimator.algorithm]
 
     @cached_property
-    def flat_start(self) -> NDArray[np.float32]:
+    def first_step(self) -> gravity.GravityTables:
         """See `GravityPrepared`."""
-        return flat_start_table(*self.sensor.window)
+        return gravity.GravityTables(flat_start_table(*self.sensor.window), self.algorithm)
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `Prepared`."""

@@ -88,8 +88,8 @@ def _tell_once() -> None:
 @cache
 def _warn_once(reason: str) -> None:
     warnings.warn(
-        f"compiled kernels cannot be kept ({reason}): every process compiles them anew, which takes half a "
-        "minute; set NUMBA_CACHE_DIR to a folder that can be written",
+        f"compiled kernels cannot be kept ({reason}): every process compiles them anew, which takes "
+        "seconds each time; set NUMBA_CACHE_DIR to a folder that can be written",
         CacheWarning,
         stacklevel=2,
     )

@@ -98,6 +98,13 @@ class _Kernel(CPUDispatcher):
         dispatcher._cache = kernel_cache(self.py_func, _kernels_stamp() + stamps)
         return dispatcher
 
+    def get_call_template(self, arguments: Any, named: Any) -> Any:
+        """Return what a call of these types is: what is written out is of the same type as any other value.
+
+        Else the same code would be compiled for every number that it is called with somewhere.
+        """
+        return super().get_call_template(tuple(map(types.unliteral, arguments)), named)
+
     def add_overload(self, result: Any) -> None:
         """Keep what kernels call; there is nothing that Python's call could find."""
         self.overloads[tuple(result.signature.args)] = result

@@ -62,10 +62,6 @@ def flat_start_table(ny: int, nx: int, dtype: DTypeLike = np.float32) -> NDArray
     return np.concatenate([cosines.ravel(), inverse.ravel()]).astype(dtype)
 
 
-NO_TABLE = np.zeros(0, np.float32)
-"""What stands for it where nothing is denoised."""
-
-
 @inlined
 def _product(lanes: Any, table: Any, entry: Any, vectors: Any, place: Any, total: Any) -> Any:
     return multiply_add(splat(lanes, get(table, entry)), load(lanes, vectors, place), total)

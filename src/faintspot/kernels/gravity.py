@@ -49,15 +49,13 @@ NOTHING, SMOOTH, DENOISE = range(3)
 
 
 class GravityTables(NamedTuple):
-    """What the kernel reads beside the settings."""
+    """What the kernel reads beside the settings; None, a type of its own, where that step is not compiled."""
 
-    before: Any
-    """NOTHING, SMOOTH or DENOISE."""
-    algorithm: Any
+    flat_start: Any = None
+    """From `flat_start_table`: images are denoised."""
+    algorithm: Any = None
     """Of the denoising, see `denoise_group`."""
-    flat_start: Any
-    """From `flat_start_table`; without elements where nothing is denoised."""
-    taps: Any
+    taps: Any = None
     """(n_subapertures, 2, 1 + reach) float32: of the smoothing along x and y, the central one first."""
 
 
@@ -87,40 +85,20 @@ def gravity_scratch(lanes: Lanes, ny: int, nx: int) -> GravityScratch:
 def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     """Find the centres of gravity of a group; an estimator's own kernel of `groups.measure_groups`."""
     lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
-    width = width_of(lanes)
-    image, output, own = scratch.image, scratch.spare, scratch.own
+    width, own = width_of(lanes), scratch.own
     _read_settings(width, first, settings, own.denoiser, own.counts, own.centroid)
-    denoised = output
-    if tables.before == DENOISE:
-        denoise_group(
-            lanes,
-            tables.algorithm,
-            True,  # strengths are lowered
-            tables.flat_start,
-            ny,
-            nx,
-            image,
-            output,
-            own.state,
-            own.rows,
-            own.denoiser,
-            own.counts,
-        )
-    elif tables.before == SMOOTH:
-        gather_taps(width, first, tables.taps, own.rows)
-        smooth_group(lanes, image, ny, nx, tables.taps.shape[2] - 1, own.rows, own.state, output)
-    else:
-        denoised = image
+    flat_start, algorithm, taps = tables
+    denoised = _first_step(flat_start, algorithm, taps, group, scratch.image, scratch.spare, own)
     if stages.shape[0] > 0:
         store_stage(width, denoised, stages[DENOISED, group.frame], first)
     _set_threshold(lanes, denoised, ny * nx, own.centroid)
     if settings[VARIANCE, first] >= 0.0:
-        _centre_and_error(lanes, image, denoised, ny, nx, own.centroid)
+        _centre_and_error(lanes, scratch.image, denoised, ny, nx, own.centroid)
     else:
         _centre_of_gravity(lanes, denoised, ny, nx, own.centroid)
     if stages.shape[0] > 0:
-        _subtract_background(lanes, denoised, ny * nx, own.centroid, output)
-        store_stage(width, output, stages[BACKGROUND, group.frame], first)
+        _subtract_background(lanes, denoised, ny * nx, own.centroid, scratch.spare)
+        store_stage(width, scratch.spare, stages[BACKGROUND, group.frame], first)
     for row, found in (
         (FLUX, brightest.SUM),
         (X, brightest.X),
@@ -131,6 +109,35 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         store(scratch.results, row * width, load(lanes, own.centroid, found * width))
     for lane in range(width):
         _flag_lane(width, lane, ny, nx, first, settings, own, scratch)
+
+
+@compiled
+def _first_step(
+    flat_start: Any, algorithm: Any, taps: Any, group: Any, image: Any, output: Any, own: Any
+) -> Any:
+    """Denoise or smooth the images where there are tables for it; return where the result is."""
+    lanes, ny, nx = group.lanes, group.ny, group.nx
+    if flat_start is not None:
+        denoise_group(
+            lanes,
+            algorithm,
+            True,  # strengths are lowered
+            flat_start,
+            ny,
+            nx,
+            image,
+            output,
+            own.state,
+            own.rows,
+            own.denoiser,
+            own.counts,
+        )
+        return output
+    if taps is not None:
+        gather_taps(width_of(lanes), group.first, taps, own.rows)
+        smooth_group(lanes, image, ny, nx, taps.shape[2] - 1, own.rows, own.state, output)
+        return output
+    return image
 
 
 @compiled

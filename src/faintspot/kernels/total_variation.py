@@ -36,8 +36,8 @@ CHECK_INTERVAL = 24
 # the second where that is asked for. Chosen by the slope error of simulated spots, docs/automatic.md.
 HIGHEST_STRENGTH, LOWERED_STRENGTH = 0.9, 0.6
 
-FGP = 0
-CHAMBOLLE = 1
+# Of two types, so that "chambolle" is compiled only where it is used.
+FGP, CHAMBOLLE = None, True
 
 # Rows of the table of per-lane numbers (n_rows, W), in the precision of the lanes.
 STRENGTH, TOLERANCE = 0, 1  # in: noise_std in image units, relative change at which to stop
@@ -249,7 +249,7 @@ def denoise_group(
     Parameters
     ----------
     lanes : Lanes
-    algorithm : int
+    algorithm : None or bool
         FGP or CHAMBOLLE.
     lowers : bool
         Whether a strength above HIGHEST_STRENGTH is lowered, which INFEASIBLE then says.
@@ -282,7 +282,7 @@ def denoise_group(
     momentum, momentum_age, current, iteration = 0.0, MOMENTUM_AGE, 0, 0
     while active > 0:
         iteration += 1
-        if algorithm == FGP:
+        if algorithm is FGP:
             norm = sweep_fgp(lanes, state, rows, ny, nx, current, splat(lanes, momentum), inverse)
         else:
             norm = sweep_chambolle(lanes, state, rows, ny, nx, current, inverse)

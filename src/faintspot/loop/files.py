@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import save_arrays
+from faintspot.files import read_arrays, save_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,32 +48,15 @@ class Stored:
         InputError
             When it cannot be read, or is something else.
         """
-        values = load_arrays(Path(path), cls.WHAT)
+        values = read_arrays(path, cls.WHAT)
         found = values.pop("format", None)
         if found is not None and found.shape == () and 0 < int(found) < cls.FORMAT:
             raise InputError(
                 f"{path}: {cls.WHAT} of an earlier version of faintspot: measure again, in another folder"
             )
         if found != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
-            raise InputError(f"{path}: not {cls.WHAT} of format {cls.FORMAT}")
+            raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
         return cls(**{name: _restored(value) for name, value in values.items()})
-
-
-def load_arrays(path: Path, what: str) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a NumPy file; `what` it should be is named in messages.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception as error:  # a damaged archive raises whatever its reader meets
-        raise InputError(f"{path}: not {what} ({error})".splitlines()[0]) from None
 
 
 def make_folder(folder: str | Path) -> Path:

@@ -17,10 +17,10 @@ from faintspot.estimate.noise import suggested_strength
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.files import save_arrays
+from faintspot.files import read_arrays, save_arrays
 from faintspot.loop.arms import LoopArm
 from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.files import load_arrays, make_folder
+from faintspot.loop.files import make_folder
 from faintspot.loop.magnitude import unit_store
 from faintspot.loop.record import LoopRecord
 from faintspot.loop.results import InterleavedResult, set_file
@@ -298,7 +298,7 @@ class _SetStore:
         return set_file(self._folder, int(key)).exists()
 
     def read(self, key: str) -> Arrays:
-        return load_arrays(set_file(self._folder, int(key)), LoopRecord.WHAT)
+        return read_arrays(set_file(self._folder, int(key)), LoopRecord.WHAT)
 
     def write(self, key: str, result: Arrays) -> None:
         save_arrays(set_file(self._folder, int(key)), result)

@@ -170,6 +170,8 @@ def markdown(dataset: xarray.Dataset, command: str) -> str:
     """
     parts = [
         "# How near to the limit\n",
+        "How near does each estimator come to the smallest slope error that photons and read noise allow, "
+        "the Cramer-Rao bound?\n",
         f"Made by `{command}`: {dataset.attrs['n']} images of each cell, settings chosen on one half and "
         f"scored on the other, seed {dataset.attrs['seed']}; all arms have the range of true positions as "
         "their search range. The arms are those of [study.md](study.md).\n",
