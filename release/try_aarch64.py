@@ -3,7 +3,7 @@
 Fetches Debian's Python and wheels of the pinned versions for aarch64 into build/aarch64, installs nothing,
 and runs the tests under qemu-aarch64 (Debian: apt-get install qemu-user). Kernels are compiled in
 the emulator, too, which takes half an hour of one core; they are kept in the folder. Arguments go to
-pytest: `python release/try_aarch64.py tests/realtime`.
+pytest: `python release/try_aarch64.py tests/test_pipeline.py`.
 
 On an aarch64 machine it is `pytest -m portable`.
 """
