@@ -3,7 +3,7 @@
 Fetches Debian's Python and wheels of the pinned versions for aarch64 into build/aarch64, installs nothing,
 and runs the tests under qemu-aarch64 (Debian: apt-get install qemu-user). Kernels are compiled in
 the emulator, too, which takes half an hour of one core; they are kept in the folder. Arguments go to
-pytest: `python release/try_aarch64.py tests/realtime`.
+pytest: `python release/try_aarch64.py tests/test_pipeline.py`.
 
 On an aarch64 machine it is `pytest -m portable`.
 """
@@ -117,8 +117,10 @@ def write_wrapper(python: Path) -> None:
         f"export NUMBA_CACHE_DIR='{FOLDER}/kernels' OPENBLAS_NUM_THREADS=1 FAINTSPOT_PATIENCE={PATIENCE}",
         f"exec qemu-aarch64 -L '{SYSTEM}' -0 '{PYTHON}' '{python}' \"$@\"",
     )
-    PYTHON.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    PYTHON.chmod(0o755)
+    text = "\n".join(lines) + "\n"
+    if not PYTHON.exists() or PYTHON.read_text(encoding="utf-8") != text:  # another run may be using it
+        PYTHON.write_text(text, encoding="utf-8")
+        PYTHON.chmod(0o755)
 
 
 def run(command: list[str], folder: Path = ROOT) -> str:
