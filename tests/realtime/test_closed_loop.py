@@ -91,16 +91,21 @@ def test_open_close_flat_and_gain(sky: Sky, files: tuple[Path, Control]) -> None
     np.testing.assert_allclose(sent[2], -0.25 * control.reconstructor.matrix @ slopes, rtol=1e-5, atol=1e-4)
     np.testing.assert_array_equal(sent[5:7], sent[[4, 4]])
     assert not sent[7:].any()
-    wait_for_change = [each["changes"] for each in _changes(sky)]
-    assert wait_for_change[-1]["loop"] == "open"
-    assert wait_for_change[-1]["opened_because"] == "asked to"
+    changes = [each["changes"] for each in _changes(sky)]
+    assert changes[-1]["loop"] == "open"
+    assert changes[-1]["opened_because"] == "asked to"
 
 
 def _changes(sky: Sky) -> list[dict[str, Any]]:
-    """What telemetry says of changes, once the watcher has looked."""
+    """What telemetry says of changes, once the watcher has seen the last one."""
     assert sky.running is not None
-    time.sleep(0.1)
-    return sky.running.telemetry.changes_since(0)[0]
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        changes = sky.running.telemetry.changes_since(0)[0]
+        last = changes[-1]["changes"] if changes else {}
+        if last.get("opened_because") == sky.loop.opened_because or time.monotonic() > end:
+            return changes
+        time.sleep(0.01)
 
 
 def with_options(control: Control, **changes: Any) -> Control:
