@@ -85,6 +85,7 @@ html_css_files = ["house.css"]
 html_copy_source = html_show_sourcelink = html_use_index = False
 html_theme_options = {
     "show_prev_next": True,
+    "show_toc_level": 2,
     "navigation_with_keys": False,
     "header_links_before_dropdown": 6,
     "secondary_sidebar_items": ["page-toc"],

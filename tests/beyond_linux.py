@@ -39,6 +39,8 @@ def take_linux_away() -> None:
     for module, beginnings in LINUX_ONLY.items():
         for name in [name for name in dir(module) if name.startswith(tuple(beginnings.split()))]:
             delattr(module, name)
+    if sys.version_info >= (3, 13):
+        os.process_cpu_count = os.cpu_count  # as the module os has it elsewhere
     for name in ("stat", "lstat", "access"):
         setattr(os, name, functools.partial(_asked, getattr(os, name)))
     sys.addaudithook(_opened)
