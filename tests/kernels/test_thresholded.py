@@ -43,8 +43,10 @@ def assert_close(found: fs.Slopes, expected: fs.Slopes) -> None:
     for name in ("flags", "bad_pixels", "iterations"):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
     for name in ("x", "y", "flux", "standard_error_x", "standard_error_y"):
+        # The square of a standard error is a small difference of such sums.
+        rounding = ROUNDING * (5 if name.startswith("standard_error") else 1)
         np.testing.assert_allclose(
-            getattr(found, name), getattr(expected, name), rtol=ROUNDING, atol=ROUNDING, err_msg=name
+            getattr(found, name), getattr(expected, name), rtol=rounding, atol=rounding, err_msg=name
         )
 
 
