@@ -6,14 +6,9 @@ from typing import Any
 
 import click
 
-_CONFIG = click.option(
-    "--config", "-c", metavar="TOML", default="faintspot.toml", show_default=True, help="What to export."
-)
-_REFERENCE = click.option(
-    "--reference",
-    metavar="FILE",
-    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
-)
+from faintspot.cli.shared_options import REFERENCE, configuration_option
+
+_CONFIG = configuration_option("What to export.")
 
 
 @click.group(short_help="Write settings as the files that other controllers read.")
@@ -24,7 +19,7 @@ def command() -> None:
 @command.command("darc")
 @_CONFIG
 @click.option("--output", "-o", metavar="FOLDER", default="darc", show_default=True, help="A new folder.")
-@_REFERENCE
+@REFERENCE
 @click.option("--no-control", is_flag=True, help="Without the control matrix of [control].")
 @click.option(
     "--format",
@@ -59,7 +54,7 @@ def darc(config: str, output: str, reference: str | None, no_control: bool, form
 @click.option(
     "--output", "-o", metavar="FITS", default="weights.fits", show_default=True, help="What to write."
 )
-@_REFERENCE
+@REFERENCE
 def weights(config: str, output: str, reference: str | None) -> None:
     """Write the weights of estimator window as FITS.
 

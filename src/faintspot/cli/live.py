@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from faintspot.cli.needs import needs
+from faintspot.cli.shared_options import ENGINE_NAME
 from faintspot.extras import require, require_linux
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ _NICENESS = 5  # the engine comes first
 @needs("live", "tornado", "pyshmem", "zarr")
 @click.command(short_help="Show a running engine, or a recording, as a web page.")
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
-@click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
+@ENGINE_NAME
 @click.option(
     "--bind",
     default="127.0.0.1",

@@ -9,6 +9,7 @@ import click
 
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.cli.shared_options import ENGINE_NAME, configuration_option
 from faintspot.errors import InputError
 from faintspot.extras import require_linux
 
@@ -20,15 +21,8 @@ if TYPE_CHECKING:
 
 @needs("realtime", "pyshmem", "zarr")
 @click.command("advise", short_help="Say what telemetry tells, and what would be better.")
-@click.option(
-    "-c",
-    "--config",
-    default="faintspot.toml",
-    show_default=True,
-    metavar="TOML",
-    help="Configuration of the engine.",
-)
-@click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
+@configuration_option("Configuration of the engine.")
+@ENGINE_NAME
 @click.option(
     "--seconds",
     type=click.FloatRange(1),

@@ -7,20 +7,14 @@ from typing import Any
 import click
 
 from faintspot.cli.needs import needs
+from faintspot.cli.shared_options import configuration_option, name_option
 from faintspot.errors import InputError, MissingExtraError
 
 
 @needs("realtime", "pyshmem")
 @click.command("calibrate", short_help="Measure interaction matrix and reference slopes.")
-@click.option(
-    "-c",
-    "--config",
-    default="faintspot.toml",
-    show_default=True,
-    metavar="TOML",
-    help="Configuration that gets [control].",
-)
-@click.option("--name", default="faintspot", show_default=True, help="Name of the engine and the streams.")
+@configuration_option("Configuration that gets [control].")
+@name_option("Name of the engine and the streams.")
 @click.option(
     "--commands",
     type=click.IntRange(1),

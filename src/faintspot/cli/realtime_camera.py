@@ -11,19 +11,12 @@ from typing import Any
 
 import click
 
+from faintspot.cli.shared_options import configuration_option, name_option
+
 
 @click.command("camera", short_help="Simulate a camera that publishes frames row by row.")
-@click.option(
-    "--config",
-    "-c",
-    metavar="TOML",
-    default="faintspot.toml",
-    show_default=True,
-    help="Configuration; its layout says where the spots are.",
-)
-@click.option(
-    "--name", default="faintspot", show_default=True, help="Name of the pixel ring, in shared memory."
-)
+@configuration_option("Configuration; its layout says where the spots are.")
+@name_option("Name of the pixel ring, in shared memory.")
 @click.option("--rate", type=float, metavar="HZ", default=500.0, show_default=True, help="Frames a second.")
 @click.option("--flux-e", type=float, default=200.0, show_default=True, help="Per sub-aperture and frame.")
 @click.option(

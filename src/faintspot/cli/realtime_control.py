@@ -9,15 +9,15 @@ import click
 
 from faintspot.cli.engine_requests import asked_at_length
 from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.cli.shared_options import ENGINE_NAME
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 _REFRESH_S = 0.5
 
 
 @click.command("status")
-@_NAME
+@ENGINE_NAME
 @click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def status(name: str, as_json: bool) -> None:
     """Say what a running engine has seen and how fast it is."""
@@ -26,7 +26,7 @@ def status(name: str, as_json: bool) -> None:
 
 
 @click.command("get")
-@_NAME
+@ENGINE_NAME
 @click.argument("settings", nargs=-1)
 def get(name: str, settings: tuple[str, ...]) -> None:
     """Show settings of a running engine: all, or those named.
@@ -38,7 +38,7 @@ def get(name: str, settings: tuple[str, ...]) -> None:
 
 
 @click.command("set", short_help="Change settings of a running engine, between two frames.")
-@_NAME
+@ENGINE_NAME
 @click.option("--subapertures", metavar="LIST", help="Which, such as 4,5,10-20. Default: all.")
 @click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
 def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) -> None:
@@ -60,7 +60,7 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
 
 
 @click.command("interleave", short_help="Have settings take turns in a running engine.")
-@_NAME
+@ENGINE_NAME
 @click.argument("arms")
 @click.option("--every", type=click.IntRange(1), default=50, show_default=True, help="Frames of each turn.")
 def interleave(name: str, arms: str, every: int) -> None:
@@ -75,14 +75,14 @@ def interleave(name: str, arms: str, every: int) -> None:
 
 
 @click.command("stop")
-@_NAME
+@ENGINE_NAME
 def stop_engine(name: str) -> None:
     """End a running engine."""
     _asked(name, "stop")
 
 
 @click.command("top", short_help="Watch a running engine in the terminal.")
-@_NAME
+@ENGINE_NAME
 def top(name: str) -> None:
     """Watch a running engine in the terminal; Ctrl-C ends watching."""
     from rich.live import Live

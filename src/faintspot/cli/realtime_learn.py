@@ -7,15 +7,14 @@ from pathlib import Path
 import click
 
 from faintspot.cli.needs import needs
+from faintspot.cli.shared_options import configuration_option
 from faintspot.errors import InputError
 
 
 @needs("realtime", "zarr")
 @click.command("learn", short_help="Have a controller learn from a recording of the closed loop.")
 @click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
-@click.option(
-    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Its [control]."
-)
+@configuration_option("Its [control].")
 @click.option(
     "--control",
     "kind",

@@ -8,10 +8,9 @@ from typing import Any
 import click
 
 from faintspot.cli.realtime_control import loop_in_words
+from faintspot.cli.shared_options import ENGINE_NAME
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
-
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
 
 
 @click.group("loop", short_help="Open or close the loop of a running engine.")
@@ -29,7 +28,7 @@ def loop() -> None:
 
 
 @loop.command("status")
-@_NAME
+@ENGINE_NAME
 @click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def status(name: str, as_json: bool) -> None:
     """Say whether it is closed, and if not, why."""
@@ -38,28 +37,28 @@ def status(name: str, as_json: bool) -> None:
 
 
 @loop.command("open")
-@_NAME
+@ENGINE_NAME
 def open_loop(name: str) -> None:
     """Open it: the mirror keeps what it has."""
     click.echo(loop_in_words(_asked(name, "open")))
 
 
 @loop.command("close")
-@_NAME
+@ENGINE_NAME
 def close_loop(name: str) -> None:
     """Close it, from what the mirror has on."""
     click.echo(loop_in_words(_asked(name, "close")))
 
 
 @loop.command("flat")
-@_NAME
+@ENGINE_NAME
 def flat(name: str) -> None:
     """Have the mirror flat, while the loop is open."""
     click.echo(loop_in_words(_asked(name, "flat")))
 
 
 @loop.command("gain")
-@_NAME
+@ENGINE_NAME
 @click.argument("gain", type=float)
 def gain(name: str, gain: float) -> None:
     """Change the loop gain from the next frame on."""

@@ -9,8 +9,7 @@ from typing import Any
 import click
 
 from faintspot.cli.engine_requests import asked_at_length
-
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
+from faintspot.cli.shared_options import ENGINE_NAME
 
 _ISOLATE = click.option(
     "--isolate", is_flag=True, help="Run it in a process of its own: 60 us a frame or more."
@@ -18,7 +17,7 @@ _ISOLATE = click.option(
 
 
 @click.command("load")
-@_NAME
+@ENGINE_NAME
 @_ISOLATE
 @click.argument("module", metavar="NAME_OR_PATH")
 def load(name: str, module: str, isolate: bool) -> None:
@@ -37,7 +36,7 @@ def load(name: str, module: str, isolate: bool) -> None:
 
 
 @click.command("swap", short_help="Put a module in the place of the one that is loaded.")
-@_NAME
+@ENGINE_NAME
 @_ISOLATE
 @click.argument("module", metavar="NAME_OR_PATH")
 def swap(name: str, module: str, isolate: bool) -> None:
@@ -49,7 +48,7 @@ def swap(name: str, module: str, isolate: bool) -> None:
 
 
 @click.command("unload")
-@_NAME
+@ENGINE_NAME
 @click.argument("stage", metavar="STAGE_OR_NAME")
 def unload(name: str, stage: str) -> None:
     """Put a built-in stage back in place of a module."""
@@ -58,7 +57,7 @@ def unload(name: str, stage: str) -> None:
 
 
 @click.command("modules", short_help="List the modules that are installed and loaded.")
-@_NAME
+@ENGINE_NAME
 @click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def modules(name: str, as_json: bool) -> None:
     """List the modules that are installed and loaded, and the last fault."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.cli.needs import needs
+from faintspot.cli.shared_options import ENGINE_NAME
 from faintspot.errors import InputError
 from faintspot.extras import require
 
@@ -27,7 +28,7 @@ _AO_MODE = click.option(
 @needs("realtime", "zarr")
 @click.command("record", short_help="Record the telemetry of a running engine.")
 @click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
-@click.option("--name", default="faintspot", show_default=True, help="Name of the engine.")
+@ENGINE_NAME
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many.")
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
 @_AO_MODE

@@ -14,20 +14,14 @@ from faintspot.cli.live import page_beside
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.realtime_control import summary
+from faintspot.cli.shared_options import configuration_option, name_option
 from faintspot.realtime.private_socket import socket_path
 
 
 @needs("realtime", "pyshmem")
 @click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
-@click.option(
-    "-c", "--config", default="faintspot.toml", show_default=True, metavar="TOML", help="Configuration."
-)
-@click.option(
-    "--name",
-    default="faintspot",
-    show_default=True,
-    help="Name of the pixel ring, the streams and the engine.",
-)
+@configuration_option("Configuration.")
+@name_option("Name of the pixel ring, the streams and the engine.")
 @click.option(
     "--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE."
 )

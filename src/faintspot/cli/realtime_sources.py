@@ -12,6 +12,7 @@ import click
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.cli.shared_options import name_option
 from faintspot.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 _HEAD_START_S = 0.5
 _ENDS_S = 5.0  # a thread looks at whether to stop many times a second
-_RING = click.option("--name", default="faintspot", show_default=True, help="Name of the pixel ring.")
+_RING = name_option("Name of the pixel ring.")
 _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
 
 
@@ -107,12 +108,7 @@ def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable
 @click.option("--from", "source", metavar="STREAM", help="Frames: a pyshmem stream, isio:NAME or dao:FILE.")
 @click.option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
 @click.option("--commands", metavar="STREAM", help="Publish the commands so, too.")
-@click.option(
-    "--name",
-    default="faintspot",
-    show_default=True,
-    help="Name of the pixel ring and of the engine's streams.",
-)
+@name_option("Name of the pixel ring and of the engine's streams.")
 @click.option("--frames", type=int, metavar="N", help="Stop after that many came in. Default: at Ctrl-C.")
 @_SLOTS
 def bridge(

@@ -9,17 +9,16 @@ from typing import Any
 import click
 
 from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.cli.shared_options import name_option
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import TELESCOPE, socket_path
 
-_NAME = click.option("--name", default="faintspot", show_default=True, help="Name of the telescope.")
+_NAME = name_option("Name of the telescope.")
 
 
 @click.command("telescope", short_help="Simulate a telescope whose mirror follows a command stream.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
-@click.option(
-    "--name", default="faintspot", show_default=True, help="Name of the pixel ring and the streams."
-)
+@name_option("Name of the pixel ring and the streams.")
 @click.option("--rate", type=float, metavar="HZ", help="Frames a second. Default: the configuration's.")
 @click.option(
     "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from faintspot.cli.progress import progress_bar
+from faintspot.cli.shared_options import REFERENCE, configuration_option
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.flags import SubapertureFlag
 from faintspot.io.formats import slope_format
@@ -19,14 +20,7 @@ from faintspot.written_changes import parse_changes
 
 @click.command(short_help="Turn recorded frames into slopes.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
-@click.option(
-    "--config",
-    "-c",
-    metavar="TOML",
-    default="faintspot.toml",
-    show_default=True,
-    help="Layout, settings, calibration.",
-)
+@configuration_option("Layout, settings, calibration.")
 @click.option(
     "--output",
     "-o",
@@ -60,11 +54,7 @@ from faintspot.written_changes import parse_changes
     help="Take the light of spots as their mean over the recording, not that of each frame: for steady, "
     "faint stars.",
 )
-@click.option(
-    "--reference",
-    metavar="FILE",
-    help="Reference positions: slopes of a flat wavefront (their mean), or (n, 2) px as FILE[:ARRAY].",
-)
+@REFERENCE
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @click.option("--threads", type=click.IntRange(1), help="Most threads to use. Default: all processors.")
 @click.option(
