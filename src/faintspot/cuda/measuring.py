@@ -123,7 +123,8 @@ class DevicePipeline:
         self.layout = layout
         self.calibration = calibration
         self._preparation = preparation
-        self._kernel = slopes_kernel(layout.window, prepared.before, prepared.algorithm)
+        first_step = prepared.first_step
+        self._kernel = slopes_kernel(layout.window, prepared.before, first_step.algorithm)
         height, line = layout.frame_shape
         if height * line > MOST_FRAME_PIXELS:
             raise InputError(
@@ -134,7 +135,8 @@ class DevicePipeline:
         self._places = cuda.to_device((layout.corners @ [line, 1]).astype(np.int32))
         maps = np.asarray(calibration.maps(layout.frame_shape), np.float32)
         self._maps = cuda.to_device(np.ascontiguousarray(maps.reshape(2, -1)))
-        self._taps = cuda.to_device(np.ascontiguousarray(prepared.taps, np.float32))
+        taps = np.ones((len(layout), 2, 1)) if first_step.taps is None else first_step.taps  # ones: not used
+        self._taps = cuda.to_device(np.ascontiguousarray(taps, np.float32))
         self._pivots = cuda.to_device(inverse_pivots(layout.window))
         self._tables: tuple[NDArray[np.float32], Any] | None = None
         self._first_variants = cuda.to_device(np.zeros(1, np.int32))

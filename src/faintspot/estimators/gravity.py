@@ -14,7 +14,6 @@ from faintspot.checks import LARGEST_FLOAT32
 from faintspot.errors import InputError
 from faintspot.estimate.automatic import automatic_kept_pixels
 from faintspot.estimate.brightest import RULES, most_kept, threshold_rank
-from faintspot.estimate.total_variation import ALGORITHMS
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Need, Prepared, Step
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
@@ -133,25 +132,17 @@ class GravityPrepared(Prepared):
 
     # What the kernels read -------------------------------------------------------------------------------
 
-    @property
-    def before(self) -> int:
-        """What is done before the background subtraction."""
-        return gravity.NOTHING
-
-    @property
-    def algorithm(self) -> bool | None:
-        """Of the denoising."""
-        return next(iter(ALGORITHMS.values()))
-
-    @cached_property
-    def taps(self) -> NDArray[np.float32]:
-        """Taps of every sub-aperture's smoothing, (n, 2, 1 + reach)."""
-        return np.ones((self.sensor.n, 2, 1), np.float32)  # not used
-
     @cached_property
     def first_step(self) -> gravity.GravityTables:
         """Tables of what is done before the background subtraction."""
         return gravity.GravityTables()
+
+    @property
+    def before(self) -> int:
+        """What that is: NOTHING, SMOOTH or DENOISE of `faintspot.kernels.gravity`."""
+        if self.first_step.flat_start is not None:
+            return gravity.DENOISE
+        return gravity.NOTHING if self.first_step.taps is None else gravity.SMOOTH
 
     @property
     def tables(self) -> Any:

@@ -86,18 +86,8 @@ class Smoothed(KeepingBrightest):
 class _Prepared(GravityPrepared):
     """Taps of the smoothing."""
 
-    @property
-    def before(self) -> int:
-        """Smoothing."""
-        return gravity.SMOOTH
-
-    @cached_property
-    def taps(self) -> NDArray[np.float32]:
-        """See `GravityPrepared`."""
-        std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
-        return gaussian_taps(std, self.sensor.window)
-
     @cached_property
     def first_step(self) -> gravity.GravityTables:
         """See `GravityPrepared`."""
-        return gravity.GravityTables(taps=self.taps)
+        std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
+        return gravity.GravityTables(taps=gaussian_taps(std, self.sensor.window))

@@ -157,20 +157,12 @@ class _Prepared(GravityPrepared):
 
     estimator: TotalVariation
 
-    @property
-    def before(self) -> int:
-        """Denoising."""
-        return gravity.DENOISE
-
-    @property
-    def algorithm(self) -> bool | None:
-        """Of the denoising."""
-        return ALGORITHMS[self.estimator.algorithm]
-
     @cached_property
     def first_step(self) -> gravity.GravityTables:
         """See `GravityPrepared`."""
-        return gravity.GravityTables(flat_start_table(*self.sensor.window), self.algorithm)
+        return gravity.GravityTables(
+            flat_start_table(*self.sensor.window), ALGORITHMS[self.estimator.algorithm]
+        )
 
     def fill(self, table: NDArray[np.float32]) -> None:
         """See `Prepared`."""
