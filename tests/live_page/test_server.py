@@ -73,7 +73,14 @@ def test_page_and_its_files_need_nothing_else() -> None:
     served(check)
 
 
-@pytest.mark.parametrize("host", ["example.org", "example.org:80", "127.0.0.1.example.org", "[", "", "a:b:c"])
+@pytest.mark.parametrize(
+    "host",
+    [
+        "example.org", "example.org:80", "127.0.0.1.example.org", "[", "", "a:b:c", "[::1]example.org",
+        "[::1].example.org:80", "127.0.0.1:80.example.org", "127.0.0.1:80@example.org", "localhost:",
+        "[127.0.0.1]",
+    ],
+)  # fmt: skip
 def test_forged_host_is_refused(host: str) -> None:
     async def check(server: LiveServer) -> None:
         assert await status_of(server, "/", Host=host) in (400, 403)
@@ -88,6 +95,18 @@ def test_forged_host_is_refused(host: str) -> None:
 def test_forged_origin_is_refused(origin: str) -> None:
     async def check(server: LiveServer) -> None:
         assert await refused_with(server, Origin=origin) == 403
+
+    served(check)
+
+
+@pytest.mark.parametrize("suffix", [".example.org", "@example.org", "0", "/", "/page", " "])
+def test_origin_that_only_begins_as_the_page_is_refused(suffix: str) -> None:
+    headers = {"Host": "127.0.0.1:8642", "Origin": "http://127.0.0.1:8642"}
+    assert Access.permits_origin(headers)
+    assert not Access.permits_origin(headers | {"Origin": headers["Origin"] + suffix})
+
+    async def check(server: LiveServer) -> None:
+        assert await refused_with(server, Origin=f"http://127.0.0.1:{server.port}.example.org") == 403
 
     served(check)
 
@@ -157,10 +176,13 @@ def test_a_stranger_who_says_nothing_is_let_go(monkeypatch: pytest.MonkeyPatch) 
     "garbage",
     [
         "", "{", "[]", "null", '"hello"', "1e999", '{"do": 5}', '{"token": "x"}', "[" * 5000, "\x00\ud7ff",
-        b"\xff\xfe", b"",
+        b"\xff\xfe", b"", '{"do": "set", "id": NaN}',
+        '{"do": "set", "id": Infinity}', '{"do": "set", "id": -1e999}',
+        '{"do": "set", "id": "\\ud800"}', '{"do": "hello", "token": "\\udfff"}',
+        '{"do": "set", "a": [{"b": NaN}]}',
     ],
 )  # fmt: skip
-def test_garbage_closes_that_client_alone(garbage: str | bytes) -> None:
+def test_garbage_closes_that_client_alone(garbage: str | bytes, caplog: pytest.LogCaptureFixture) -> None:
     async def check(server: LiveServer) -> None:
         good, bad = await connected(server), await connected(server)
         for connection in (good, bad):
@@ -171,6 +193,27 @@ def test_garbage_closes_that_client_alone(garbage: str | bytes) -> None:
         await next_of(good, "now")
 
     served(check)
+    assert not caplog.records
+
+
+def test_errors_are_logged_at_the_servers_pace(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(value: object) -> None:
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr(server_module, "plain", fail)
+    monkeypatch.setattr(server_module, "_rate_limit", server_module._RateLimit())
+
+    async def check(server: LiveServer) -> None:
+        for _ in range(20):
+            client = await connected(server)
+            await client.send(json.dumps({"do": "hello"}))
+            while await client.read() is not None:
+                pass
+
+    served(check)
+    assert len(caplog.records) == 1
 
 
 def test_huge_message_closes_that_client_alone() -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 from collections.abc import Mapping
-from urllib.parse import urlsplit
 
 from faintspot.errors import InputError
 
 _LOOPBACK = "localhost"
+_HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?", re.IGNORECASE | re.ASCII)
+"""IPv6 address in brackets, or a name or an IPv4 address; with or without a port."""
 
 
 class Access:
@@ -45,13 +47,14 @@ class Access:
 
     def permits_host(self, host: str | None) -> bool:
         """Whether a request's Host header names this machine."""
-        name = urlsplit(f"//{host}").hostname if host and _splits(f"//{host}") else None
-        if name is None:
+        match = _HOST.fullmatch(host or "")
+        if match is None:
             return False
+        version_6, name = match.groups()
         try:
-            ipaddress.ip_address(name)
+            ipaddress.IPv6Address(version_6) if version_6 else ipaddress.IPv4Address(name)
         except ValueError:
-            return name in (_LOOPBACK, socket.gethostname().lower())
+            return not version_6 and name.lower() in (_LOOPBACK, socket.gethostname().lower())
         return True
 
     @staticmethod
@@ -63,10 +66,3 @@ class Access:
     def knows(self, token: object) -> bool:
         """Whether it is the token; takes as long for any other."""
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self.token.encode())
-
-
-def _splits(url: str) -> bool:
-    try:
-        return urlsplit(url).hostname is not None
-    except ValueError:
-        return False

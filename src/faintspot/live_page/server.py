@@ -7,6 +7,7 @@ import contextlib
 import json
 import logging
 import socket
+import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -49,6 +50,7 @@ _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+_LOG_INTERVAL_S = 60.0
 _GARBAGE, _TOO_SLOW, _NOT_ALLOWED = 1008, 1013, 1008  # codes of closing a web socket
 
 
@@ -89,8 +91,7 @@ class LiveServer:
             ) from None
         listening.setblocking(False)
         self._address, self.port = address, int(listening.getsockname()[1])
-        for name in ("tornado.access", "tornado.general"):  # what strangers send does not fill the terminal
-            logging.getLogger(name).addHandler(logging.NullHandler())
+        _limit_logging()
         self._http = HTTPServer(
             Application(
                 [
@@ -137,6 +138,34 @@ class LiveServer:
                 self._loop.call_soon_threadsafe(self.board.forget, kind)
             else:
                 self._loop.call_soon_threadsafe(self.board.post, kind, message)
+
+
+class _RateLimit(logging.Filter):
+    """Passes one record in `_LOG_INTERVAL_S`, with the number of records left out since the last one."""
+
+    _next_s, _left_out = 0.0, 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether the record is logged."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            self._left_out += 1
+            return False
+        if self._left_out:
+            record.msg, record.args = f"{record.getMessage()} ({self._left_out} more left out)", ()
+        self._next_s, self._left_out = now_s + _LOG_INTERVAL_S, 0
+        return True
+
+
+_rate_limit = _RateLimit()
+
+
+def _limit_logging() -> None:
+    """Keep clients from filling the log: no record of their mistakes, few of the server's errors."""
+    for name in ("tornado.access", "tornado.general"):
+        logging.getLogger(name).addHandler(logging.NullHandler())
+    for name in ("tornado.application", "asyncio"):
+        logging.getLogger(name).addFilter(_rate_limit)
 
 
 def _assets() -> dict[str, tuple[str, bytes]]:
@@ -267,10 +296,11 @@ class Client(_Guarded, WebSocketHandler):
 
 
 def _parsed(message: str | bytes) -> dict[str, Any]:
-    """Return a request: a JSON object that says what to do."""
+    """Return a request: a JSON object that says what to do, of values that JSON can send back."""
     try:
         request = parse_json(message) if isinstance(message, str) else None
-    except ValueError:
+        json.dumps(request, allow_nan=False, ensure_ascii=False).encode()  # NaN, infinity, lone surrogates
+    except (ValueError, RecursionError):
         request = None
     if not isinstance(request, dict) or not isinstance(request.get("do"), str):
         raise InputError('expected a JSON object with "do"')
