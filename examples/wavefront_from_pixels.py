@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
 from faintspot.control.kalman import SlopePredictor
-from faintspot.control.turbulence import phase_covariance_rad2
 from faintspot.loop import LoopConfiguration, load_loop
 from faintspot.loop.arms import arm_kind
 from faintspot.loop.control import learnt_control
 from faintspot.loop.observatory import LoopOptics, Observatory, prepare
 from faintspot.loop.simulation import Idealised, _Loop
+from faintspot.turbulence.slope_covariance import phase_covariance_rad2
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from faintspot.control.learning import Plant
 from faintspot.control.models import SlopeModel
 from faintspot.control.reconstructor import make_reconstructor
 from faintspot.control.telemetry import Telemetry
-from faintspot.control.turbulence import SlopeTurbulence
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 FRAME_S = 0.004
 CELLS = np.array([[row, column] for row in range(3) for column in range(3)], np.float64)

@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 from faintspot.errors import InputError
 from faintspot.simulate import Detector, speckled_spots, spots, subapertures
-from faintspot.simulate.turbulence import _structure
+from faintspot.turbulence.von_karman import structure_function
 
 
 def centres_of_gravity(images: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -189,7 +189,7 @@ def test_the_outer_scale_takes_tilt_away() -> None:
     assert rms(3.0) < 0.8 * rms(30.0) < 0.8 * rms(None)
     # Von Karman turbulence with an immense outer scale is Kolmogorov's: 1.03 (2 pi r / L0)^(1/3) less.
     r = np.array([0.02, 0.3, 1.4])
-    np.testing.assert_allclose(_structure(r, 1e5), kolmogorov(r), rtol=0.06)
+    np.testing.assert_allclose(structure_function(r, 1e5), kolmogorov(r), rtol=0.06)
 
 
 def test_every_image_has_its_own_turbulence_and_size() -> None:

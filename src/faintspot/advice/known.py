@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import calibration_of_electrons
 from faintspot.advice.seen import Seen
-from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
 from faintspot.estimate.noise import pixel_noise
 from faintspot.loop.configuration import ARCSEC
-from faintspot.loop.seeing import estimate_r0
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.training.psf_learning import learn_psf_from_images
+from faintspot.turbulence.seeing import estimate_r0
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from faintspot.checks import numbers_between
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
 from faintspot.control.telemetry import Telemetry, make_telemetry
-from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
 from faintspot.sensor.layout import Layout
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:
     from faintspot.io.telemetry import Telemetry as Recording

@@ -15,7 +15,7 @@ from faintspot.errors import InputError
 from faintspot.estimate.automatic import automatic_kept_pixels
 from faintspot.estimate.brightest import RULES, most_kept, threshold_rank
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Need, Prepared, Step
-from faintspot.estimators.scene import Scene
+from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
 from faintspot.kernels.groups import Task
@@ -27,7 +27,6 @@ KEPT_FRACTION = 0.08  # of a window's pixels, where keep_brightest is not given:
 FEWEST_KEPT = 5
 FLUX_FLOOR = 1e-4
 _KEPT = (1.0, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0, 4.5)  # times the automatic number
-_PIXEL_BLUR_PX2 = 0.46  # by so much a pixel raises the square of a spot's full width at half maximum
 _USUAL_RANGE_PX = 1.0  # of positions, where no search range is set
 
 
@@ -196,7 +195,7 @@ class GravityPrepared(Prepared):
     def rule_arguments(self, flux_e: Floats) -> dict[str, Any]:
         """Return what the automatic rules ask: light, camera, and the spots before the pixels blur them."""
         sensor, fwhm = self.sensor, self.sensor.spot_fwhm_px
-        optical = np.sqrt(np.maximum(fwhm**2 - _PIXEL_BLUR_PX2, 0.25 * fwhm**2))
+        optical = np.sqrt(np.maximum(fwhm**2 - PIXEL_BLUR_PX2, 0.25 * fwhm**2))
         # As the kernel's table holds them.
         reach = sensor.search_range_px.astype(np.float32)
         return {

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-_PIXEL_BLUR_PX2 = 0.46  # that the pixel adds to the square of a Gaussian spot's width
+PIXEL_BLUR_PX2 = 0.46
+"""Increase of a Gaussian spot's squared FWHM by the integration over a pixel, px^2."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Scene:
     @property
     def seen_fwhm_px(self) -> float:
         """Width of the spots with the pixels' blur."""
-        return math.sqrt(self.spot_fwhm_px**2 + _PIXEL_BLUR_PX2)
+        return math.sqrt(self.spot_fwhm_px**2 + PIXEL_BLUR_PX2)
 
     @property
     def lambda_over_d_px(self) -> float:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from faintspot.compare.statistics import Estimate, mean_by_blocks, paired_mean
 from faintspot.errors import InputError
+from faintspot.loop.pseudo_open_loop import r0_of_record
 from faintspot.loop.record import LoopRecord
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
-from faintspot.loop.seeing import Seeing, mean_r0, r0_of_record
 from faintspot.loop.statistics import (
     MagnitudeGain,
     RegressionLine,
@@ -21,6 +21,7 @@ from faintspot.loop.statistics import (
     neighbour_differences,
     regression_line,
 )
+from faintspot.turbulence.seeing import Seeing, mean_r0
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.loop.configuration import R0_WAVELENGTH_M, LoopConfiguration
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.turbulence.von_karman import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float32]
 
@@ -131,8 +132,7 @@ def _screen_points(outer_scale_m: float, width_m: float, spacing_m: float) -> in
 def _amplitudes(size: int, spacing_m: float, outer_scale_m: float) -> Floats:
     """Return the amplitude of each frequency (of a real transform) of a screen of r0 = 1 m, nm.
 
-    From the power spectral density of the phase, 0.0229 r0^(-5/3) (f^2 + 1 / L0^2)^(-11/6), f in cycles per
-    m, von Karman. Frequencies beyond what points can hold are aliased, as by sampling real turbulence.
+    Frequencies beyond what the points can hold are aliased, as by sampling real turbulence.
     """
     rows, columns = np.fft.fftfreq(size, spacing_m), np.fft.rfftfreq(size, spacing_m)
     power = np.zeros((len(rows), len(columns)), np.float32)
@@ -144,7 +144,7 @@ def _amplitudes(size: int, spacing_m: float, outer_scale_m: float) -> Floats:
             power += square ** np.float32(-11 / 6)
     power[0, 0] = 0  # piston
     to_nm = R0_WAVELENGTH_M * 1e9 / (2 * math.pi)
-    amplitude: Floats = np.sqrt(power) * np.float32(math.sqrt(0.0229) / spacing_m * to_nm)
+    amplitude: Floats = np.sqrt(power) * np.float32(math.sqrt(SPECTRUM) / spacing_m * to_nm)
     return amplitude
 
 

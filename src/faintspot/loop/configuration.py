@@ -19,11 +19,10 @@ from faintspot.estimators.scene import Scene
 from faintspot.loop.checked_fields import LIST, NUMBER_OR_LIST, checked_section, number
 from faintspot.sizes import check_size
 from faintspot.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
+from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
 
 ARCSEC = math.pi / 180 / 3600
 """Radians in one arcsecond."""
-R0_WAVELENGTH_M = 500e-9
-"""Wavelength at which r0 is given."""
 
 CLOSED, OPEN = "closed", "open"
 SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d

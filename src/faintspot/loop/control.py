@@ -14,11 +14,11 @@ from faintspot.control.commands import CommandLine
 from faintspot.control.integrator import Integrator
 from faintspot.control.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
 from faintspot.control.telemetry import Telemetry, make_telemetry
-from faintspot.control.turbulence import SlopeTurbulence
 from faintspot.errors import InputError
 from faintspot.loop.arms import PRIOR, LoopArm
 from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
 from faintspot.loop.record import LoopRecord
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:
     from faintspot.loop.observatory import LoopOptics

@@ -1,4 +1,4 @@
-"""Slopes as they would be without a mirror, from the telemetry of a closed loop."""
+"""Pseudo-open-loop slopes from the telemetry of a closed loop, and their Fried parameter."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between
 from faintspot.errors import InputError
+from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.record import LoopRecord
+from faintspot.turbulence.seeing import Seeing, estimate_r0
 
 Floats = NDArray[np.float64]
+
+_LEAST_ILLUMINATION = 0.85  # the theory is that of whole squares
 
 
 def pseudo_open_loop_slopes(
@@ -76,6 +80,36 @@ def open_loop_slopes(record: LoopRecord) -> Floats:
         return measured
     return pseudo_open_loop_slopes(
         record.slopes_px, record.commands, record.interaction_matrix, centroid_gain=gain
+    )
+
+
+def r0_of_record(record: LoopRecord, frames: ArrayLike, *, remove_tip_tilt: bool = True) -> Seeing:
+    """Return r0 from a run's frames, chosen by a mask, with the run's own outer scale; see `estimate_r0`.
+
+    Only sub-apertures that are at least 85 % illuminated are used; if there are none, all are.
+
+    Raises
+    ------
+    InputError
+        When there are fewer than 20 frames.
+    """
+    configuration = LoopConfiguration.from_text(record.configuration)
+    chosen = np.flatnonzero(np.asarray(frames))
+    usable = record.illumination >= _LEAST_ILLUMINATION
+    if not usable.any():
+        usable = np.ones_like(usable)
+    gaps = np.cumsum(np.diff(chosen, prepend=chosen[:1]) > 1)
+    slopes = open_loop_slopes(record)[:, np.tile(usable, 2)]
+    return estimate_r0(
+        slopes[chosen],
+        cells=record.cells[usable],
+        subaperture_m=record.subaperture_m,
+        pixel_scale_rad=record.pixel_scale_rad,
+        outer_scale_m=configuration.atmosphere.outer_scale_m,
+        baseline_m=record.subaperture_m * (1 - 1 / configuration.sensor.samples),
+        segment=gaps,
+        static_px=slopes[record.scored].mean(axis=0),
+        remove_tip_tilt=remove_tip_tilt,
     )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import number_between
 from faintspot.loop.pseudo_open_loop import pseudo_open_loop_slopes
-from faintspot.loop.seeing import Seeing, estimate_r0
+from faintspot.turbulence.seeing import Seeing, estimate_r0
 
 Floats = NDArray[np.float64]
 

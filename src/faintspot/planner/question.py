@@ -19,7 +19,7 @@ from faintspot.compare.photometry import (
     Photometry,
 )
 from faintspot.errors import InputError
-from faintspot.estimators.scene import Scene
+from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
@@ -278,7 +278,7 @@ class Question:
         if self.psf is not None and self.fwhm_px is None:
             widths = self.psf.fwhm_px.mean(axis=0)
             # The PSF includes the pixel, which widens it; exact for Gaussian spots.
-            self._put("fwhm_px", math.sqrt(max(float(widths.prod()) - 0.46, 0.01)))
+            self._put("fwhm_px", math.sqrt(max(float(widths.prod()) - PIXEL_BLUR_PX2, 0.01)))
         if self.fwhm_px is None:
             known = [self.lenslet_m, self.wavelength_nm, self.pixel_scale_arcsec]
             if any(value is None for value in known):

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from faintspot.checks import number_between, numbers_between
 from faintspot.errors import InputError
-from faintspot.loop.configuration import ARCSEC, R0_WAVELENGTH_M, LoopConfiguration
+from faintspot.loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.toml_files import check_keys
+from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
 
 if TYPE_CHECKING:
     from faintspot.realtime.control import Handler

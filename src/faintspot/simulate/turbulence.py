@@ -13,6 +13,7 @@ from faintspot.checks import finite_array, number_between, numbers_between, one_
 from faintspot.errors import InputError
 from faintspot.simulate.generators import spawn
 from faintspot.simulate.spots import SMALLEST_SIZE, image_shape, per_spot
+from faintspot.turbulence.von_karman import structure_function
 
 Floats = NDArray[np.float64]
 
@@ -185,24 +186,6 @@ def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
     return int(np.clip(2 * math.ceil(wanted / 2), _FEWEST_POINTS, _MOST_POINTS))
 
 
-def _structure(r: Floats, outer_scale: float) -> Floats:
-    """Return the phase structure function for r0 = 1, rad^2.
-
-    Kolmogorov, or von Karman: D(r) = 2 (B(0) - B(r)) with B(r) proportional to
-    (L0 / r0)^(5/3) (2 pi r / L0)^(5/6) K_5/6(2 pi r / L0) (Conan 2008, JOSA A 25, 526).
-    """
-    from scipy.special import gamma, kv  # here: importing it takes 0.1 s, which slopes do not need
-
-    if math.isinf(outer_scale):
-        kolmogorov: Floats = 6.88 * r ** (5 / 3)
-        return kolmogorov
-    t = 2 * np.pi * np.maximum(r, 1e-12) / outer_scale
-    factor = gamma(11 / 6) / (2 ** (5 / 6) * np.pi ** (8 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
-    at_zero = 2 ** (-1 / 6) * gamma(5 / 6)
-    von_karman: Floats = 2 * factor * outer_scale ** (5 / 3) * (at_zero - t ** (5 / 6) * kv(5 / 6, t))
-    return von_karman
-
-
 @functools.lru_cache(maxsize=8)
 def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
     """Return the square root of the covariance of phases and mean gradients, for d = r0 = 1.
@@ -217,7 +200,7 @@ def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
     y = np.concatenate([y, line, line, half, -half])
     n = points**2
     distance = np.hypot(x[:, None] - x, y[:, None] - y)
-    structure = _structure(distance, outer_scale)
+    structure = structure_function(distance, outer_scale)
     from_piston = structure[:n].mean(axis=0)
     covariance = 0.5 * (from_piston[:, None] + from_piston - structure - from_piston[:n].mean())
     edges = np.repeat([[1.0, -1.0, 0, 0], [0, 0, 1, -1]], points, axis=1) / points

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from tests.control.control_cases import COVARIANCES, TURBULENCE
 
-from faintspot.control.turbulence import SlopeTurbulence, phase_covariance_rad2
 from faintspot.loop import LoopConfiguration
 from faintspot.loop.atmosphere import make_atmosphere
 from faintspot.loop.control import slope_turbulence
-from faintspot.loop.seeing import slope_variance
+from faintspot.turbulence.seeing import slope_variance
+from faintspot.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
 
 
 @pytest.mark.parametrize("outer_scale_m", [2.0, 25.0, math.inf])

@@ -16,12 +16,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.special import gamma, kv
+
+from faintspot.turbulence.von_karman import R0_WAVELENGTH_M, structure_function
 
 Floats = NDArray[np.float64]
 
-_R0_WAVELENGTH_M = 500e-9  # at which r0 is given
-_KOLMOGOROV = 6.88
 _SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations in outer scales of the table
 _DIRECTIONS = 8
 _POINTS = 6  # of the quadrature along half an edge
@@ -64,7 +63,7 @@ class SlopeTurbulence:
         total = 0.0
         for strength, (wind_x, wind_y) in zip(part, self.wind_m_per_s, strict=True):
             total = total + strength * self._of_layer(x - wind_x * later_s, y - wind_y * later_s)
-        scale = self.r0_m ** (-5 / 3) * (_R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
+        scale = self.r0_m ** (-5 / 3) * (R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
         return np.asarray(scale * total)
 
     def turned(self, factor: float, degrees: float) -> Self:
@@ -141,21 +140,14 @@ class _Structure:
         self._scale = outer_scale_m
         if math.isfinite(outer_scale_m):
             line = np.geomspace(_SMALLEST, _LARGEST, _NODES)
-            self._table = CubicSpline(np.log(line), np.log(_von_karman(line)))
+            self._table = CubicSpline(np.log(line), np.log(structure_function(line, 1.0)))
 
     def __call__(self, square_m2: Floats) -> Floats:
         square = np.maximum(square_m2, 1e-20)
         if not math.isfinite(self._scale):
-            return np.asarray(_KOLMOGOROV * square ** (5 / 6))
+            return structure_function(np.sqrt(square), math.inf)
         separation = np.clip(0.5 * np.log(square / self._scale**2), math.log(_SMALLEST), math.log(_LARGEST))
         return np.asarray(np.exp(self._table(separation)) * self._scale ** (5 / 3))
-
-
-def _von_karman(separation: Floats) -> Floats:
-    """Return the structure function for r0 = 1, outer scale 1 (Conan 2008, JOSA A 25, 526)."""
-    x = 2 * math.pi * separation
-    factor = 2 ** (1 / 6) * gamma(11 / 6) / math.pi ** (8 / 3) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)
-    return np.asarray(factor * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x)))
 
 
 @lru_cache(maxsize=4)

@@ -8,7 +8,8 @@ from tests.loop.loop_cases import faint, plain
 
 from faintspot.errors import InputError
 from faintspot.loop import LoopRecord, simulate_loop
-from faintspot.loop.seeing import KOLMOGOROV, Seeing, estimate_r0, mean_r0, r0_of_record, slope_variance
+from faintspot.loop.pseudo_open_loop import r0_of_record
+from faintspot.turbulence.seeing import KOLMOGOROV, Seeing, estimate_r0, mean_r0, slope_variance
 
 SIDE = 0.6
 OUTER_SCALE = 25.0

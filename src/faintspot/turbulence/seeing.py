@@ -11,16 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between
 from faintspot.errors import InputError
-from faintspot.loop.configuration import R0_WAVELENGTH_M, LoopConfiguration
-from faintspot.loop.pseudo_open_loop import open_loop_slopes
-from faintspot.loop.record import LoopRecord
+from faintspot.turbulence.von_karman import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float64]
 
 KOLMOGOROV = math.inf
 """Outer scale of Kolmogorov's spectrum."""
 
-_LEAST_ILLUMINATION = 0.85  # of sub-apertures that are used: theory is that of whole squares
 _FEWEST_FRAMES = 20
 _FREQUENCIES = 600
 _ANGLES = 96
@@ -107,7 +104,7 @@ def _slope_variance(
     x, y = frequency * np.cos(angle), frequency * np.sin(angle)
     along, across = to_x * x + to_y * y, to_x * y - to_y * x
     gradient = 2 * math.pi * along * np.sinc(along * baseline) * np.sinc(across * side)
-    density = 0.0229 * (frequency**2 + outer_scale_m**-2) ** (-11 / 6) * gradient**2
+    density = SPECTRUM * (frequency**2 + outer_scale_m**-2) ** (-11 / 6) * gradient**2
     if positions is not None:
         density = density * (1 - _array_factor(positions, x, y))
     # d^2 f = f^2 dangle dlog f
@@ -196,36 +193,6 @@ def estimate_r0(
         math.sqrt(max(0.0, signal.mean())),
         math.sqrt(max(0.0, (total - signal).mean())),
         len(slopes),
-    )
-
-
-def r0_of_record(record: LoopRecord, frames: ArrayLike, *, remove_tip_tilt: bool = True) -> Seeing:
-    """Return r0 from some frames of a run, given as a mask, with its own outer scale; see `estimate_r0`.
-
-    Of sub-apertures that are at least 85 % lit, all others when there are none.
-
-    Raises
-    ------
-    InputError
-        When there are fewer than 20 frames.
-    """
-    configuration = LoopConfiguration.from_text(record.configuration)
-    chosen = np.flatnonzero(np.asarray(frames))
-    usable = record.illumination >= _LEAST_ILLUMINATION
-    if not usable.any():
-        usable = np.ones_like(usable)
-    gaps = np.cumsum(np.diff(chosen, prepend=chosen[:1]) > 1)
-    slopes = open_loop_slopes(record)[:, np.tile(usable, 2)]
-    return estimate_r0(
-        slopes[chosen],
-        cells=record.cells[usable],
-        subaperture_m=record.subaperture_m,
-        pixel_scale_rad=record.pixel_scale_rad,
-        outer_scale_m=configuration.atmosphere.outer_scale_m,
-        baseline_m=record.subaperture_m * (1 - 1 / configuration.sensor.samples),
-        segment=gaps,
-        static_px=slopes[record.scored].mean(axis=0),
-        remove_tip_tilt=remove_tip_tilt,
     )
 
 
