@@ -34,7 +34,7 @@ calibration = fs.Calibration(dark=0.0, read_noise_e=3.0)
 # %%
 # Learn it from half of them, measure the other half.
 
-learnt = fs.learn_psf(frames[:300], layout, calibration=calibration)
+learnt = fs.learn_psf(frames[:300], layout, calibration)
 print(learnt)
 
 figure = Figure(figsize=(7, 3.4), layout="constrained")

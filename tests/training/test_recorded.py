@@ -15,6 +15,13 @@ from faintspot.simulate import Detector, subapertures
 from faintspot.training import train_estimator, train_from_frames
 from faintspot.training.recorded import _Splitter
 
+LAYOUT = Layout.stacked(20, (16, 16))
+
+
+def as_frames(images: NDArray[Any]) -> NDArray[Any]:
+    """Images (n, 20, 16, 16) as frames of `LAYOUT`."""
+    return images.reshape(len(images), *LAYOUT.frame_shape)
+
 
 def recorded(n: int = 4000, seed: int = 4, **options: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     """Images (n / 20, 20, 16, 16) and truth."""
@@ -37,7 +44,8 @@ def test_nearly_as_good_as_with_a_truth(read_noise: float, loss: float) -> None:
     detector = Detector(read_noise_e=read_noise)
     images, _ = recorded(detector=detector)
     score = train_from_frames(
-        images,
+        as_frames(images),
+        LAYOUT,
         Calibration(read_noise_e=read_noise),
         draws=3,
         target_radius_px=5.0,
@@ -88,26 +96,27 @@ def test_parts_do_not_covary_but_for_what_is_known(read_noise: float, em_gain: f
     assert noise[:, 0].mean() == pytest.approx(np.var(target), rel=0.05)
 
 
-def test_raw_frames_with_a_layout() -> None:
+def test_frames_are_calibrated() -> None:
     images, _ = recorded(2000)
     layout = Layout.grid((4, 5), pixels=16)
     frames = np.zeros((len(images), *layout.frame_shape), np.float32)
     for number, (row, column) in enumerate(layout.corners):
         frames[:, row : row + 16, column : column + 16] = images[:, number] / 2 + 100
     raw = Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=0.1)
-    from_frames = train_from_frames(frames, raw, layout=layout, draws=1, rng=np.random.default_rng(1))
-    from_images = train_from_frames(
-        images, Calibration(read_noise_e=0.1), draws=1, rng=np.random.default_rng(1)
+    from_adu = train_from_frames(frames, layout, raw, draws=1, rng=np.random.default_rng(1))
+    from_electrons = train_from_frames(
+        as_frames(images), LAYOUT, Calibration(read_noise_e=0.1), draws=1, rng=np.random.default_rng(1)
     )
     # Subtracting 100 ADU in float32 leaves 1e-5 e- of round-off, which the regression amplifies a little.
-    np.testing.assert_allclose(from_frames.tables, from_images.tables, atol=2e-3)
+    np.testing.assert_allclose(from_adu.tables, from_electrons.tables, atol=2e-3)
 
 
 def test_classes_and_kinds() -> None:
     images, _ = recorded(4000, flux_e=np.repeat([30.0, 300.0], 2000))
     done: list[tuple[int, int]] = []
     score = train_from_frames(
-        images,
+        as_frames(images),
+        LAYOUT,
         Calibration(read_noise_e=0.1),
         index=[0] * 10 + [1] * 10,
         symmetry="aligned",
@@ -126,10 +135,11 @@ def test_classes_and_kinds() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"images": np.ones((5, 16, 16))}, "images: expected shape"),
-        ({"images": np.full((5, 20, 16, 16), np.nan)}, "images: expected finite"),
-        ({"images": np.zeros((20, 20, 16, 16))}, "images: expected light"),
-        ({"images": np.ones((4, 20, 16, 16))}, "expected at least 100 of each kind"),
+        ({"frames": np.ones((320, 16))}, "frames: expected shape"),
+        ({"frames": np.ones((5, 16, 16))}, "expected"),
+        ({"frames": np.full((5, 320, 16), np.nan)}, "frames: expected"),
+        ({"frames": np.zeros((20, 320, 16))}, "frames: expected light"),
+        ({"frames": np.ones((4, 320, 16))}, "expected at least 100 images of each kind"),
         ({"calibration": Calibration()}, r"calibration\.read_noise_e: expected a number"),
         ({"reference": np.zeros((3, 2))}, "reference: expected shape"),
         ({"index": [0, 2] * 10}, "without gaps"),
@@ -140,11 +150,14 @@ def test_classes_and_kinds() -> None:
         ({"passes": 9}, "passes"),
         ({"node_spacing_px": 0.0}, "node_spacing_px"),
         ({"target_radius_px": 0.0}, "target_radius_px"),
-        ({"layout": Layout.grid((4, 5), pixels=16)}, "images: expected frames"),
     ],
 )
 def test_bad_options(options: dict[str, Any], message: str) -> None:
-    images = np.random.default_rng(1).poisson(1.0, (20, 20, 16, 16)).astype(float)
-    values: dict[str, Any] = {"images": images, "calibration": Calibration(read_noise_e=0.1)}
+    frames = np.random.default_rng(1).poisson(1.0, (20, *LAYOUT.frame_shape)).astype(float)
+    values: dict[str, Any] = {
+        "frames": frames,
+        "layout": LAYOUT,
+        "calibration": Calibration(read_noise_e=0.1),
+    }
     with pytest.raises(InputError, match=message):
         train_from_frames(**(values | options))

@@ -67,8 +67,8 @@ class LearntPSF:
 def learn_psf(
     frames: ArrayLike,
     layout: Layout,
-    *,
     calibration: Calibration | None = None,
+    *,
     scope: str | ArrayLike = "sensor",
     start: PSF | float | None = None,
     oversampling: int = 4,
@@ -147,8 +147,8 @@ def learn_psf(
 
 def learn_psf_from_images(
     images: ArrayLike,
-    *,
     calibration: Calibration | None = None,
+    *,
     index: ArrayLike | None = None,
     start: PSF | float | None = None,
     oversampling: int = 4,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, image_stack, number_between, numbers_between, one_of, real_array
+from faintspot.checks import finite_array, number_between, numbers_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
@@ -109,10 +109,10 @@ def _distances(shape: tuple[int, ...], reference: Floats) -> tuple[Floats, Float
 
 
 def train_from_frames(
-    images: ArrayLike,
+    frames: ArrayLike,
+    layout: Layout,
     calibration: Calibration,
     *,
-    layout: Layout | None = None,
     reference: ArrayLike = 0.0,
     search_range_px: float | None = None,
     start: str = "reference",
@@ -142,13 +142,12 @@ def train_from_frames(
 
     Parameters
     ----------
-    images : (n_frames, n_subapertures, ny, nx) array, or (n_frames, h, w) with a layout
-        Calibrated photo-electrons, not rounded and not cut off at zero; with a layout raw frames, which are
-        calibrated. Spots must move from frame to frame as they will in use: that is the prior.
+    frames : (n_frames, h, w) array, ADU
+        Spots must move from frame to frame as they will in use: that is the prior. Values must be neither
+        rounded to electrons nor clipped at the dark level.
+    layout : Layout
     calibration : Calibration
         Its read noise must be known; that, background and multiplication gain give the images' noise.
-    layout : Layout, optional
-        Where the sub-apertures are in raw frames.
     reference : array that broadcasts to (n_subapertures, 2)
         Reference positions, px from the window's centre.
     search_range_px : float, optional
@@ -190,19 +189,19 @@ def train_from_frames(
     Raises
     ------
     InputError
-        For images that are not finite or without light, too few images, or a value out of range.
+        For frames that are not finite or without light, too few images, or a value out of range.
 
     Examples
     --------
     >>> import numpy as np, faintspot as fs
     >>> from faintspot.training import train_from_frames
     >>> images, _ = fs.simulate.subapertures(4000, shape=(8, 8), flux_e=200.0, rng=np.random.default_rng(1))
-    >>> camera = fs.Calibration(read_noise_e=0.1)
-    >>> score = train_from_frames(images[:, None], camera, rng=np.random.default_rng(2))
+    >>> layout, camera = fs.Layout.grid((1, 1), pixels=8), fs.Calibration(read_noise_e=0.1)
+    >>> score = train_from_frames(images, layout, camera, rng=np.random.default_rng(2))
     >>> print(score.standard_error(200.0).round(2))
     [[0.06 0.06]]
     """
-    stack, home = _images_and_reference(images, calibration, layout, reference)
+    stack, home = _images_and_reference(frames, layout, calibration, reference)
     half = 0.5 * max(stack.shape[2:]) if search_range_px is None else search_range_px
     radius = stack.shape[2] + stack.shape[3] if target_radius_px is None else target_radius_px
     splitter = _Splitter(
@@ -263,7 +262,7 @@ class _Recorded:
         light = np.sum(images.mean(axis=0) * near, axis=(1, 2))
         if flux.min() <= 0 or light.min() <= 0:
             raise InputError(
-                f"images: expected light in every frame and sub-aperture, got {flux.min():.3g} e- a spot "
+                f"frames: expected light in every frame and sub-aperture, got {flux.min():.3g} e- a spot "
                 f"in the faintest frame and {light.min():.3g} e- in the faintest sub-aperture"
             )
         return cls(images, flux, light / flux.mean(), reference)
@@ -290,8 +289,8 @@ class _Recorded:
         held_out = max(1, round(_HELD_OUT * len(frames)))
         if (len(frames) - held_out) * len(subapertures) < _FEWEST_IMAGES:
             raise InputError(
-                f"images: expected at least {_FEWEST_IMAGES} of each kind and flux class to train on, got "
-                f"{(len(frames) - held_out) * len(subapertures)}"
+                f"frames: expected at least {_FEWEST_IMAGES} images of each kind and flux class to train on, "
+                f"got {(len(frames) - held_out) * len(subapertures)}"
             )
         train_rng, error_rng = spawn(rng, 2)
         draws = max(1, min(draws, _MOST_SPLIT_IMAGES // (len(frames) * len(subapertures))))
@@ -346,22 +345,17 @@ class _Recorded:
 
 
 def _images_and_reference(
-    images: ArrayLike, calibration: Calibration, layout: Layout | None, reference: ArrayLike
+    frames: ArrayLike, layout: Layout, calibration: Calibration, reference: ArrayLike
 ) -> tuple[Floats, Floats]:
     """Electrons (n_frames, n_subapertures, ny, nx), and references (n_subapertures, 2) from the windows."""
-    if layout is not None:
-        pipeline = SlopePipeline(layout, Settings(denoise=False), calibration)
-        frames = real_array("images", images)
-        if frames.ndim != 3:
-            raise InputError(f"images: expected frames (n, h, w), got shape {frames.shape}")
-        images = pipeline.explain(frames).calibrated
-    stack = image_stack("images", images).astype(np.float64)
-    if stack.ndim != 4:
-        raise InputError(f"images: expected shape (frames, sub-apertures, ny, nx), got {stack.shape}")
+    raw = real_array("frames", frames)
+    if raw.ndim != 3:
+        raise InputError(f"frames: expected shape (n, h, w), got {raw.shape}")
+    images = SlopePipeline(layout, Settings(denoise=False), calibration).explain(raw).calibrated
     home = finite_array("reference", reference).astype(np.float64)
-    if home.shape not in ((), (2,), (stack.shape[1], 2)):
-        raise InputError(f"reference: expected shape ({stack.shape[1]}, 2), got {home.shape}")
-    return stack, np.broadcast_to(home, (stack.shape[1], 2)) + (0.0 if layout is None else layout.offsets)
+    if home.shape not in ((), (2,), (len(layout), 2)):
+        raise InputError(f"reference: expected shape ({len(layout)}, 2), got {home.shape}")
+    return images.astype(np.float64), np.broadcast_to(home, (len(layout), 2)) + layout.offsets
 
 
 def _read_variance(calibration: Calibration) -> float:
