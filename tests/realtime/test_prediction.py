@@ -122,6 +122,23 @@ def test_a_prediction_s_writer_may_die() -> None:
     reader.close()
 
 
+def test_a_prediction_for_another_frame_is_not_taken() -> None:
+    """Neither the last one again, nor an older one, nor one for a later frame."""
+    name = f"fs_test_{uuid4().hex[:12]}"
+    prior = Prior(2, 10.0)
+    stream = pyshmem.create(f"{name}_prediction", shape=(9,), dtype=np.float64)
+    reader = PredictionStream(name, prior)
+    for late, predicted in enumerate((8, 7, 0, -1, 10)):
+        for number, taken in ((8, predicted == 8), (9, False)):
+            stream.write(np.array([*np.ones(8), predicted]), frame_id=predicted % 2**32)
+            reader.fill(number)
+            assert prior.mean_px.any() == taken
+        assert reader.counters.late == 2 * late + 1
+    assert reader.counters.taken == 1
+    stream.unlink()
+    reader.close()
+
+
 def test_the_mean_light_is_told(sky: Sky, files: tuple[Path, Control]) -> None:
     """The star fades by three quarters: the settings follow."""
     path, control = files

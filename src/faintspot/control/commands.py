@@ -49,12 +49,32 @@ class CommandLine:
         return self._rows[self.place]
 
     def put(self, command: Floats) -> None:
-        """Send a command, and go on to the next frame."""
-        np.clip(command, -self.largest, self.largest, out=self.spare)
-        self.sent()
+        """Send a command, clipped to the stroke, and go on to the next frame.
 
-    def sent(self) -> None:
-        """Send what was written into `spare`, which is within the stroke, and go on to the next frame."""
+        Raises
+        ------
+        ArithmeticError
+            See `sent`.
+        """
+        total = float(command.sum())
+        np.clip(command, -self.largest, self.largest, out=self.spare)
+        self.sent(total)
+
+    def sent(self, total: float) -> None:
+        """Send the command in `spare`, which is within the stroke, and go on to the next frame.
+
+        Parameters
+        ----------
+        total : float
+            Sum of the command before it was clipped, which turns an infinite command into a finite one.
+
+        Raises
+        ------
+        ArithmeticError
+            When the sum is not finite. The latest command stays the latest.
+        """
+        if not math.isfinite(total):
+            raise ArithmeticError("its commands were not finite")
         self.place = (self.place + 1) % len(self._rows)
 
     def hold(self, command: Floats) -> None:

@@ -82,8 +82,10 @@ def add_products(columns: Any, vectors: Any, out: Any) -> None:
 
 
 @_compiled
-def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any) -> None:
+def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any) -> float:
     """Write the next command: `keep` of the latest, less `gain` times the wavefront, within the stroke.
+
+    Return the command's sum before it was clipped.
 
     Parameters
     ----------
@@ -101,8 +103,12 @@ def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, row
     for c in range(out.shape[0]):
         out[c] = 0.0
     add_products(columns, slopes.reshape(1, slopes.shape[0]), rows[place : place + 1])
+    total = 0.0
     for c in range(out.shape[0]):
-        out[c] = min(max(keep * latest[c] - gain * out[c], -largest), largest)
+        wanted = keep * latest[c] - gain * out[c]
+        total += wanted
+        out[c] = min(max(wanted, -largest), largest)
+    return total
 
 
 _INTEGRATE = Direct(integrate)
@@ -143,5 +149,5 @@ class CompiledIntegrator:
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`; slopes that were not measured are 0."""
         line = self._line
-        _INTEGRATE(slopes_px, self._columns, self.gain, self._keep, line.largest, line.rows, line.place)
-        line.sent()
+        numbers = self.gain, self._keep, line.largest
+        line.sent(_INTEGRATE(slopes_px, self._columns, *numbers, line.rows, line.place))

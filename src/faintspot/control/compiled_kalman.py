@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -143,7 +141,7 @@ class CompiledKalman:
         Raises
         ------
         ArithmeticError
-            When the filter's numbers have become too large.
+            When a controller's commands are not finite.
         """
         self._catch_up()
         prior = self.prior_std_px
@@ -158,18 +156,16 @@ class CompiledKalman:
             self._places(),
             self._memory,
         )
-        if not math.isfinite(total):
-            raise ArithmeticError("its commands were not finite")
-        self._line.sent()
+        self._line.sent(total)
         self._is_behind = True
 
     def _catch_up(self) -> None:
         """Do what is left of the frame before."""
         if self._is_behind:
-            GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
-            self._learnt.sent()
-            self._plain.sent()
             self._is_behind, self._held_at = False, -1
+            total = GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)
+            self._learnt.sent(total)
+            self._plain.sent(total)
         if self._held_at != self._line.place:
             HOLD(self._matrices, self._lines, self._places(), self._memory)
             self._held_at = self._line.place

@@ -63,6 +63,7 @@ class ControlOptions(Options):
         "Stroke, in the interaction matrix's unit: no command is larger, and what is cut off is forgotten. "
         "Default: no limit.",
         low=0,
+        high=_BEYOND_ALL,
         low_open=True,
     )
     largest_condition: float = _setting(
@@ -103,6 +104,7 @@ class ControlOptions(Options):
         "loop, which must have been open for `guard_frames` before; else a quarter of a window's side.",
         unit="px",
         low=0,
+        high=_BEYOND_ALL,
         low_open=True,
     )
     most_at_limit: float = _setting(
@@ -174,6 +176,7 @@ class Control:
         model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
         if model.kind != kind:
             raise InputError(f"{MODEL}: expected what {kind!r} has learnt, got that of {model.kind!r}")
+        model.check(self.plant)
         return model
 
     @cached_property
@@ -261,6 +264,32 @@ class Control:
             matrix = (modes * self.model.arrays["gains"]) @ modes.T @ matrix
             return CompiledIntegrator(line, self.interaction, matrix, 1.0, options.leak)
         return Learnt(self.plant, self.model).controller(line)
+
+    def rehearse(self) -> None:
+        """Compile the controller and run it on made-up frames, the last without a valid slope.
+
+        Raises
+        ------
+        InputError
+            When its commands, or the slopes that it expects, are not finite numbers.
+        """
+        slopes_px = np.resize([1.0, -1.0], len(self.interaction))
+        line = self.line()
+        try:
+            with np.errstate(all="ignore"):
+                controller = self.controller(line)
+                for error_px in (0.1, 1.0, np.inf):
+                    controller.update(slopes_px * np.isfinite(error_px), np.full_like(slopes_px, error_px))
+                    expected = controller.expected()
+                finite_array("expected slopes", expected.mean_px)
+                if expected.std_px is not None:
+                    finite_array("their errors", expected.std_px)
+        except (ArithmeticError, ValueError) as error:  # also of NumPy's linear algebra, and InputError
+            reason = str(error).split("\n")[0]
+            raise InputError(
+                f"{TABLE}.controller = {self.options.controller!r}: cannot compute commands with these "
+                f"{INTERACTION} and {MODEL} ({reason}); measure the matrix, or learn the model, again"
+            ) from None
 
 
 def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:

@@ -160,14 +160,17 @@ def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) 
 
 
 @_compiled
-def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> None:
-    """Write the integrator's command."""
+def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> float:
+    """Write the integrator's command; return its sum before it is cut."""
     made = memory.commands[_MADE : _MADE + 1]
     made[:] = 0.0
     add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], made)
+    total = 0.0
     for c in range(command.shape[0]):
         wanted = keep * memory.commands[LATEST_PLAIN, c] - gain * made[0, c]
+        total += wanted
         command[c] = min(max(wanted, -largest), largest)
+    return total
 
 
 @_compiled
@@ -236,7 +239,7 @@ def follow(
     places: Any,
     memory: Any,
 ) -> float:
-    """Write the mirror's next command, which is that of one of the controllers; return the filter's sum.
+    """Write the mirror's next command, that of one of the controllers; return its sum before it is cut.
 
     Parameters
     ----------
@@ -253,10 +256,10 @@ def follow(
     """
     here, of_learnt, of_plain = places
     gain, keep, largest, steps = numbers
-    plainly, total = memory.guard[CHOSEN] > 0.0, 0.0
+    plainly = memory.guard[CHOSEN] > 0.0
     _take(slopes, errors, prior_std, noise_factor, memory.slopes, plainly)
     if plainly:
-        _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
+        total: float = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     else:
         total = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
     for c in range(lines.true.shape[1]):
@@ -265,14 +268,17 @@ def follow(
 
 
 @_compiled
-def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> None:
-    """Do what is left of a frame when the mirror's command is out: the other one's, the guard, the state."""
+def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> float:
+    """Do what is left of a frame when the mirror's command is out: the other one's, the guard, the state.
+
+    Return the sum of the other controller's command before it is cut.
+    """
     _, of_learnt, of_plain = places
     gain, keep, largest, steps = numbers
     if memory.guard[CHOSEN] > 0.0:
-        _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
+        total: float = _filter(matrices, memory, steps, largest, lines.learnt[of_learnt])
     else:
-        _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
+        total = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     left = memory.commands[_LEFT : _LEFT + 2]
     left[:] = 0.0
     add_products(matrices.reconstruct, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
@@ -282,6 +288,7 @@ def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> 
         plain += left[1, c] * left[1, c]
     _choose(memory.guard, learnt, plain)
     _advance(matrices, memory)
+    return total
 
 
 HOLD, FOLLOW, GO_ON = Direct(hold), Direct(follow), Direct(go_on)

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import finite_array, one_of
+from faintspot.checks import numbers_between, one_of
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandLine
 from faintspot.control.compiled_kalman import CompiledKalman
@@ -45,6 +46,20 @@ _OF_KIND = {
 _SQUARE = {"now_px2", "ahead_px2"}
 _OF_LAYERS = {"first", "second", "driving_px2"}
 _OF_ALL = ("plain_gain", "noise_factor", "left")
+_COVARIANCE = -1e8, 1e8  # px^2: of slopes of 1e4 px
+_RANGES = {
+    "gains": (0.0, 2.0),
+    "gain": (0.0, 1.0),
+    "plain_gain": (0.0, 2.0),
+    "noise_factor": (1e-6, 1e6),
+    "variance_px2": (1e-12, 1e8),
+    "now_px2": _COVARIANCE,
+    "ahead_px2": _COVARIANCE,
+    "driving_px2": _COVARIANCE,
+    "first": (-1e6, 1e6),
+    "second": (-1e6, 1e6),
+}
+"""Beyond these, numbers are damaged or in another unit, and sums of their products may overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,20 +154,11 @@ class Model:
         Raises
         ------
         InputError
-            When it cannot be read, is not finite, or is for another loop.
+            When it cannot be read, is for another loop, or has numbers out of range.
         """
         what = "what control has learnt"
         kind = one_of("kind", str(read_arrays(path, what, ("kind",))["kind"]), list(_OF_KIND))
-        found = read_arrays(path, what, (*_OF_ALL, *_OF_KIND[kind]))
-        numbers = {name: finite_array(name, array).astype(np.float64) for name, array in found.items()}
-        slopes, modes = len(plant.interaction), plant.reconstructor.modes.shape[1]
-        shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
-        shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
-        layers = len(numbers["first"]) if kind == KALMAN and numbers["first"].ndim == 3 else 1
-        shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
-        for name, array in numbers.items():
-            if array.shape != shapes.get(name, ()):
-                raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
+        numbers = _checked(read_arrays(path, what, (*_OF_ALL, *_OF_KIND[kind])), plant)
         learnt, plain = numbers["left"]
         return cls(
             kind,
@@ -161,6 +167,30 @@ class Model:
             float(numbers["noise_factor"]),
             (float(learnt), float(plain)),
         )
+
+    def check(self, plant: Plant) -> None:
+        """Refuse a model that is for another loop, or has numbers out of range.
+
+        Raises
+        ------
+        InputError
+            One line.
+        """
+        _checked({**self.arrays, "plain_gain": self.plain_gain, "noise_factor": self.noise_factor}, plant)
+
+
+def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
+    """Return a model's numbers as float64, of the shapes that the loop needs and within `_RANGES`."""
+    numbers = {name: numbers_between(name, value, *_RANGES.get(name, ())) for name, value in found.items()}
+    slopes, modes = len(plant.interaction), plant.reconstructor.modes.shape[1]
+    shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
+    shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
+    layers = len(numbers["first"]) if "first" in numbers and numbers["first"].ndim == 3 else 1
+    shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
+    for name, array in numbers.items():
+        if array.shape != shapes.get(name, ()):
+            raise InputError(f"{name}: expected shape {shapes.get(name, ())}, got {array.shape}")
+    return numbers
 
 
 @dataclass(frozen=True, eq=False)

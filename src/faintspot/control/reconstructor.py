@@ -12,6 +12,8 @@ from faintspot.errors import InputError
 
 Floats = NDArray[np.float64]
 
+_LARGEST_ANSWER_PX = 1e-12, 1e12
+"""Range of the largest element of an interaction matrix; its square is far from the limits of float64."""
 _RIDGE_CLEAN = 3e-3  # of slopes that a filter has freed of most of their noise
 _RIDGE = 3e-2  # of the mean square of the driven combinations' slopes: weak ones move less, noise does too
 
@@ -61,7 +63,8 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     Raises
     ------
     InputError
-        When there are more commands than slopes, or no command moves a slope.
+        When there are more commands than slopes, no command moves a slope, or the elements are too small or
+        too large to compute with.
     """
     matrix: Floats = finite_array("interaction", interaction).astype(np.float64)
     if matrix.ndim != 2:
@@ -69,9 +72,15 @@ def make_reconstructor(interaction: ArrayLike, largest_condition: float = 30.0) 
     slopes, commands = matrix.shape
     check_controllable(commands, slopes)
     limit = number_between("largest_condition", largest_condition, 1)
-    left, size, right = np.linalg.svd(matrix, full_matrices=False)
-    if size[0] == 0:
+    largest, (smallest_px, largest_px) = np.abs(matrix).max(initial=0.0), _LARGEST_ANSWER_PX
+    if largest == 0:
         raise InputError("interaction: expected slopes that follow the commands, got zeros only")
+    if not smallest_px <= largest <= largest_px:
+        raise InputError(
+            f"interaction: expected a largest element of {smallest_px:g} to {largest_px:g} px for a unit of "
+            f"the command, got {largest:.3g}; express the commands in another unit"
+        )
+    left, size, right = np.linalg.svd(matrix, full_matrices=False)
     driven = size * limit >= size[0]
     modes, seen = right[driven].T, left[:, driven] * size[driven]
     equal = np.ones(slopes)

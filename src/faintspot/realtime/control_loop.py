@@ -41,8 +41,6 @@ class _Ready(NamedTuple):
     """Whether estimators are told what it expects."""
     takes_prior: bool
     """Whether it asks how wide the prior is that slopes are drawn to."""
-    is_compiled: bool
-    """Then its commands are finite."""
 
     @classmethod
     def of(cls, control: Control, line: CommandLine) -> Self:
@@ -52,7 +50,6 @@ class _Ready(NamedTuple):
             controller,
             control.prediction == CONTROLLER,
             isinstance(controller, (Guarded, CompiledKalman)),
-            isinstance(controller, (CompiledIntegrator, CompiledKalman)),
         )
 
 
@@ -163,35 +160,36 @@ class ControlLoop:
         if new is self._on:
             return
         self._on = new
-        if self.closed and not self._begins:
-            new.controller.begin()
-        self._expect()
+        self._expect(begins=self.closed and not self._begins)
 
-    def _expect(self) -> None:
-        """Tell estimators what the controller expects of the next frame."""
+    def _expect(self, *, begins: bool = False) -> None:
+        """Tell estimators what the controller, which may begin now, expects of the next frame."""
         prior, on = self._prior, self._on
-        if prior is None:
-            return
-        if on.predicts and self.closed and not self._begins:
-            prior.expect(*on.controller.expected())
-        else:
+        try:
+            if begins:
+                on.controller.begin()
+            if prior is not None and on.predicts and self.closed and not self._begins:
+                prior.expect(*on.controller.expected())
+                return
+        except Exception as error:  # in the frame path nothing raises
+            self._fail(error)
+        if prior is not None:
             prior.forget()
 
     def _update(self, on: _Ready) -> None:
-        """Let a controller send its command; one that fails opens the loop."""
-        line = self._line
-        before = line.latest
+        """Let a controller send its command."""
         try:
             if self._begins:
                 self._begins = False
                 on.controller.begin()
             on.controller.update(self._slopes, self._errors)
-            if on.is_compiled or math.isfinite(line.latest.sum()):
-                return
-            reason = "the controller's commands were not finite"
         except Exception as error:  # in the frame path nothing raises
-            reason = f"the controller failed: {type(error).__name__}: {error}".split("\n")[0]
-        line.hold(before.copy())
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        """Open the loop because its controller failed; the mirror keeps the latest command."""
+        self._line.hold(self._line.latest.copy())
+        reason = f"the controller failed: {type(error).__name__}: {error}".split("\n")[0]
         self.closed, self.opened_because = False, self.guard.end(reason)
 
     # Any thread -------------------------------------------------------------------------------------
@@ -202,14 +200,12 @@ class ControlLoop:
         Raises
         ------
         InputError
-            When the model of the control is not what it has learnt.
+            When the model of the control is not what it has learnt, or its commands are not finite.
         """
         if kind in self._ready:
             return
         control = self.control.with_controller(kind)
-        tried = control.controller(control.line())  # so that everything is compiled
-        tried.update(np.zeros(len(control.interaction)), np.ones(len(control.interaction)))
-        tried.expected()
+        control.rehearse()
         self._ready[kind] = _Ready.of(control, self._line)
 
     @property

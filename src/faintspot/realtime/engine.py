@@ -224,7 +224,7 @@ class Engine:
         if self._light is not None:
             self._light.start()
         try:
-            with self._streams.held():
+            with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time, and nobody reads it
                 while not self._done(n_frames):
                     ring = self._attached()
                     if ring is None:

@@ -1,0 +1,147 @@
+"""A mirror never gets a command that is not a finite number, whatever the files of [control] hold."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
+from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
+
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandLine
+from faintspot.control.configuration import Control, ControlOptions
+from faintspot.control.guarded import Guarded
+from faintspot.control.integrator import Integrator
+from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, learn
+from faintspot.control.learnt import Model
+from faintspot.errors import InputError
+from faintspot.realtime.control_loop import ControlLoop
+from faintspot.realtime.prior import Prior
+from faintspot.sensor.layout import Layout
+from faintspot.slopes import RESULT_TYPES, Slopes
+
+LAYOUT = Layout.grid((3, 3), pixels=8)
+N, COMMANDS = len(LAYOUT), INTERACTION.shape[1]
+FRAMES = 12
+EXTREMES = (0.0, 5e-324, 1e-160, 1e-30, 1e-8, 1e-3, 0.1, 2.0, 1e3, 1e6, 1e12, 1e160, 1e308)
+
+
+class PlainControl(Control):
+    """With the controllers that are written in NumPy."""
+
+    def controller(self, line: CommandLine) -> Controller:
+        """See `Control`."""
+        plant, kind, gain = self.plant, self.options.controller, self.options.gain
+        if kind == INTEGRATOR:
+            numbers = self.interaction, self.reconstructor, gain, self.options.leak
+            return Integrator(line, *numbers, weighted=True)
+        if kind == KALMAN:
+            of_both = partial(self.model.controller, plant), partial(plant.integrator, self.model.plain_gain)
+            return Guarded(line, self.interaction, self.reconstructor.matrix, *of_both)
+        controller: Controller = self.model.controller(plant, line)
+        return controller
+
+
+@cache
+def learnt(kind: str) -> Model:
+    return learn(kind, PLANT, telemetry(200, 0.3), {"told": COVARIANCES[None]}).model
+
+
+def scaled(draw: Any, array: np.ndarray) -> np.ndarray:
+    """Return an array as it is, with another size, or with an element or a row replaced by an extreme."""
+    how = draw(st.sampled_from(["same"] * 6 + ["all", "one", "row"]))
+    value = draw(st.sampled_from(EXTREMES))
+    result = np.array(array, np.float64)
+    sign = draw(st.sampled_from([1.0, -1.0]))
+    with np.errstate(over="ignore"):
+        if how == "all":
+            result = np.nan_to_num(result * value * sign)
+        elif how == "one":
+            result.flat[draw(st.integers(0, result.size - 1))] = value * sign
+        elif how == "row":
+            result[...] = np.where(np.arange(result.size).reshape(result.shape) % 5, result, value * sign)
+    return result
+
+
+@st.composite
+def controls(draw: Any) -> Control:
+    """Return control with extreme numbers in its matrix, options and model; or refuse it in one line."""
+    kind = draw(st.sampled_from(list(CONTROLS)))
+    model = None
+    if kind != INTEGRATOR:
+        own = learnt(kind)
+        arrays = {name: scaled(draw, array) for name, array in own.arrays.items()}
+        gain, factor = (draw(st.sampled_from([usual] * 20 + [*EXTREMES])) for usual in (0.4, 1.0))
+        model = Model(kind, arrays, gain, factor, draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)])))
+    options = {
+        "controller": kind,
+        "gain": draw(st.sampled_from([0.4, 0.0, 2.0])),
+        "leak": draw(st.sampled_from([0.01, 0.0, 1.0])),
+        "delay_frames": draw(st.sampled_from([1, 2, 5])),
+        "largest_command": draw(st.sampled_from([*[None] * 4, *[10.0] * 4, 1e-300, 1e30, 1e300])),
+        "largest_condition": draw(st.sampled_from([30.0, 1.0, 1e6])),
+        "centroid_gain": draw(st.sampled_from([1.0, 0.01, 100.0])),
+        "guard_frames": draw(st.sampled_from([50, 1_000_000])),
+        "most_at_limit": 1.0,
+        "largest_residual_px": draw(st.sampled_from([*[1e30] * 8, None, 1e300])),
+    }
+    made: type[Control] = draw(st.sampled_from([Control, PlainControl]))
+    return made(scaled(draw, INTERACTION), None, ControlOptions(**options), model)
+
+
+@st.composite
+def frames(draw: Any) -> list[Slopes]:
+    """Return slopes as estimators give them, with numbers as large as float32 holds and flags at random."""
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    made = []
+    for _ in range(FRAMES):
+        slopes = Slopes(*(np.zeros(N, kind) for kind in RESULT_TYPES))
+        size = draw(st.sampled_from([1.0, 1.0, 0.0, 1e-30, 1e4, 1e38]))
+        for array in (slopes.x, slopes.y):
+            array[:] = size * rng.uniform(-1, 1, N)
+        for array in (slopes.standard_error_x, slopes.standard_error_y):
+            array[:] = draw(st.sampled_from([0.3, 0.3, 0.0, 1e-38, 1e38, np.inf, np.nan]))
+        slopes.flags[:] = rng.integers(0, 2, N) * draw(st.sampled_from([0, 0, 1, 2]))
+        made.append(slopes)
+    return made
+
+
+@settings(max_examples=250, deadline=None)
+@given(st.data())
+def test_what_is_not_finite_never_reaches_the_mirror(data: st.DataObject) -> None:
+    """Control that cannot be computed is refused in one line; else the loop opens and the mirror stays."""
+    try:
+        control = data.draw(controls())
+        loop = ControlLoop(control, LAYOUT, prior=Prior(N))
+    except InputError as error:
+        event("refused")
+        said = str(error)
+    else:
+        said = run(loop, control.options.largest_command or 1e30, data.draw(frames()))
+        event(f"ran, {control.options.controller}")
+    assert "\n" not in said
+
+
+def run(loop: ControlLoop, stroke: float, taken: list[Slopes]) -> str:
+    """Close a loop again and again, and return why it has opened."""
+    reasons = ""
+    loop.close()
+    for number, slopes in enumerate(taken):
+        before = np.zeros(COMMANDS) if loop._flattened else loop._line.latest.copy()
+        with np.errstate(all="ignore"):
+            sent = loop.follow(slopes, number).copy()
+            failed = not loop.closed
+            loop.look_after()
+        assert np.isfinite(sent.astype(np.float32)).all()
+        assert np.abs(sent).max() <= stroke
+        if failed:
+            np.testing.assert_array_equal(sent, before)
+        if not loop.closed:
+            event("opened")
+            assert loop.opened_because
+            reasons += loop.opened_because
+            loop.close()
+    return reasons
