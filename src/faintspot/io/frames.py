@@ -7,19 +7,19 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.io.formats import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
 from faintspot.sizes import check_size, memory_bytes
 
 
-class FrameSource:
+class FrameSource(Closing):
     """Frames of one or several files as one sequence, for one thread at a time.
 
     Reading in order is cheap for every format; in compressed files going back starts from the front.
@@ -88,14 +88,6 @@ class FrameSource:
     def close(self) -> None:
         """Close the file that is open, if any."""
         self._open.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _read(self, array: StoredArray, start: int, stop: int) -> NDArray[Any]:
         """Read from one file, keeping no more than one open: there may be thousands."""

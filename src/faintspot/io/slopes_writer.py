@@ -6,12 +6,12 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.files import output_errors
 from faintspot.io.output_lock import OutputLock
@@ -89,7 +89,7 @@ class Storage(Protocol):
         """Make the output of it when all frames are marked."""
 
 
-class BlockWriter:
+class BlockWriter(Closing):
     """Writes slopes to a storage that exists, from where it stopped.
 
     Frames of a chunk that is not full wait in memory until it is, or until `close`. Before every write the
@@ -163,14 +163,6 @@ class BlockWriter:
         finally:
             self._lock.release()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def _store(self, count: int) -> None:
         """Write the first `count` waiting frames, then, when it is time, the mark."""
         joined = {name: np.concatenate([block[name] for block in self._waiting]) for name in VARIABLES}
@@ -210,7 +202,7 @@ class BlockWriter:
             )
 
 
-class FinishedWriter:
+class FinishedWriter(Closing):
     """Stands for an output that an earlier, equal run has completed: nothing is left to do."""
 
     def __init__(self, n_frames: int) -> None:
@@ -226,11 +218,3 @@ class FinishedWriter:
 
     def close(self) -> None:
         """Nothing is open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

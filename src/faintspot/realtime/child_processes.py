@@ -10,9 +10,8 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.files import output_errors
 
@@ -22,7 +21,7 @@ _DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _ERROR = "faintspot: error: "
 
 
-class ChildProcesses:
+class ChildProcesses(Closing):
     """Commands that run beside this process. As a context manager it ends them, the last one first.
 
     Ctrl-C in the terminal does not reach them, so that they end in order; the kernel ends them where this
@@ -104,14 +103,6 @@ class ChildProcesses:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _log(self, name: str) -> Path:
         return self._folder / f"{name}.log"

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.files import parse_json
 from faintspot.realtime.private_socket import (
@@ -93,7 +94,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
     return _checked_reply(f"{kind} {name}", reply)
 
 
-class ControlServer:
+class ControlServer(Closing):
     """Answers requests in a thread of its own, until it is closed.
 
     Clients that hang, send garbage or go away neither stop it nor hold up others. Commands named in `lengthy`
@@ -134,12 +135,6 @@ class ControlServer:
         self._one_at_a_time = asyncio.Lock()
         self._thread = threading.Thread(target=self._run, name="faintspot-control", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> ControlServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop answering and remove the socket; closing again does nothing."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
+from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.realtime.shared_streams import create_stream
 from faintspot.realtime.telemetry import TelemetryReader
@@ -21,7 +20,7 @@ _NO_FRAMES_S = 5.0
 _NOTICED_S = 0.5  # after which whoever drives the mirror has found a stream that is new
 
 
-class StreamedMirror:
+class StreamedMirror(Closing):
     """A mirror that follows NAME_commands, and an engine NAME without control that sees it.
 
     As a context manager it leaves the mirror flat and the stream removed. It is a `PokedMirror`.
@@ -60,14 +59,6 @@ class StreamedMirror:
         self._stream = create_stream(f"{name}_commands", (self.commands,))
         self._send(np.zeros(self.commands))
         time.sleep(_NOTICED_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Leave the mirror flat, and remove the stream when it has had time to see that."""

@@ -24,13 +24,13 @@ import struct
 import time
 import zlib
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import number_between
+from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.kernels.ordered import fence
 from faintspot.realtime.pixel_ring import PixelRing
@@ -60,7 +60,7 @@ _BYTE = np.dtype(np.uint8)
 _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's 64 MiB of shared memory
 
 
-class TelemetryRing:
+class TelemetryRing(Closing):
     """The writer's side, made by `create`. As a context manager it closes itself.
 
     Records, images and changes may come from three threads, but each of them from one alone.
@@ -239,14 +239,6 @@ class TelemetryRing:
     def close(self) -> None:
         """Remove the segment's name and tell readers that nothing more comes. Harmless when repeated."""
         self._ring.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class TelemetryReader:

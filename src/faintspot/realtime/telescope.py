@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.closing import Closing
 from faintspot.loop.camera import make_detector
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.observatory import Observatory
@@ -50,7 +51,7 @@ class Exposure:
     truth: tuple[float, ...]
 
 
-class SimulatedTelescope(Readout):
+class SimulatedTelescope(Readout, Closing):
     """Observes as `simulate_loop` does, with the commands of a stream.
 
     The exposure of a frame takes a frame time, its read-out a part of the next one. When an exposure begins,
@@ -136,12 +137,6 @@ class SimulatedTelescope(Readout):
         self._orders = threading.Lock()
         self._order: Order | None = None
         self._complained_s, self._complained_of = -np.inf, 0
-
-    def __enter__(self) -> SimulatedTelescope:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Remove the ring and the streams; closing again does nothing."""
