@@ -10,7 +10,7 @@ from tests.recorded.recorded_cases import sensor, simulated
 from tests.shared_data import shared_file
 
 from faintspot.errors import InputError
-from faintspot.report import layout_picture
+from faintspot.recorded.layout_picture import layout_picture
 from faintspot.sensor.layout import Layout
 
 

@@ -17,7 +17,7 @@ from faintspot.errors import InputError
 from faintspot.io import create_writer
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded, slopes_as_variables
-from faintspot.report import report_of_stored
+from faintspot.recorded.report_of_stored import report_of_stored
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF

@@ -9,7 +9,6 @@ import pytest
 from tests.recorded.recorded_cases import Page as Reader
 
 from faintspot.errors import InputError
-from faintspot.report import write_report
 from faintspot.report.drawing import new_figure
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import (
@@ -21,6 +20,7 @@ from faintspot.report.page import (
     configuration_section,
     html_of,
     write_page,
+    write_report,
 )
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures")

@@ -26,7 +26,7 @@ from faintspot.study import demonstration
 from faintspot.study.demonstration import Comparison
 
 if TYPE_CHECKING:
-    from faintspot.report import Arm
+    from faintspot.recorded.statistics import Arm
 
 
 @click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
@@ -136,7 +136,7 @@ def write_files(
     folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Write new frames at one flux, measure them in both arms with what was chosen; return what it shows."""
-    from faintspot.report import Arm
+    from faintspot.recorded.statistics import Arm
 
     layout = demonstration.demonstration_layout()
     shown = demonstration.FLUXES_E.index(demonstration.SHOWN_FLUX_E)
@@ -160,7 +160,8 @@ def write_files(
 
 def write_page(folder: Path, arms: list[Arm], **shown: Any) -> None:
     """Make the report."""
-    from faintspot.report import slopes_report, write_report
+    from faintspot.recorded.page import slopes_report
+    from faintspot.report.page import write_report
 
     facts = {
         "Source": "simulated, with known truth",

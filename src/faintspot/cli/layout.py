@@ -277,7 +277,7 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
 
 def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
     """Draw frame and windows, and say where."""
-    from faintspot.report import layout_picture
+    from faintspot.recorded.layout_picture import layout_picture
 
     path = picture or str(target.with_suffix(".png"))
     layout_picture(frame, layout, path)

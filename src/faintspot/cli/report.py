@@ -42,7 +42,9 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
       faintspot report night.zarr
       faintspot report canary -o canary.html
     """
-    from faintspot.report import report_of_stored, report_of_study, write_report
+    from faintspot.recorded.report_of_stored import report_of_stored
+    from faintspot.report.page import write_report
+    from faintspot.study.page import report_of_study
 
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
