@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -184,6 +185,21 @@ def test_subapertures_of_others(tmp_path: Path) -> None:
     with open_frames([tmp_path / "e.fits"]) as frames:
         pipeline = fs.SlopePipeline(layout, fs.Settings("centroid"), reference=sensor.reference)
         assert np.array_equal(read_slopes(tmp_path / "s.npz").variables["y"], pipeline(frames.block(0, 10)).y)
+
+
+def test_quad_cells_of_others_without_a_configuration(tmp_path: Path, run: Commands) -> None:
+    def quad_cells(system: Any) -> None:
+        sensor = system.wavefront_sensors[0]
+        sensor.subaperture_mask = aotpy.Image("mask", np.array([[0, 1], [2, 3]]))
+        sensor.mask_offsets, sensor.subaperture_size = [aotpy.Coordinates(4.0, 6.0)], 2.0
+        sensor.detector.pixel_intensities.data[:, 6:10, 4:8] += 100.0
+
+    path = example(tmp_path / "e.fits", quad_cells)
+    toml = tmp_path / "faintspot.toml"
+    error = run.refused("slopes", path, "-c", toml, "-o", tmp_path / "s.npz").error
+    run.ok(*shlex.split(error.split("`")[1].removeprefix("faintspot ")))
+    assert fs.Layout.load(toml).corners.tolist() == [[6, 4], [6, 6], [8, 4], [8, 6]]
+    run.ok("slopes", path, "-c", toml, "-o", tmp_path / "s.npz")
 
 
 def no_pixels(system: Any) -> None:

@@ -182,3 +182,7 @@ class TestImages:
     def test_wrong_shape(self) -> None:
         with refused("frame", "(8, 8)", "(8, 9)"):
             fs.Layout.grid((2, 2), pixels=4).images(np.zeros((8, 9)))
+
+
+def test_repr_is_one_line() -> None:
+    assert len(repr(fs.Layout.grid((40, 40), pixels=2))) < 200

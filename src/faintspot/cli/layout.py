@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import configuration
-from faintspot.cli import layout_options
+from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
 from faintspot.errors import InputError
@@ -22,6 +22,7 @@ from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.sensor.hot_pixels import find_hot_pixels
+from faintspot.sensor.known_grid import KnownGrid
 from faintspot.sensor.layout import GEOMETRIES, Layout
 from faintspot.settings import Settings
 
@@ -51,6 +52,12 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
     show_default=True,
     help="How the lenslets are packed.",
 )
+@click.option(
+    "--grid",
+    metavar="ROWSxCOLUMNS",
+    help="Rows and columns of an array that fills the frame or --roi, such as quad cells; only which "
+    "lenslets are illuminated is searched for.",
+)
 @click.option("--pitch", type=float, metavar="PX", help="Distance of neighbouring lenslets, if you know it.")
 @click.option(
     "--pixels", type=int, metavar="N", help="Side of a window. Default: the largest without overlap."
@@ -60,7 +67,8 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
     "--lit-fraction",
     type=float,
     metavar="PART",
-    help="Least flux of a lit lenslet, as a part of the median. Default: where fewest are, 0.18 to 0.5.",
+    help="Least flux of a lit lenslet, as a part of the median. Default: where fewest are, 0.18 to 0.5; "
+    "with --grid 0.3.",
 )
 @click.option(
     "--pupil",
@@ -122,6 +130,7 @@ def command(
     output: str,
     picture: str | None,
     geometry: str,
+    grid: str | None,
     pitch: float | None,
     pixels: int | None,
     window: str | None,
@@ -145,9 +154,10 @@ def command(
     """Find the sub-apertures in a frame and write a configuration.
 
     FRAME is a file with spots, from one frame to many of the same field (the first 200 are averaged). Square
-    and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are lit. A
-    picture shows the frame with the windows that were found: look at it. --lit-fraction, --pupil and
-    --exclude correct which are lit.
+    and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are lit.
+    Spots of quad cells (2 x 2 pixels) overlap and cannot be found; --grid gives the array. A picture shows
+    the frame with the windows that were found: look at it. --lit-fraction, --pupil and --exclude correct
+    which are lit.
 
     A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
     Else the settings written beside the layout are a start: the strength noise_std is taken from the frame's
@@ -158,6 +168,7 @@ def command(
       faintspot layout flat_wavefront.fits -o faintspot.toml
       faintspot layout cube.npz --dark dark.fits --gain 1.9 --pixels 16
       faintspot layout eye.fits --pupil 512,498,320,40 --exclude 0-3,57
+      faintspot layout quad_cells.fits --grid 40x40 --dark dark.fits
     """
     target = Path(output)
     keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
@@ -181,10 +192,14 @@ def command(
         mean = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
-        found = _found(source.description, mean, exclude, options)
-        layout = replace(found.layout, **optics)
+        found: FoundLayout | KnownGrid
+        if grid is not None:
+            found = layout_grid.illuminated(source.description, mean, grid, calibration, options)
+        else:
+            found = _found(source.description, mean, options)
+        layout = replace(layout_options.without(found.layout, exclude), **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
-    calibration, notes = _completed(calibration, layout, mean, hot)
+    calibration, notes = _completed(calibration, found, layout, mean, hot)
     settings, noise, flux = _first_settings(layout, calibration, first)
     if keeps_settings:
         settings = configuration.load(target, "settings")
@@ -195,7 +210,11 @@ def command(
     # The layout last: it may be long, and whatever is saved after it reads it again.
     for item in (settings, calibration, layout):
         configuration.save(target, item)
-    for line in [*_describe(output, found, settings, noise, flux), *notes]:
+    if isinstance(found, KnownGrid):
+        lines = layout_grid.describe(output, found, layout, flux, calibration)
+    else:
+        lines = _describe(output, found, layout, settings, noise, flux)
+    for line in [*lines, *notes]:
         click.echo(line)
     if calibration.gain_e_per_adu == 1.0:
         click.echo("  one electron per ADU assumed; give --gain if your camera has another")
@@ -205,24 +224,24 @@ def command(
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
 
-def _found(
-    description: str, mean: NDArray[np.float64], exclude: str | None, options: dict[str, Any]
-) -> FoundLayout:
+def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any]) -> FoundLayout:
     """Find the layout, and say in an error where, and which option changes it."""
     bad = np.isnan(mean)
     try:
-        found = find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
+        return find_layout(np.where(bad, 0, mean), bad_pixels=bad, **options)
     except InputError as error:
         text = str(error)
         for name, option in _OPTIONS.items():
             text = text.replace(name, option)
+        if "found no" in text:
+            text += "; --grid is for an array that is known, such as quad cells"
         raise InputError(f"{description}: {text}") from None
-    return replace(found, layout=layout_options.without(found.layout, exclude))
 
 
-def _describe(output: str, found: FoundLayout, settings: Settings, noise: float, flux: float) -> list[str]:
+def _describe(
+    output: str, found: FoundLayout, layout: Layout, settings: Settings, noise: float, flux: float
+) -> list[str]:
     """Say in a few lines what was found, and what was left out."""
-    layout = found.layout
     strength = getattr(settings, "noise_std", None)  # kept settings may be those of another estimator
     noise_std = "" if strength is None else f": noise_std {plain(strength)}"
     rows, columns = np.ptp(layout.cells, axis=0) + 1
@@ -232,6 +251,7 @@ def _describe(output: str, found: FoundLayout, settings: Settings, noise: float,
         f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px",
         f"  background noise {plain(noise)} e-, median flux {plain(flux)} e-{noise_std}",
     ]
+    lines += layout_options.largest_window_note(layout)
     if found.lenslets.doubt:
         lines.append(
             f"  doubtful: {found.lenslets.doubt} (look at the picture; --lit-fraction or --pupil decides)"
@@ -285,11 +305,17 @@ def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path
 
 
 def _completed(
-    calibration: Calibration, layout: Layout, mean: NDArray[np.float64], hot: NDArray[np.int64]
+    calibration: Calibration,
+    found: FoundLayout | KnownGrid,
+    layout: Layout,
+    mean: NDArray[np.float64],
+    hot: NDArray[np.int64],
 ) -> tuple[Calibration, list[str]]:
     """Add the frame's background as dark level where none is known, and hot pixels; say so."""
     notes = []
     edges = layout.images(mean)[:, [0, -1]]
+    if isinstance(found, KnownGrid) and (len(found.unlit) or layout_grid.is_quad_cell(layout)):
+        edges = found.unlit if len(found.unlit) else np.zeros(1)
     level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
     spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
     if calibration.dark is None and level > spread > 0:
@@ -316,5 +342,7 @@ def _first_settings(
     stages = plain.explain(frames)
     noise = pixel_noise(stages.calibrated)
     flux = float(np.median(stages.slopes.flux))
+    if layout_grid.is_quad_cell(layout):
+        return Settings("centroid"), noise, flux
     strength = float(suggested_strength(noise, max(flux, 0.0), layout.pixels))
     return Settings(noise_std=float(f"{strength:.3g}")), noise, flux

@@ -14,6 +14,7 @@ from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.window_size import LARGEST_WINDOW
 from faintspot.tables import read_tables
 
 
@@ -38,6 +39,14 @@ def window(pixels: int | None, text: str | None) -> int | tuple[int, int] | None
         raise InputError("--pixels, --window: expected one of them, got both")
     height, width = numbers("--window", text, (2,), "height and width in pixels, such as 12,16") or (0, 0)
     return (height, width)  # type: ignore[return-value]  # checked for whole numbers where windows are made
+
+
+def grid_shape(text: str) -> tuple[int, int]:
+    """Return rows and columns of a text such as 7x7."""
+    rows, _, columns = text.lower().partition("x")
+    if not (rows.isdecimal() and columns.isdecimal() and int(rows) * int(columns) > 0):
+        raise InputError(f"--grid {text}: expected rows and columns of lenslets, such as 7x7")
+    return int(rows), int(columns)
 
 
 def without(layout: Layout, text: str | None) -> Layout:
@@ -81,6 +90,17 @@ def optics(
     given = {"pixel_scale_arcsec": pixel_scale, "subaperture_m": subaperture_size, "diameter_m": diameter}
     known = read_tables(target).get("layout", {}) if target.exists() else {}
     return {name: known.get(name) if value is None else value for name, value in given.items()}
+
+
+def largest_window_note(layout: Layout) -> list[str]:
+    """Return a line that says so where windows are limited and leave out much of a sub-aperture."""
+    side = max(layout.window)
+    if side < LARGEST_WINDOW or layout.pitch_px is None or layout.pitch_px < side + 1:
+        return []
+    return [
+        f"  windows stop at {LARGEST_WINDOW} px, of a pitch of {layout.pitch_px:.0f} px: spots farther than "
+        f"{LARGEST_WINDOW // 2} px from their centre are missed; bin the frames if they move so far"
+    ]
 
 
 def dark_level(text: str) -> Any:

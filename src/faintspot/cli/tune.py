@@ -16,6 +16,7 @@ from rich.table import Table
 
 from faintspot import configuration
 from faintspot.cli import tune_loop
+from faintspot.cli.layout_options import grid_shape
 from faintspot.cli.needs import suggested_slopes
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
@@ -100,7 +101,9 @@ def _values(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--dark", multiple=True, metavar="FILE", help="Frames without light.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @_values
-@click.option("--grid", metavar="RxC", help="Rows and columns of lenslets, such as 7x7, for the layout.")
+@click.option(
+    "--grid", metavar="ROWSxCOLUMNS", help="Rows and columns of lenslets, such as 7x7, for the layout."
+)
 @click.option("--layout", "layout_file", metavar="TOML", help="Configuration with the layout.")
 @click.option(
     "--output",
@@ -256,12 +259,10 @@ def _sensor(grid: str | None, layout_file: str | None, target: Path, given: dict
 
 
 def _grid(grid: str, given: dict[str, Any]) -> Layout:
-    rows, _, columns = grid.lower().partition("x")
-    if not (rows.isdecimal() and columns.isdecimal()):
-        raise InputError(f"--grid {grid}: expected rows and columns of lenslets, such as 7x7")
+    shape = grid_shape(grid)
     if given.get("pixels") is None:
         raise InputError("--grid: with it, expected --pixels, the side of a sub-aperture's window")
-    return Layout.grid((int(rows), int(columns)), pixels=given["pixels"])
+    return Layout.grid(shape, pixels=given["pixels"])
 
 
 def _question(

@@ -48,6 +48,15 @@ _POSITIVE += ("flux_e", "frame_rate_hz", "zero_point", "search_range_px")
 _BUDGET = re.compile(r"\s*([-+0-9.eE]+)\s*(px|arcsec|mas)?\s*")
 
 
+def check_not_quad_cells(window: tuple[int, int]) -> None:
+    """Raise InputError for windows of two pixels on a side, in which estimators do not differ."""
+    if min(window) < 3:
+        raise InputError(
+            f"quad cells (windows of {window[0]} x {window[1]} px) leave nothing to tune: every estimator is "
+            "the difference of halves over the flux, whose settings `faintspot layout --grid` writes"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Question:
     """A camera, its spots and a star; everything that is not known may be left out where it is optional.
@@ -273,6 +282,7 @@ class Question:
         side = self._needed("pixels", "the side of a sub-aperture (px)")
         side = number_between("pixels", side, SMALLEST_WINDOW, LARGEST_WINDOW, integer=True)
         self._put("pixels", int(side))
+        check_not_quad_cells(self.shape)
 
     def _check_spot(self) -> None:
         if self.psf is not None and self.fwhm_px is None:

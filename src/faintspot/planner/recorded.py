@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.checks import finite_array
 from faintspot.errors import InputError
 from faintspot.estimate.noise import pixel_noise
-from faintspot.planner.question import Question
+from faintspot.planner.question import Question, check_not_quad_cells
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.photon_transfer import DetectorMeasurement, measure_detector
@@ -86,6 +86,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
         layout = Layout.from_frame(stack.mean(axis=0) - dark_mean, pixels=given.get("pixels"))
         ny, nx = layout.window
         facts.append(f"{len(layout)} sub-apertures of {ny} x {nx} px found in the frames")
+    check_not_quad_cells(layout.window)
     given.pop("pixels", None)
     calibration = _calibration(stack, dark_stack, layout, given, facts)
     given["em_gain"] = calibration.em_gain

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from faintspot.io.slopes_format import UNITS, VARIABLES, pixels_in, scaled_posit
 from faintspot.light import MeanLight
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings, with_preset, without_denoising
 from faintspot.slopes import Slopes
 from faintspot.tables import read_tables
@@ -202,7 +204,10 @@ def _given(
         )
     words = ["sub-apertures", *(["reference slopes"] if sensor.reference is not None else [])]
     document = dict(sensor.tables)
-    if Path(path).exists() or not document:
+    if not Path(path).exists() and not document:
+        command = _layout_command(frames[0], sensor.layout, path)
+        raise InputError(f"{path}: no such file, and {first} has no settings; `{command}` makes one")
+    if Path(path).exists():
         document = read_tables(path)
     else:
         words.append("settings")
@@ -216,6 +221,16 @@ def _given(
     )
     listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
     return parts, f"{listed} of {first}", sensor.reference
+
+
+def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str:
+    """Return the command that writes a configuration for a layout whose cells are on a grid."""
+    rows, columns = np.ptp(layout.cells, axis=0) + 1
+    (top, left), (bottom, right) = layout.corners.min(axis=0), layout.corners.max(axis=0) + layout.window
+    whole = (top, left, bottom, right) == (0, 0, *layout.frame_shape)
+    roi = [] if whole else ["--roi", f"{left},{top},{right},{bottom}"]
+    words = ["faintspot", "layout", str(frames), "--grid", f"{rows}x{columns}", *roi, "-o", str(path)]
+    return shlex.join(words)
 
 
 def _told_mean_light(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:

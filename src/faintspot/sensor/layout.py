@@ -122,6 +122,14 @@ class Layout:
 
     __hash__ = None  # type: ignore[assignment]
 
+    def __repr__(self) -> str:
+        """Return a line: the arrays of a layout have hundreds of rows."""
+        pitch = "" if self.pitch_px is None else f", pitch_px={self.pitch_px:.4g}"
+        return (
+            f"<Layout: {len(self)} sub-apertures, frame_shape={self.frame_shape}, window={self.window}, "
+            f"geometry={self.geometry!r}{pitch}>"
+        )
+
     def _repr_html_(self) -> str:
         from faintspot.notebook import layout_picture
 

@@ -147,7 +147,7 @@ def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float,
     if pitch_px < _SMALLEST_GIVEN_PITCH_PX:
         raise InputError(
             f"pitch_px = {pitch_px:g}: expected {_SMALLEST_GIVEN_PITCH_PX} to {largest:g}; spots of quad "
-            "cells overlap too much to be found, give their places as [layout.grid] in a configuration file"
+            "cells overlap too much to be found, --grid of faintspot layout gives their places"
         )
     if pitch_px > largest:
         raise InputError(
