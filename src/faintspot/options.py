@@ -144,6 +144,9 @@ class PerSubaperture:
         """Value of sub-aperture `index`."""
         return self.others.get(int(index), self.default)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PerSubaperture, (self.default, dict(self.others))  # a read-only mapping cannot be pickled
+
 
 @dataclass(frozen=True, eq=False)
 class Options:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
@@ -164,19 +167,39 @@ class TestInstalledPackages:
         assert estimators()["brightest"] is BrightestPixels
 
     @pytest.mark.parametrize("package", ["spots", None])
+    @pytest.mark.parametrize(
+        ("fault", "error"),
+        [
+            (RuntimeError("no such library\nand more"), "RuntimeError: no such library and more"),
+            (SystemExit(0), "SystemExit: 0"),
+            (KeyboardInterrupt(), "KeyboardInterrupt"),
+            (None, "SystemExit: 3"),
+        ],
+    )
     def test_one_that_fails_is_said_in_one_line(
-        self, monkeypatch: pytest.MonkeyPatch, package: str | None
+        self, monkeypatch: pytest.MonkeyPatch, package: str | None, fault: BaseException | None, error: str
     ) -> None:
         def load() -> None:
-            raise RuntimeError("no such library\nand more")
+            if fault is None:
+                os._exit(3)
+            raise fault
 
         installed(monkeypatch, Point(load, package))
         for _ in range(2):  # and not only the first time
-            with refused(
-                f"estimator 'middle' of the package {package or '?'}: RuntimeError: no such library; "
-                "mend or uninstall it"
-            ):
+            with refused(f"estimator 'middle' of the package {package or '?'}", error):
                 fs.Settings("ml")
+
+    def test_ctrl_c_while_one_is_imported_is_the_users(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def load() -> None:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(60)
+            except KeyboardInterrupt:
+                raise RuntimeError("half imported") from None
+
+        installed(monkeypatch, Point(load))
+        with pytest.raises(KeyboardInterrupt):
+            fs.Settings("ml")
 
     def test_one_with_a_name_that_is_taken(self, monkeypatch: pytest.MonkeyPatch) -> None:
         installed(monkeypatch, Point(lambda: register(middle("ml"))))

@@ -1,7 +1,7 @@
 """Whatever changes in a running engine a thousand times leaves nothing behind: memory, threads, descriptors.
 
 The garbage collector is off, as it is while frames come. FAINTSPOT_LEAK_TIMES=50 makes fifty times as many
-changes: 10,000 of settings, 1000 of modules and of cameras take a few minutes.
+changes: 10,000 of settings, 1000 of estimators and of cameras take a few minutes.
 """
 
 from __future__ import annotations
@@ -18,20 +18,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.realtime.bench import Bench, simulated
+from tests.realtime.estimator_files import write
 
-from faintspot.realtime.module_loading import load_module
+from faintspot.realtime.trial import Trial
 
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
 FEW = max(50, 20 * TIMES)
 PATIENCE_S = 10.0  # for threads that are about to end
 FIRST = 12  # changes before the count begins: everything is compiled, and the heap has its size
-MODULE = """
-STAGE = "denoise"
-class Kind:
-    pass
-def make(layout, settings):
-    return lambda images: images + {}
-"""
 
 
 def held() -> dict[str, int]:
@@ -119,20 +113,22 @@ def test_changes_of_settings(changing: Changing) -> None:
     assert_nothing(left, min(count, 1000), 2000)
 
 
-def test_changes_of_modules(changing: Changing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every one is another version of its file."""
-    monkeypatch.setattr(
-        "faintspot.realtime.engine_modules._EFFECT_TIMEOUT_S", 0.0
-    )  # its frame comes after it
-    path, modules = tmp_path / "added.py", changing.bench.engine.modules
+def test_swaps_of_an_estimator(changing: Changing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every one is another version of its file, in use; the trial in another process is left out."""
+    # Its frame comes after the change.
+    monkeypatch.setattr("faintspot.realtime.engine_estimators._EFFECT_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(Trial, "elsewhere", Trial.here)
+    estimators, live = changing.bench.engine.estimators, changing.bench.engine.live
+    estimators.load(str(write(tmp_path, "return sensor.zero")))
+    live.propose({"estimator": "mine"})
 
     def change(number: int) -> None:
-        path.write_text(MODULE.format(number))
-        modules.load(load_module(path))
+        estimators.load(str(write(tmp_path, f"return sensor.zero + {number % 7} / 10")), swap=True)
 
     count = FEW
     assert_nothing(changing.left_behind(change, count), count, 1000)
-    assert modules.module_fault() is None
+    assert estimators.fault is None
+    estimators.unload("mine")
 
 
 def test_restarts_of_the_camera(changing: Changing) -> None:

@@ -56,7 +56,7 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
     where = None if subapertures is None else parse_subapertures(subapertures)
     wanted = {"changes": parse_changes(changes), "where": where}
     reply = asked_at_length(name, "set", **wanted)
-    click.echo(_since(reply["frame"]))
+    click.echo(since(reply["frame"]))
 
 
 @click.command("interleave", short_help="Have settings take turns in a running engine.")
@@ -71,7 +71,7 @@ def interleave(name: str, arms: str, every: int) -> None:
       faintspot realtime interleave none,tv --every 100
     """
     reply = asked_at_length(name, "interleave", arms=arms, every=every)
-    click.echo(_since(reply["frame"]))
+    click.echo(since(reply["frame"]))
 
 
 @click.command("stop")
@@ -102,7 +102,7 @@ def _table(name: str) -> Any:
     grid.add_column("")
     grid.add_column("", justify="right")
     grid.add_row("source", "none" if source is None else f"process {source['pid']}, frame {source['frame']}")
-    for words in ("source_refused", "module_fault"):
+    for words in ("source_refused", "estimator_fault"):
         if reply[words]:
             grid.add_row(words.replace("_", " "), f"[bold red]{reply[words]}")
     if len(reply["arms"]) > 1:
@@ -111,8 +111,8 @@ def _table(name: str) -> Any:
         grid.add_row("preparing", _preparing(reply["preparing"]))
     if reply["loop"]["state"] != "none":
         grid.add_row("loop", loop_in_words(reply["loop"]).removeprefix("loop "))
-    for stage, module in reply["modules"].items():
-        grid.add_row(f"{stage} by module", module)
+    for estimator, file in reply["loaded"].items():
+        grid.add_row(f"{estimator} loaded from", file)
     grid.add_section()
     for key, value in reply["counters"].items():
         grid.add_row(key.replace("_", " "), f"{value}")
@@ -126,7 +126,8 @@ def _table(name: str) -> Any:
     return grid
 
 
-def _since(frame: int | None) -> str:
+def since(frame: int | None) -> str:
+    """Say from which frame on a change is in effect."""
     return "taken at the next frame" if frame is None else f"in effect from frame {frame}"
 
 
@@ -157,7 +158,7 @@ def summary(reply: dict[str, Any]) -> str:
     counters, latency = reply["counters"], reply["latency"]
     lost = counters["dropped"] + counters["skipped"]
     lines = f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"
-    for words in ("source_refused", "module_fault"):
+    for words in ("source_refused", "estimator_fault"):
         if reply[words]:
             lines += f"\n  {words.replace('_', ' ')}: {reply[words]}"
     if reply["preparing"]:

@@ -61,10 +61,6 @@ from faintspot.realtime.private_socket import socket_path
     metavar="FRAMES",
     help="Tell estimators the light of every sub-aperture, averaged over so many frames.",
 )
-@click.option(
-    "--module", "modules", multiple=True, metavar="NAME_OR_PATH", help="Module to begin with; see load."
-)
-@click.option("--isolate", is_flag=True, help="Run these modules in processes of their own; see load.")
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
 @click.option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
 def run(
@@ -81,8 +77,6 @@ def run(
     close_loop: bool,
     no_control: bool,
     mean_light: float | None,
-    modules: tuple[str, ...],
-    isolate: bool,
     frames: int | None,
     live: bool,
 ) -> None:
@@ -131,8 +125,6 @@ def run(
     )
     if engine.loop is not None and close_loop:
         engine.loop.close()
-    for source in modules:
-        engine.modules.load(engine.modules.admit(source, isolate=isolate))
     server = ControlServer(socket_path(name), commands_of(engine), lengthy=LENGTHY)
     with server, real_time(processors, priority) as refused:
         engine.refused = refused

@@ -165,6 +165,8 @@ def describe(summary: Summary, output: str) -> list[str]:
             lines.append(f"  {_count(count, 'slope')} {text} ({100 * count / summary.measured:.3g} %)")
     if not any(summary.flag_counts.values()):
         lines.append("  every slope is valid, without any flag")
+    if summary.failed_frames:
+        lines.append(f"  {_count(summary.failed_frames, 'frame')} without slopes: {summary.failure}")
     if summary.bad_frames:
         lines.append(f"  {_count(summary.bad_frames, 'frame')} without any valid slope")
     return lines + _next_step(output)

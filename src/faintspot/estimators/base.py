@@ -262,6 +262,10 @@ class Prepared:
     """Whether a group that is not full is measured faster with a narrower vector."""
     variance: float
     """Of a dark pixel, electrons squared."""
+    faults: int = 0
+    """Number of frames in which an estimator in NumPy has failed."""
+    fault: str = ""
+    """Error of the last one, in one line."""
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         self.estimator, self.sensor = estimator, sensor

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.checks import LARGEST_FLOAT32
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator, Positions, Prepared
+from faintspot.estimators.faults import faults_of
 from faintspot.estimators.gravity import keep_all
 from faintspot.estimators.sensor import Sensor
 from faintspot.flags import INVALID, SubapertureFlag
@@ -16,10 +20,11 @@ from faintspot.kernels import gravity, groups
 from faintspot.kernels.groups import SlopeArrays
 
 _NO_LIGHT = np.uint8(SubapertureFlag.NO_LIGHT)
+_TYPICAL_FLUX_E = 300.0
 _AT_SEARCH_LIMIT = np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)
 
 
-def limit_slopes(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
+def _limited(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
     """Return slopes (n, 2) within the search range; flags (n,) say which valid ones it has limited."""
     reach = table[groups.RANGE]
     at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX
@@ -29,25 +34,41 @@ def limit_slopes(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[
     return slopes
 
 
+def typical_images(n: int, window: tuple[int, int]) -> NDArray[np.float32]:
+    """Return images (n, ny, nx) of spots of 300 e- in the middles of windows, without noise."""
+    y, x = (np.arange(side) - 0.5 * (side - 1) for side in window)
+    profile = np.exp(-0.5 * (y[:, None] ** 2 + x**2))
+    spot = (_TYPICAL_FLUX_E * profile / profile.sum()).astype(np.float32)
+    return np.tile(spot, (n, 1, 1))
+
+
 class PythonPrepared(Prepared):
     """The kernel calibrates images and flags what is bad; `locate` then finds the positions.
 
     Parameters
     ----------
     estimator : Estimator
-        With a `locate` of its own.
+        With a `locate` of its own, which is tried on typical spots.
     sensor : Sensor
+
+    Raises
+    ------
+    InputError
+        When the estimator fails there.
     """
 
     kernel = staticmethod(gravity.gravity_of_groups)
     setting_rows = gravity.SETTING_ROWS
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
-        super().__init__(estimator, sensor)
+        zero = sensor.zero.copy()
+        zero.flags.writeable = False  # else an estimator that writes into it moves all later slopes
+        super().__init__(estimator, replace(sensor, zero=zero))
         if type(estimator).locate is Estimator.locate:
             raise InputError(
                 f"estimator {estimator.name!r}: expected a class with `locate` or `prepared`, got neither"
             )
+        self.found(typical_images(sensor.n, sensor.window), sensor.zero.copy())
 
     @property
     def tables(self) -> Any:
@@ -63,22 +84,37 @@ class PythonPrepared(Prepared):
         """See `Prepared`."""
         keep_all(table)
 
-    def positions(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the positions (n, 2) of the spots of one frame, px from the windows' middles."""
-        found = self._found(images, self.sensor.zero)
-        return np.stack([found.x, found.y], axis=1).astype(np.float32)
+    def found(self, images: NDArray[np.float32], prior: NDArray[np.float64]) -> Positions:
+        """Return what the estimator finds in one frame, with the flux filled in.
 
-    def _found(self, images: NDArray[np.float32], prior: NDArray[np.floating[Any]]) -> Positions:
-        """Return what the estimator finds, checked."""
-        found = self.estimator.locate(images, self.sensor, prior.astype(np.float64))
-        if isinstance(found, Positions):
-            return found
-        array, n = np.asarray(found), self.sensor.n
-        if array.shape != (n, 2):
-            raise InputError(
-                f"estimator {self.estimator.name!r}: locate: expected ({n}, 2), got {array.shape}"
-            )
-        return Positions(array[:, 0], array[:, 1])
+        Parameters
+        ----------
+        images : (n, ny, nx) float32
+        prior : (n, 2) float64
+            Predicted positions, px from the windows' middles.
+
+        Raises
+        ------
+        InputError
+            Whatever `locate` raises, and when it returns another shape: one line that names the estimator.
+        """
+        n, kind = self.sensor.n, type(self.estimator)
+        light = images.sum(axis=(1, 2))  # before `locate`, which may write into the images
+        file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+        title = f"estimator {self.estimator.name!r} of {file or kind.__module__}"
+        with faults_of(title, file), np.errstate(all="ignore"):
+            found = self.estimator.locate(images, self.sensor, prior)
+            if not isinstance(found, Positions):
+                array = np.asarray(found, np.float64)
+                if array.shape != (n, 2):
+                    raise InputError(f"locate: expected shape ({n}, 2), got {array.shape}")
+                found = Positions(array[:, 0], array[:, 1])
+            found = found._replace(flux=light if found.flux is None else found.flux)
+            values = [None if value is None else np.asarray(value, np.float64) for value in found]
+            for name, value in zip(Positions._fields, values, strict=True):
+                if value is not None and value.shape != (n,):
+                    raise InputError(f"locate: {name}: expected shape ({n},), got {value.shape}")
+        return Positions(*values)  # type: ignore[arg-type]
 
     def locate_frame(
         self,
@@ -90,6 +126,8 @@ class PythonPrepared(Prepared):
     ) -> None:
         """Write the slopes of one frame; flags hold what the calibration has found.
 
+        A frame in which the estimator fails is counted, and all its slopes are invalid.
+
         Parameters
         ----------
         images : (n, ny, nx) float32
@@ -100,26 +138,35 @@ class PythonPrepared(Prepared):
         frame : int
             Number of the frame in `slopes`.
         slopes : SlopeArrays
-
-        Raises
-        ------
-        InputError
-            When the estimator returns something of another shape.
         """
-        sensor, n = self.sensor, self.sensor.n
-        found = self._found(images, sensor.zero + prior.T)
-        light = images.sum(axis=(1, 2)) if found.flux is None else found.flux
-        usable = np.isfinite(found.x) & np.isfinite(found.y) & np.isfinite(light)
-        usable &= np.ones(n, bool) if found.valid is None else np.asarray(found.valid, bool)
+        try:
+            found: Positions | None = self.found(images, self.sensor.zero + prior.T)
+        except InputError as error:
+            self.faults, self.fault, found = self.faults + 1, str(error), None
+        self.write(found, table, frame, slopes)
+
+    def write(
+        self, found: Positions | None, table: NDArray[np.float32], frame: int, slopes: SlopeArrays
+    ) -> None:
+        """Write what `found` has returned into the slopes of a frame; None: nothing was found."""
+        if found is None:
+            nowhere = np.full(self.sensor.n, np.nan)
+            found = Positions(nowhere, nowhere, nowhere)
+        assert found.flux is not None
+        ny, nx = self.sensor.window
+        usable = (np.abs(found.x) <= 0.5 * nx) & (np.abs(found.y) <= 0.5 * ny)  # also: finite
+        usable &= np.abs(found.flux) <= LARGEST_FLOAT32
+        usable &= True if found.valid is None else found.valid != 0
         flags = slopes.flags[frame]
         flags &= ~_NO_LIGHT
         flags[~usable & (flags & INVALID == 0)] |= _NO_LIGHT
         valid = (flags & INVALID) == 0
-        slopes.flux[frame] = np.where(usable, light, 0.0)
+        slopes.flux[frame] = np.where(usable, found.flux, 0.0)
         positions = np.stack([found.x, found.y], axis=1)
-        away = np.where(valid[:, None], positions - sensor.zero, 0.0)
-        slopes.x[frame], slopes.y[frame] = limit_slopes(away, table, flags).T
+        away = np.where(valid[:, None], positions - self.sensor.zero, 0.0)
+        slopes.x[frame], slopes.y[frame] = _limited(away, table, flags).T
         scale = table[groups.ERROR_SCALE]
         errors = found.standard_error_x, found.standard_error_y
         for error, result in zip(errors, (slopes.standard_error_x, slopes.standard_error_y), strict=True):
-            result[frame] = np.inf if error is None else np.where(valid, scale * error, np.inf)
+            known = False if error is None else valid & (error >= 0)
+            result[frame] = np.where(known, scale * (0.0 if error is None else error), np.inf)

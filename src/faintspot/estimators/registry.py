@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, TypeVar
+from unittest import mock
 
 from faintspot.errors import InputError
+from faintspot.estimators.faults import faults_of
 
 if TYPE_CHECKING:
     from faintspot.estimators.base import Estimator
@@ -80,6 +84,12 @@ def estimators() -> dict[str, type[Estimator]]:
     return dict(sorted(_kinds.items(), key=lambda item: places.get(item[1].__module__, len(places))))
 
 
+def restore(kinds: Mapping[str, type[Estimator]]) -> None:
+    """Make the estimators known that `estimators` has returned before, and no others."""
+    global _kinds
+    _kinds = dict(kinds)
+
+
 def estimator_named(name: str) -> type[Estimator]:
     """Return the class of an estimator.
 
@@ -120,11 +130,8 @@ def _load() -> None:
     _kinds.clear()
     _kinds.update({kind.name: kind for kind in kinds})
     for point in entry_points(group=ENTRY_POINTS):
-        try:
+        package = point.dist.name if point.dist else "?"
+        title = f"estimator {point.name!r} of the package {package} (mend or uninstall it)"
+        # An import that ends the process would end it without a word.
+        with faults_of(title), mock.patch("os._exit", sys.exit):
             point.load()
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}".split("\n")[0]
-            package = point.dist.name if point.dist else "?"
-            raise InputError(
-                f"estimator {point.name!r} of the package {package}: {reason}; mend or uninstall it"
-            ) from None

@@ -9,7 +9,6 @@ from faintspot.checks import number_between, one_of
 from faintspot.errors import InputError
 from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
-from faintspot.realtime.module_commands import module_commands
 
 LENGTHY = ("set", "interleave", "load", "swap", "unload")
 """Commands that make something anew, which may compile: other commands are answered meanwhile."""
@@ -22,7 +21,7 @@ LOOP_ACTIONS = ("status", "open", "close", "gain", "flat")
 
 
 def commands_of(engine: Engine) -> dict[str, Handler]:
-    """Return the commands: status, get, set, interleave, loop, advice, stop, and those for modules."""
+    """Return the commands: status, get, set, interleave, loop, advice, stop, load, swap and unload."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return engine.status()
@@ -62,9 +61,25 @@ def commands_of(engine: Engine) -> dict[str, Handler]:
         engine.advice = [line[:_LONGEST_LINE] for line in lines[:_MOST_LINES]]
         return {}
 
+    def load(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return engine.estimators.load(_text(fields, "source"))
+
+    def swap(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return engine.estimators.load(_text(fields, "source"), swap=True)
+
+    def unload(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return engine.estimators.unload(_text(fields, "estimator"))
+
     own: dict[str, Handler] = {"status": status, "get": get, "set": change, "stop": stop}
-    own |= {"interleave": interleave, "loop": loop, "advice": advice}
-    return own | module_commands(engine.modules)
+    own |= {"load": load, "swap": swap, "unload": unload}
+    return own | {"interleave": interleave, "loop": loop, "advice": advice}
+
+
+def _text(fields: dict[str, Any], name: str) -> str:
+    value = fields.get(name)
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{name} = {value!r:.40}: expected a text")
+    return value
 
 
 def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:

@@ -14,13 +14,14 @@ from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.errors import InputError
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.control_loop import CLOSED, OPEN, STATES, ControlLoop
-from faintspot.realtime.engine_modules import EngineModules
+from faintspot.realtime.engine_estimators import EngineEstimators
+from faintspot.realtime.frame_path import FramePath
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM, Interleaving
 from faintspot.realtime.light_following import LightFollower
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
-from faintspot.realtime.prepared_settings import MeasuringPath, PreparedSettings, SettingsPreparer
+from faintspot.realtime.prepared_settings import PreparedSettings, SettingsPreparer
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
@@ -110,7 +111,7 @@ class Engine:
         self.advice: list[str] = []
         """What was last said to be better, for whoever asks for the status."""
         self._source, self._unfit = source, ""
-        self._path: MeasuringPath | None = None
+        self._path: FramePath | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the frame that was measured last
         self._measured: dict[int, int] = {}  # by an arm's number
@@ -119,7 +120,7 @@ class Engine:
         prior = None if control is None else Prior(len(control.interaction) // 2)
         self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
         self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
-        self.modules = EngineModules(self.live, self.preparer)
+        self.estimators = EngineEstimators(self.live, self.preparer)
         self._light = None if mean_light is None else LightFollower(self.live, mean_light)
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
@@ -170,8 +171,8 @@ class Engine:
             "subapertures": len(self.live.running.layout),
             "arms": interleaving.labels,
             "every": interleaving.every,
-            "modules": {stage: module.name for stage, module in self.modules.modules().items()},
-            "module_fault": self.modules.module_fault(),
+            "loaded": {name: str(file.path) for name, file in self.estimators.loaded.items()},
+            "estimator_fault": self.estimators.fault,
             "not_permitted": list(self.refused),
             "advice": self.advice,
             "loop": self.loop_status(),
@@ -317,16 +318,20 @@ class Engine:
         self._end_frame(ring, path, arm, arrival, number if whole else -1, explain)
         return True
 
-    def _take(self, ring: PixelRing) -> tuple[MeasuringPath, int]:
+    def _take(self, ring: PixelRing) -> tuple[FramePath, int]:
         """Return the path of the next frame, and whose turn it is; changes of settings take effect here."""
         prepared = self.live.take(self._number + 1)
         place = prepared.interleaving.arm_of(self.counters.processed)
+        path = prepared.paths(ring)[place]
+        if path.fault is not None and prepared.fallback is not None:
+            self.estimators.fall_back(prepared.fallback, path.fault)
+            return self._take(ring)
         if self.loop is not None:
             self.loop.take_turn(prepared.interleaving.arms[place].control)
-        return prepared.paths(ring)[place], prepared.interleaving.first + place
+        return path, prepared.interleaving.first + place
 
     def _end_frame(
-        self, ring: PixelRing, path: MeasuringPath, arm: int, arrival: int, number: int, explained: bool
+        self, ring: PixelRing, path: FramePath, arm: int, arrival: int, number: int, explained: bool
     ) -> None:
         """Publish what was measured, unless it was not that frame; first of all the slopes."""
         counters, slopes = self.counters, path.slopes
@@ -364,6 +369,7 @@ class Engine:
         counters.at_iteration_limit += limited
         counters.iterations += iterations
         counters.late += latency > self._deadline_ns
+        counters.estimator_failures += path.failed
         if self._arrival and number != self._number + 1:
             counters.skipped += max(number - self._number - 1, 0)
             counters.repeated += number <= self._number
@@ -395,7 +401,7 @@ class Engine:
     def _watch(self) -> None:
         """End the engine's waiting when it is to stop, or when what it waits for will not come.
 
-        And do all that takes time: tell telemetry what was changed, replace workers, take out modules.
+        And do all that takes time: tell telemetry what was changed, replace workers.
         """
         looks = told = 0
         loop_told: dict[str, Any] = {}
@@ -409,8 +415,6 @@ class Engine:
                     path.stop()
             if self._workers is not None:
                 self.counters.worker_restarts += self._workers.replace_dead()
-            if path is not None:
-                self.modules.take_out(path)
             self.live.let_go()
             if self._prediction is not None:
                 self._prediction.look_after()

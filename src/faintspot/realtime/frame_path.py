@@ -133,12 +133,14 @@ class FramePath:
         self._slots = len(slots)
         self._shares = 1 + (0 if workers is None else workers.count)
         n, pixels = len(pipeline.layout), pipeline.layout.pixels
-        results = SlopeArrays(*(np.zeros((1, n), dtype) for dtype in RESULT_TYPES))
+        self._results = results = SlopeArrays(*(np.zeros((1, n), dtype) for dtype in RESULT_TYPES))
         self.slopes = Slopes(*(result[0] for result in results))
         """Of the frame measured last; overwritten by the next one."""
         self._stages = np.zeros((STAGE_ROWS, 1, n, pixels), np.float32)
         self.fault: str | None = None
-        """Nothing of its own can fail; see `ModularPath`."""
+        """Why the estimator is given up; of compiled ones never, see `PythonPath`."""
+        self.failed = False
+        """Whether the estimator has failed in the frame measured last."""
         self._control = np.zeros(1, np.int64)
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide

@@ -97,10 +97,10 @@ class LiveSettings(Generic[Prepared]):
         self._prepare = prepare
         # Neither is ever taken by `take`.
         self._proposing = threading.Lock()  # held while settings are prepared, which may take seconds
-        self._lock = threading.Lock()  # of the history
+        self._lock = threading.Lock()  # of the history, and of what is newest
         self._under_way: tuple[dict[str, Any], float] | None = None
         first = _Version(prepare(settings), Change(0, {}, None, frame_number=-1))
-        # Written by those who propose, one at a time; read by the engine.
+        # Written with `_lock` held; read by the engine.
         self._newest = first
         # Written by the engine alone.
         self._running = first
@@ -129,6 +129,11 @@ class LiveSettings(Generic[Prepared]):
     def running(self) -> Prepared:
         """What measures frames now."""
         return self._running.prepared
+
+    @property
+    def newest(self) -> Prepared:
+        """What was prepared last, whether the engine has taken it or not."""
+        return self._newest.prepared
 
     @property
     def settings(self) -> Settings:
@@ -200,11 +205,16 @@ class LiveSettings(Generic[Prepared]):
             prepared = self._prepare(settings)
         finally:
             self._under_way = None
-        change = Change(self._newest.change.number + 1, changes, places)
-        with self._lock:
-            self._record.append(change)
-        self._newest = _Version(prepared, change)
+        change = self.offer(prepared, changes, places)
         self.let_go()
+        return change
+
+    def offer(self, prepared: Prepared, changes: dict[str, Any], where: list[int] | None = None) -> Change:
+        """Let the engine take what is prepared already before its next frame; `changes` names what is new."""
+        with self._lock:
+            change = Change(self._newest.change.number + 1, changes, where)
+            self._record.append(change)
+            self._newest = _Version(prepared, change)
         return change
 
     def frame_of(self, change: Change) -> int | None:

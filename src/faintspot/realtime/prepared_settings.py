@@ -1,69 +1,28 @@
-"""Settings made ready for their first frame: pipelines, modules, and the paths of frames through them."""
+"""Settings made ready for their first frame: pipelines, and the paths of frames through them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
+from faintspot.estimators.registry import estimator_named
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.frame_path import FramePath, Progress, check_real_time
 from faintspot.realtime.interleaving import Interleaving
-from faintspot.realtime.modular import ModularPipeline
-from faintspot.realtime.modular_path import ModularPath
-from faintspot.realtime.module_loading import Module
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import ARRIVALS, ROWS
 from faintspot.realtime.prior import Prior
+from faintspot.realtime.python_path import PythonPath, tried
+from faintspot.realtime.time_limit import call_within
 from faintspot.realtime.workers import Workers
-from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
-from faintspot.slopes import Slopes
 
-
-class MeasuringPath(Protocol):
-    """What measures frames: a `FramePath`, or one with modules in it."""
-
-    slopes: Slopes
-    fault: str | None
-
-    def warm_up(self) -> None:
-        """Have everything compiled."""
-        ...
-
-    @property
-    def denoised(self) -> NDArray[np.float32]:
-        """Images of the frame that was measured last, where they were asked for."""
-        ...
-
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` was called."""
-        ...
-
-    @property
-    def prior_std_px(self) -> NDArray[np.float64] | None:
-        """How wide the prior is that slopes are drawn to, (2 n,); None: they are not."""
-        ...
-
-    def await_start(self, number: int) -> None:
-        """Wait for the first row of a frame."""
-        ...
-
-    def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
-        """Measure a frame; see `FramePath.measure`."""
-        ...
-
-    def stop(self) -> None:
-        """End waiting for rows."""
-        ...
-
-    def go_on(self) -> None:
-        """Wait for rows again."""
-        ...
+TRIAL_LIMIT_S = 60.0  # an estimator may compile
 
 
 class PreparedSettings:
@@ -77,18 +36,13 @@ class PreparedSettings:
         Those that the arms' own changes are added to.
     interleaving : Interleaving
         Whose arms they are.
-    modules : mapping of str to Module
-        In place of built-in stages, by stage.
     workers : Workers, optional
     budget_s : float
-        For modules, from a frame's last row.
+        For estimators in NumPy, of one frame.
     prior : Prior, optional
-        Of all frames, see `FramePath`; what modules measure has none.
-
-    Raises
-    ------
-    InputError
-        When a module is refused.
+        Of all frames, see `FramePath`.
+    fallback : PreparedSettings, optional
+        Takes over when an estimator of somebody else fails.
     """
 
     def __init__(
@@ -96,56 +50,44 @@ class PreparedSettings:
         pipelines: Sequence[SlopePipeline],
         settings: Settings,
         interleaving: Interleaving,
-        modules: Mapping[str, Module],
         workers: Workers | None,
         budget_s: float,
         prior: Prior | None = None,
+        fallback: PreparedSettings | None = None,
     ) -> None:
         self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
-        self.pipelines, self._workers, self._budget_s = tuple(pipelines), workers, budget_s
-        self._prior = prior
-        own = [stages_of(pipeline, modules) for pipeline in self.pipelines]
-        self._modular = [
-            ModularPipeline(pipeline, stages, budget_s=budget_s) if stages else None
-            for pipeline, stages in zip(self.pipelines, own, strict=True)
-        ]
+        self.pipelines, self.fallback = tuple(pipelines), fallback
+        self._workers, self._budget_s, self._prior = workers, budget_s, prior
         self._ring: PixelRing | None = None
-        self._paths: tuple[MeasuringPath, ...] = ()
+        self._paths: tuple[FramePath, ...] = ()
 
-    def paths(self, ring: PixelRing) -> tuple[MeasuringPath, ...]:
+    @property
+    def estimator_names(self) -> set[str]:
+        """Names of the estimators of all arms."""
+        return {pipeline.settings.estimator.name for pipeline in self.pipelines}
+
+    def paths(self, ring: PixelRing) -> tuple[FramePath, ...]:
         """Return the paths of a ring's frames, one for every arm, complete and warm."""
         if ring is not self._ring:
-            made = zip(self.pipelines, self._modular, strict=True)
-            self._paths = tuple(self._new_path(pipeline, modular, ring) for pipeline, modular in made)
+            if self.fallback is not None:
+                self.fallback.paths(ring)
+            self._paths = tuple(self._new_path(pipeline, ring) for pipeline in self.pipelines)
             self._ring = ring
         return self._paths
 
-    def _new_path(
-        self, pipeline: SlopePipeline, modular: ModularPipeline | None, ring: PixelRing
-    ) -> MeasuringPath:
+    def _new_path(self, pipeline: SlopePipeline, ring: PixelRing) -> FramePath:
         cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
         columns = ring.cells.shape[1]
         # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
         progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
-        built_in = FramePath(pipeline, pixels, progress, workers=self._workers, prior=self._prior)
-        path: MeasuringPath = built_in
-        if modular is not None:
-            path = ModularPath(modular, pixels, progress, built_in, budget_s=self._budget_s)
+        made_for = pipeline, pixels, progress
+        path = (
+            PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
+            if isinstance(pipeline.preparation.prepared, PythonPrepared)
+            else FramePath(*made_for, workers=self._workers, prior=self._prior)
+        )
         path.warm_up()
         return path
-
-
-def stages_of(pipeline: SlopePipeline, modules: Mapping[str, Module]) -> Mapping[str, Module]:
-    """Return the modules, and what an estimator in NumPy does in the place of the compiled centroid."""
-    prepared = pipeline.preparation.prepared
-    if not isinstance(prepared, PythonPrepared) or "centroid" in modules:
-        return modules
-
-    def make(layout: Layout, settings: Settings) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-        return prepared.positions
-
-    name = prepared.estimator.name
-    return {**modules, "centroid": Module(name, "centroid", make, type(prepared.estimator).__module__, "")}
 
 
 class SettingsPreparer:
@@ -158,7 +100,7 @@ class SettingsPreparer:
     interleaving : Interleaving
     workers : Workers, optional
     budget_s : float
-        For modules, from a frame's last row.
+        For estimators in NumPy, of one frame.
     prior : Prior, optional
         Predicted slopes, see `FramePath`.
     """
@@ -177,8 +119,7 @@ class SettingsPreparer:
         self._workers, self._budget_s, self._prior = workers, budget_s, prior
         self.ring: PixelRing | None = None
         """Whose frames are being measured, if any."""
-        self.modules: Mapping[str, Module] = {}
-        """In place of built-in stages in all that is prepared from now on, by stage."""
+        self._built_in: Estimator = estimator_named("brightest")()
 
     def prepare(self, settings: Settings) -> PreparedSettings:
         """Prepare settings; where there is a ring, for its frames.
@@ -186,21 +127,53 @@ class SettingsPreparer:
         Raises
         ------
         InputError
-            When the settings do not fit, or what an arm makes of them, or a module is refused.
+            When the settings do not fit, or what an arm makes of them, or an estimator fails in its trial.
         """
-        pipelines = [self.make_pipeline(each) for each in self.of_arms(settings)]
+        arms = [arm.of(settings) for arm in self.interleaving.arms]
+        pipelines = [self._pipeline(each) for each in arms]
         for pipeline in pipelines:
             check_real_time(pipeline)
-        made_for = self._workers, self._budget_s, self._prior
-        prepared = PreparedSettings(pipelines, settings, self.interleaving, self.modules, *made_for)
-        ring = self.ring
-        if ring is not None:
-            prepared.paths(ring)
+        own = all(is_built_in(each.estimator) for each in arms)
+        prepared = self._prepared(
+            pipelines, settings, self.interleaving, None if own else self._fallback(settings)
+        )
+        if self.ring is not None:
+            prepared.paths(self.ring)
+        if is_built_in(settings.estimator):
+            self._built_in = settings.estimator
         return prepared
 
-    def of_arms(self, settings: Settings) -> list[Settings]:
-        """Return the settings of every arm."""
-        return [arm.of(settings) for arm in self.interleaving.arms]
+    def built_in(self, settings: Settings) -> Settings:
+        """Return settings with the built-in estimator that was set last, where theirs is somebody else's."""
+        own = is_built_in(settings.estimator)
+        return settings if own else settings.replace(estimator=self._built_in)
+
+    def _fallback(self, settings: Settings) -> PreparedSettings:
+        """Prepare the same settings with a built-in estimator, and no arms that take turns."""
+        settings, arms = self.built_in(settings), self.interleaving
+        alone = arms if len(arms.arms) == 1 else Interleaving(first=arms.first + len(arms.arms))
+        return self._prepared([self.make_pipeline(settings)], settings, alone, None)
+
+    def _prepared(
+        self,
+        pipelines: Sequence[SlopePipeline],
+        settings: Settings,
+        arms: Interleaving,
+        fallback: PreparedSettings | None,
+    ) -> PreparedSettings:
+        made_for = self._workers, self._budget_s, self._prior
+        return PreparedSettings(pipelines, settings, arms, *made_for, fallback)
+
+    def _pipeline(self, settings: Settings) -> SlopePipeline:
+        if is_built_in(settings.estimator):
+            return self.make_pipeline(settings)
+        title = f"estimator {settings.estimator.name!r}"
+        return call_within(TRIAL_LIMIT_S, title, tried, self.make_pipeline, settings, self._budget_s)
+
+
+def is_built_in(estimator: Estimator) -> bool:
+    """Return whether an estimator is one of this package."""
+    return type(estimator).__module__.startswith(f"{__package__.partition('.')[0]}.")
 
 
 class _WritableMemory:

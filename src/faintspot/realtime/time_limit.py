@@ -9,6 +9,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from faintspot.errors import InputError
+from faintspot.estimators.faults import one_line
 
 Result = TypeVar("Result")
 _TRIAL = "faintspot-trial"
@@ -50,12 +51,6 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
     if error is not None:
         raise InputError(f"{what}: {one_line(error)}")
     return result  # type: ignore[return-value]
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error's name and text in one line of bounded length; of an `InputError` the text alone."""
-    text = " ".join(str(error).split())[:300]
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 def call_is_under_way() -> bool:

@@ -176,6 +176,8 @@ class Counters:
     """How often the source went away and came back."""
     commands_renewed: int = 0
     """How often NAME_commands was removed and made anew."""
+    estimator_failures: int = 0
+    """Frames in which an estimator in NumPy failed: all their slopes are invalid."""
     worker_restarts: int = 0
     """Worker threads that died and were replaced."""
 

@@ -54,6 +54,10 @@ class Summary:
     """Frames of this call without a single valid slope."""
     measured: int = 0
     """Slopes made by this call."""
+    failed_frames: int = 0
+    """Frames of this call in which an estimator in NumPy failed."""
+    failure: str = ""
+    """Error of the last of them."""
     origin: str = ""
     """What was taken from a file of telemetry, in words."""
 
@@ -181,6 +185,8 @@ def measure_recorded(
                 summary.add(slopes)
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
+    prepared = pipeline.preparation.prepared
+    summary.failed_frames, summary.failure = prepared.faults, prepared.fault
     return summary
 
 

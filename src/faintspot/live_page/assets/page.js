@@ -81,7 +81,7 @@ function showState() {
   say("name", place.name);
   document.title = `${place.name} · faintspot`;
   const trouble = !connected ? "The server does not answer: is faintspot live still running?"
-    : place.error || status?.source_refused || status?.module_fault || (there && status?.error) || "";
+    : place.error || status?.source_refused || status?.estimator_fault || (there && status?.error) || "";
   byId("trouble").hidden = !trouble;
   say("trouble", trouble);
   const recorded = place.kind === "recording";
@@ -333,7 +333,7 @@ function showStatus() {
     ...(values.latency ? Object.entries(values.latency).filter(([name]) => name !== "count").map(([name, value]) =>
       [`latency ${name.replace("_us", "").replace("_", ".")}, µs`, inWords(value, 4)]) : []),
     ["not seen by this page", inWords(missed)],
-    ...Object.entries(values.modules || {}).map(([stage, module]) => [`${stage} by module`, module]),
+    ...Object.entries(values.loaded || {}).map(([estimator, file]) => [`${estimator} loaded from`, file]),
     ...(values.preparing ? [["being prepared", Object.keys(values.preparing.changes).join(", ")]] : []),
   ]);
 }

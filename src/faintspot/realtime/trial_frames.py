@@ -1,4 +1,4 @@
-"""Frames on which a module is tried before it is let near real ones."""
+"""Frames on which an estimator is tried before it measures real ones."""
 
 from __future__ import annotations
 
