@@ -75,7 +75,7 @@ def test_arms_of_later_interleavings_have_numbers_of_their_own() -> None:
     changes: list[dict[str, Any]] = [
         {"changes": {"noise_std": 2.0}},
         {"changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 5}},
-        {"changes": {"modules": {}}},
+        {"changes": {"loop": "open"}},
         {"changes": {"arms": ["set"], "first_arm": 4, "every": 5}},
     ]
     assert arms_after(["none", "tv"], changes[:1]) == (["none", "tv"], 0)

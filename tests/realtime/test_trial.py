@@ -12,6 +12,7 @@ from tests.realtime.estimator_files import PEAK, write
 
 import faintspot as fs
 from faintspot.estimators import estimators
+from faintspot.estimators.registry import restore
 from faintspot.realtime.estimator_file import load_estimators
 from faintspot.realtime.trial import Trial
 
@@ -33,21 +34,36 @@ def test_what_passes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "top", "message"),
     [
-        ("raise SystemExit(0)", "", "SystemExit: 0"),
-        ("raise KeyboardInterrupt", "", "KeyboardInterrupt"),
-        ("return images", "", r"expected shape \(16, 2\), got \(16, 8, 8\)"),
-        ("if images.max() == 0:\n    raise ValueError('dark')\nreturn sensor.zero", "", "ValueError: dark"),
         ("os._exit(3)", "", "exit status 3"),
         ("ctypes.string_at(0)", "", "SIGSEGV"),
         (PEAK, "os._exit(0)", "exit status 0"),
-        (PEAK, "raise SystemExit", "SystemExit"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, body: str, top: str, message: str) -> None:
+def test_what_ends_its_process(tmp_path: Path, body: str, top: str, message: str) -> None:
     with pytest.raises(fs.InputError, match=message) as caught:
         trial(write(tmp_path, body, top)).elsewhere()
     assert "my_estimator.py" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("body", "top", "message"),
+    [
+        ("raise SystemExit(0)", "", "SystemExit: 0"),
+        ("raise KeyboardInterrupt", "", "KeyboardInterrupt"),
+        ("return images", "", r"expected shape \(16, 2\), got \(16, 8, 8\)"),
+        ("if images.max() == 0:\n    raise ValueError('dark')\nreturn sensor.zero", "", "ValueError: dark"),
+        (PEAK, "raise SystemExit", "SystemExit"),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, body: str, top: str, message: str) -> None:
+    before = estimators()
+    try:
+        with pytest.raises(fs.InputError, match=message) as caught:
+            trial(write(tmp_path, body, top)).here()
+    finally:
+        restore(before)
+    assert "my_estimator.py" in str(caught.value)
 
 
 def test_one_that_does_not_let_go_of_the_interpreter(tmp_path: Path) -> None:
