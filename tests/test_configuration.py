@@ -175,6 +175,27 @@ def test_maps_in_files_of_ones_own(tmp_path: Path) -> None:
     assert np.array_equal(calibration.flat, np.full((6, 7), 2.0))
 
 
+def test_maps_are_means_of_several_frames(tmp_path: Path) -> None:
+    cube = np.random.default_rng(1).normal(100, 3, (5, 6, 7))
+    np.savez(tmp_path / "maps.npz", dark=cube, flat=cube / 100, bad=np.where(np.eye(6, 7) > 0, np.nan, 0))
+    path = written(
+        tmp_path,
+        '[calibration]\ndark = "maps.npz:dark"\nflat = "maps.npz:flat"\nbad_pixels = "maps.npz:bad"\n',
+    )
+    calibration = fs.Calibration.load(path)
+    assert np.allclose(calibration.dark, cube.mean(axis=0))
+    assert np.allclose(calibration.flat, cube.mean(axis=0) / 100)
+    assert np.array_equal(calibration.bad_pixels, np.eye(6, 7) > 0)
+
+
+def test_the_file_is_not_taken_for_a_table(tmp_path: Path) -> None:
+    path = tmp_path / "layout.est.toml"
+    path.write_text(SETTINGS)
+    with pytest.raises(fs.InputError) as error:
+        configuration.load_all(path)
+    assert str(error.value) == f"{path}: expected a table [layout], found estimator"
+
+
 def test_all_together_and_again(tmp_path: Path) -> None:
     path = tmp_path / "faintspot.toml"
     parts = fs.Layout.grid((2, 3), pixels=4), fs.Settings(noise_std=1.0), fs.Calibration(em_gain=500.0)

@@ -35,6 +35,32 @@ def test_arrays(tmp_path: Path) -> None:
         np.testing.assert_array_equal(stored["y"], np.eye(2))
 
 
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("night.toml", "night.psf.npz"),
+        ("night.1.toml", "night.1.psf.npz"),
+        ("night.1", "night.1.psf.npz"),  # not that of night.2
+        ("night.1.fits.gz", "night.1.psf.npz"),
+        ("night.control.NPZ", "night.control.psf.npz"),
+    ],
+)
+def test_names_of_derived_files(name: str, expected: str) -> None:
+    assert files.derived(f"a.b/{name}", ".psf.npz") == Path("a.b") / expected
+
+
+def test_only_regular_files_of_a_known_size_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    (tmp_path / "file").write_bytes(bytes(10))
+    for name, words in (("pipe", "a named pipe"), ("zero", "a device"), ("file", "at most 9")):
+        with pytest.raises(InputError, match=words):
+            files.read_bytes(tmp_path / name, "a file", 9)
+    assert files.read_bytes(tmp_path / "file", "a file", 10) == bytes(10)
+    with pytest.raises(IsADirectoryError):
+        files.read_bytes(tmp_path, "a file", 9)
+
+
 def test_content_is_on_the_disk_before_the_name_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

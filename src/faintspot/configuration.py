@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from faintspot.errors import InputError
+from faintspot.files import derived
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import Score, load_score
 from faintspot.settings import Settings
-from faintspot.tables import errors_of_table, read_tables, save_tables, table_of, tables_as_text
+from faintspot.tables import errors_of_table, read_tables, save_tables, tables_as_text
 from faintspot.toml_files import check_keys
 
 _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
@@ -59,10 +60,8 @@ def load_all(path: str | Path) -> Configuration:
     """Read everything from a configuration file; PSF and score may be absent."""
     path = Path(path)
     document = read_tables(path)
-    with errors_of_table(path, "layout"):
-        layout = Layout.from_table(table_of(path, document, "layout"))
     return Configuration(
-        layout,
+        Layout.from_tables(path, document),
         Settings.from_tables(path, document),
         Calibration.from_tables(path, document),
         psf_of(path, document),
@@ -96,7 +95,7 @@ def save(path: str | Path, item: Item) -> None:
         item.save(path)
         return
     table = "psf" if isinstance(item, PSF) else "score"
-    store = Path(path).with_suffix(f".{table}.npz")
+    store = derived(path, f".{table}.npz")
     item.save(store)
     save_tables(path, {table: {"file": store.name}})
 

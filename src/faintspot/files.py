@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import secrets
+import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -22,6 +23,8 @@ _ADVICE = {
     errno.EPERM: "no permission to write there: choose another folder",
     errno.EROFS: "the file system is read-only: choose another folder",
 }
+# What a name of ours ends with; anything else behind a dot is part of the name, as in night.1.
+_ENDINGS = (".toml", ".npz", ".zarr", ".fits", ".fits.gz", ".csv", ".html", ".json")
 Content = bytes | str | Callable[[BinaryIO], object]
 """What a file is to contain, a text as UTF-8; or what writes that to a stream."""
 
@@ -39,6 +42,53 @@ def output_errors(path: str | Path) -> Iterator[None]:
     except OSError as error:
         reason = _ADVICE.get(error.errno or 0, f"{error.strerror or error}: choose another name")
         raise InputError(f"{path}: cannot be written: {reason}") from None
+
+
+def check_regular(path: str | Path) -> int:
+    """Return the size of a file in bytes; refuse a pipe or a device, which may never end.
+
+    Raises
+    ------
+    InputError
+        When it is neither a file nor a folder.
+    OSError
+        When there is no such file, or it is a folder.
+    """
+    found = os.stat(path)
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a named pipe" if stat.S_ISFIFO(found.st_mode) else "a device or a socket"
+        raise InputError(f"{path}: expected a regular file, got {kind}")
+    return found.st_size
+
+
+def read_bytes(path: str | Path, what: str, most: int) -> bytes:
+    """Return the content of a file that should hold `what`, in at most so many bytes.
+
+    Raises
+    ------
+    InputError
+        When it is larger, or no regular file.
+    OSError
+        When it cannot be read.
+    """
+    check_file_size(path, what, most)
+    with Path(path).open("rb") as stream:
+        return stream.read(most)
+
+
+def check_file_size(path: str | Path, what: str, most: int) -> None:
+    """Refuse a file of more than so many bytes; raises what `read_bytes` raises."""
+    if (size := check_regular(path)) > most:
+        raise InputError(f"{path}: has {size:,} bytes: expected {what} of at most {most:,}")
+
+
+def derived(path: str | Path, ending: str) -> Path:
+    """Return the file beside `path` that is named after it: its name without its own ending, and `ending`."""
+    path = Path(path)
+    own = next((each for each in _ENDINGS if path.name.lower().endswith(each)), "")
+    return path.with_name(f"{path.name[: len(path.name) - len(own)]}{ending}")
 
 
 def write_atomically(path: str | Path, content: Content) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from faintspot.errors import InputError
 from faintspot.files import write_atomically
 from faintspot.options import PerSubaperture
-from faintspot.toml_files import check_keys, checked_table, parse_file
+from faintspot.toml_files import check_keys, checked_table, parse_file, read_text
 
 TABLES = ("layout", "calibration", "estimator", "settings", "psf", "score", "promise", "loop", "control")
 
@@ -28,7 +28,7 @@ def read_tables(path: str | Path) -> dict[str, dict[str, Any]]:
     """
     path = Path(path)
     maker = f"`faintspot layout FRAME -o {path.name}` makes one"
-    document: dict[str, Any] = parse_file(path, if_missing=maker).unwrap()
+    document = parse_file(path, if_missing=maker)
     check_keys(f"{path}: ", document, TABLES, what="table")
     return {name: checked_table(f"{path}: {name}", values) for name, values in document.items()}
 
@@ -89,9 +89,13 @@ def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]
         When the file exists and is not TOML, or cannot be written.
     """
     import tomlkit
+    from tomlkit.exceptions import TOMLKitError
 
     path = Path(path)
-    document = parse_file(path) if path.exists() else tomlkit.document()
+    try:
+        document = tomlkit.parse(read_text(path)) if path.exists() else tomlkit.document()
+    except (TOMLKitError, RecursionError) as error:
+        raise InputError(f"{path}: not a TOML file: {error}") from None
     for name, values in tables.items():
         if values is None:
             document.pop(name, None)

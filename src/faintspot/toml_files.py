@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from faintspot.errors import InputError
+from faintspot.files import read_bytes
 
-if TYPE_CHECKING:
-    import tomlkit
+_MOST_BYTES = 1 << 22  # a layout of 10,000 sub-apertures takes a tenth of it
 
 
-def parse_file(path: str | Path, *, if_missing: str = "") -> tomlkit.TOMLDocument:
-    """Read a TOML file; `.unwrap()` gives plain dictionaries, the document itself keeps the comments.
+def read_text(path: str | Path, *, if_missing: str = "") -> str:
+    """Read the text of a TOML file.
 
     Parameters
     ----------
@@ -25,20 +26,24 @@ def parse_file(path: str | Path, *, if_missing: str = "") -> tomlkit.TOMLDocumen
     Raises
     ------
     InputError
-        When the file cannot be read or is not TOML.
+        When the file cannot be read, is too large or is not UTF-8.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        return read_bytes(path, "a TOML file", _MOST_BYTES).decode("utf-8")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file{if_missing and f'; {if_missing}'}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a TOML file: it is not UTF-8 text") from None
-    return parse_text(text, str(path))
 
 
-def parse_text(text: str, where: str) -> tomlkit.TOMLDocument:
+def parse_file(path: str | Path, *, if_missing: str = "") -> dict[str, Any]:
+    """Read a TOML file; parameters and errors as `read_text`, and as `parse_text`."""
+    return parse_text(read_text(path, if_missing=if_missing), str(path))
+
+
+def parse_text(text: str, where: str) -> dict[str, Any]:
     """Read TOML text; `where` it was found is named in messages.
 
     Raises
@@ -46,12 +51,11 @@ def parse_text(text: str, where: str) -> tomlkit.TOMLDocument:
     InputError
         When it is not TOML.
     """
-    import tomlkit  # here: layouts and calibrations are made without any file, too
-    from tomlkit.exceptions import TOMLKitError
-
     try:
-        return tomlkit.parse(text)
-    except TOMLKitError as error:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{where}: not a TOML file: nested too deeply") from None
+    except ValueError as error:  # also of numbers that Python does not read
         raise InputError(f"{where}: not a TOML file: {str(error).splitlines()[0]}") from None
 
 

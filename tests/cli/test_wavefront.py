@@ -59,6 +59,14 @@ def test_without_scales_it_says_its_unit(run: Commands, slopes: Path) -> None:
     assert "Z7" not in result.out
 
 
+def test_pictures_of_two_recordings_have_two_names(run: Commands, slopes: Path) -> None:
+    for name in ("night.1.npz", "night.2.npz"):
+        slopes.with_name(name).write_bytes(slopes.read_bytes())
+        run.ok("wavefront", name)
+    assert Path("night.1_wavefront.png").exists()
+    assert Path("night.2_wavefront.png").exists()
+
+
 def test_scales_of_the_configuration_are_stored(run: Commands, slopes: Path) -> None:
     scales = "pixel_scale_arcsec = 0.4\nsubaperture_m = 1.0"
     text = CONFIGURATION.replace("[layout.grid]", f"[layout]\n{scales}\n[layout.grid]")

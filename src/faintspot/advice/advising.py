@@ -25,7 +25,7 @@ from faintspot.compare.statistics import Estimate, mean_by_blocks
 from faintspot.control.configuration import load_control
 from faintspot.control.learnt import INTEGRATOR
 from faintspot.errors import InputError
-from faintspot.files import parse_json, write_atomically
+from faintspot.files import derived, parse_json, write_atomically
 from faintspot.io.telemetry import Telemetry
 from faintspot.settings import Settings
 
@@ -176,7 +176,7 @@ def write_journal(path: str | Path, entry: dict[str, Any]) -> Path:
     InputError
         When it cannot be written, or something else is there.
     """
-    place = Path(path).with_suffix(JOURNAL)
+    place = derived(path, JOURNAL)
     entries: Any = []
     if place.exists():
         try:

@@ -114,7 +114,7 @@ def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Set
     gain : float
         Where the recording says no other.
     """
-    document = parse_text(telemetry.attributes["settings"], "settings of the recording").unwrap()
+    document = parse_text(telemetry.attributes["settings"], "settings of the recording")
     settings, first = Settings.from_tables("settings of the recording", document), -1
     for change in telemetry.changes:
         values = change["changes"]

@@ -17,6 +17,7 @@ from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
 from faintspot.errors import InputError
 from faintspot.estimate.noise import pixel_noise, suggested_strength
+from faintspot.files import derived
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
@@ -299,7 +300,7 @@ def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path
     """Draw frame and windows, and say where."""
     from faintspot.recorded.layout_picture import layout_picture
 
-    path = picture or str(target.with_suffix(".png"))
+    path = picture or str(derived(target, ".png"))
     layout_picture(frame, layout, path)
     return f"picture: {path}"
 

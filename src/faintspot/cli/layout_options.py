@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot import configuration
 from faintspot.errors import InputError
-from faintspot.io.frames import read_array
-from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.calibration import Calibration, read_map
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW
 from faintspot.tables import read_tables
@@ -72,7 +72,7 @@ def without(layout: Layout, text: str | None) -> Layout:
 def calibration(target: Path, **given: Any) -> Calibration:
     """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
     known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
-    maps = {"dark": dark_level, "flat": flat_field, "bad_pixels": bad_pixels}
+    maps = {"dark": dark_level, "flat": flat_field, "bad_pixels": partial(read_map, "bad_pixels")}
     changes = {
         name: maps[name](value) if name in maps else value
         for name, value in given.items()
@@ -108,24 +108,16 @@ def dark_level(text: str) -> Any:
     try:
         return float(text)
     except ValueError:
-        return _mean_map(text)
+        return read_map("dark", text)
 
 
 def flat_field(text: str) -> NDArray[np.float64]:
     """Return the relative response of the pixels: a frame, or the mean of several, divided by its mean."""
-    flat = _mean_map(text)
+    flat = read_map("flat", text)
     usable = np.isfinite(flat) & (flat > 0)
     if not usable.any():
         raise InputError(f"{text}: expected a flat field, no pixel is above 0")
     return np.asarray(flat / flat[usable].mean())
-
-
-def bad_pixels(text: str) -> NDArray[Any]:
-    """Return bad pixels: a map in which all but 0 is bad, or rows of (row, column)."""
-    array = read_array(text)
-    if array.ndim == 2 and array.shape[1] == 2:
-        return array
-    return np.asarray((array != 0) | ~np.isfinite(array))
 
 
 def plain(value: Any) -> str:
@@ -133,8 +125,3 @@ def plain(value: Any) -> str:
     if not isinstance(value, float | int):
         return str(value)
     return np.format_float_positional(float(f"{value:.3g}"), trim="-")
-
-
-def _mean_map(text: str) -> NDArray[np.float64]:
-    array = read_array(text)
-    return np.asarray(array.mean(axis=0, dtype=np.float64) if array.ndim == 3 else array, dtype=np.float64)

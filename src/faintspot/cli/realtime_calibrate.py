@@ -9,6 +9,7 @@ import click
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import configuration_option, name_option
 from faintspot.errors import InputError, MissingExtraError
+from faintspot.files import derived
 
 
 @needs("realtime", "pyshmem")
@@ -99,8 +100,8 @@ def calibrate(
     store = save_calibration(config, found, np.asarray(reference))
     written = [str(store)]
     try:
-        save_picture(store.with_suffix(".png"), found, np.asarray(reference), layout)
-        written.append(store.with_suffix(".png").name)
+        save_picture(derived(store, ".png"), found, np.asarray(reference), layout)
+        written.append(derived(store, ".png").name)
     except MissingExtraError as error:
         click.echo(f"no picture: {error}", err=True)
     for line in _in_words(found):

@@ -9,6 +9,7 @@ import click
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import configuration_option
 from faintspot.errors import InputError
+from faintspot.files import derived
 
 
 @needs("realtime", "zarr")
@@ -71,7 +72,7 @@ def learn(
     prior = prior_std_px(Settings.load(config), layout)
     telemetry, rate_hz = telemetry_of_recording(night, control, prior)
     learnt = learnt_by(kind, control.plant, telemetry, theories_of(layout, rate_hz, speeds, layers))
-    path = Path(config).with_suffix(".model.npz")
+    path = derived(config, ".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)
     left = learnt.model.left

@@ -8,6 +8,7 @@ import click
 
 from faintspot.cli.needs import needs
 from faintspot.errors import InputError
+from faintspot.files import derived
 from faintspot.io.locations import split_location
 from faintspot.io.zarr_store import holds_telemetry
 from faintspot.loop.stored_results import holds_loop_results
@@ -70,6 +71,6 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
         html = report_of_telemetry(paths[0])
     else:
         html = report_of_stored(paths, frames=[Path(path) for path in frames] or None)
-    target = output or str(paths[0].with_suffix(".html"))
+    target = output or str(derived(paths[0], ".html"))
     write_report(target, html)
     click.echo(f"{target}: open it in a browser")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
+from faintspot.files import derived, write_atomically
 
 if TYPE_CHECKING:
     import xarray
@@ -93,7 +93,7 @@ def run(
     from faintspot.study.specification import StudySpecification
 
     described = StudySpecification.from_file(specification)
-    target = output or str(Path(specification).with_suffix(".zarr"))
+    target = output or str(derived(specification, ".zarr"))
     _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
@@ -136,7 +136,7 @@ def paper(
     described = study_of_paper.specification(quick, figures or None)
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
     results = _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
-    page = Path(target).with_suffix(".html")
+    page = derived(target, ".html")
     study_of_paper.report(results, page)
     click.echo(f"{page}: open it in a browser")
 
@@ -171,14 +171,13 @@ def estimators(
       faintspot study estimators --quick
       faintspot study estimators -o estimators.zarr --table efficiency.md
     """
-    from faintspot.files import write_atomically
     from faintspot.study import estimators as study_of_estimators
     from faintspot.study.efficiency import markdown
 
     described = study_of_estimators.specification(quick)
     target = output or f"estimators{'-quick' if quick else ''}.zarr"
     results = _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
-    page = Path(target).with_suffix(".html")
+    page = derived(target, ".html")
     study_of_estimators.report(results, page)
     click.echo(f"{page}: open it in a browser")
     if table is not None:

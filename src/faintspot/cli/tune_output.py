@@ -11,7 +11,7 @@ from rich.console import Console
 
 from faintspot.cli.needs import can_make
 from faintspot.errors import InputError
-from faintspot.files import write_atomically
+from faintspot.files import derived, write_atomically
 
 _WIDEST_TEXT = 110
 
@@ -40,7 +40,7 @@ def picture_file(target: Path, picture: str | None) -> Path | None:
     """Return where the picture goes; None, said now, where it cannot be drawn and was not asked for."""
     if not can_make("picture", "web", "matplotlib", asked=picture is not None):
         return None
-    return Path(picture) if picture else target.with_name(f"{target.stem}-tune.png")
+    return Path(picture) if picture else derived(target, "-tune.png")
 
 
 def write_picture(answer: Any, path: Path | None) -> None:

@@ -104,10 +104,10 @@ def _print(wavefront: Wavefront) -> None:
 
 def _draw(wavefront: Wavefront, layout: Layout, slopes: Path, picture: str | None) -> str:
     """Draw it and say where."""
-    from faintspot.files import write_atomically
+    from faintspot.files import derived, write_atomically
     from faintspot.report.drawing import png
     from faintspot.wavefront.figure import wavefront_figure
 
-    path = picture or str(slopes.with_name(f"{slopes.name.split('.')[0]}_wavefront.png"))
+    path = picture or str(derived(slopes, "_wavefront.png"))
     write_atomically(path, png(wavefront_figure(wavefront, layout, slopes.name).figure))
     return f"picture: {path}"

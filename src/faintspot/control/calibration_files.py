@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.configuration import INTERACTION, REFERENCE, save_control
 from faintspot.control.mirror_calibration import MirrorCalibration
-from faintspot.files import save_arrays, write_atomically
+from faintspot.files import derived, save_arrays, write_atomically
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ def save_calibration(path: str | Path, found: MirrorCalibration, reference: Floa
     InputError
         When a file cannot be written.
     """
-    store = Path(path).with_suffix(".control.npz")
+    store = derived(path, ".control.npz")
     arrays = {
         INTERACTION: found.interaction,
         "interaction_error": found.interaction_error,

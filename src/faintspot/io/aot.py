@@ -8,7 +8,6 @@ interleaved settings and denoised images: they stay in the Zarr store.
 from __future__ import annotations
 
 import json
-import tomllib
 import warnings
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +20,7 @@ from faintspot.checks import one_of
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.files import write_atomically
 from faintspot.io.telemetry import Telemetry
+from faintspot.toml_files import parse_text
 
 # The standard wants both, and a sensor alone has neither.
 _EXPECTED = r".AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"
@@ -82,7 +82,7 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
 
     unix = telemetry.unix_time_s
     attributes = telemetry.attributes
-    tables = tomllib.loads(attributes["settings"])
+    tables = parse_text(attributes["settings"], "settings of the recording")
     source = aotpy.NaturalGuideStar("SOURCE")
     return aotpy.AOSystem(
         ao_mode=ao_mode,

@@ -308,7 +308,7 @@ class LoopConfiguration:
         InputError
             When it is not TOML, has an unknown table or key, or a bad value.
         """
-        return cls.from_document(parse_text(text, where).unwrap(), where)
+        return cls.from_document(parse_text(text, where), where)
 
     @classmethod
     def from_document(cls, document: dict[str, Any], where: str) -> LoopConfiguration:
@@ -361,7 +361,7 @@ def load_loop(path: str | Path) -> LoopConfiguration:
         shipped = ", ".join(shipped_loops())
         document = parse_file(path, if_missing=f"none of the shipped configurations either: {shipped}")
         where = str(path)
-    return LoopConfiguration.from_document(document.unwrap(), where)
+    return LoopConfiguration.from_document(document, where)
 
 
 def shipped_loops() -> list[str]:

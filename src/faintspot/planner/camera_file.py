@@ -37,7 +37,7 @@ def read_camera(path: str | Path) -> dict[str, Any]:
     InputError
         When the file cannot be read or is not TOML, or has an unknown table or key.
     """
-    document = parse_file(path).unwrap()
+    document = parse_file(path)
     check_keys(f"{path}: ", document, [*TABLES, _LAYOUT], what="table")
     values: dict[str, Any] = {}
     for table, content in document.items():

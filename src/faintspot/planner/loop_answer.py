@@ -17,7 +17,7 @@ from faintspot.compare.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, o
 from faintspot.control.learning import INTEGRATOR
 from faintspot.errors import InputError
 from faintspot.estimators.base import Need
-from faintspot.files import write_atomically
+from faintspot.files import derived, write_atomically
 from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice, LoopArm
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import LoopConfiguration
@@ -260,7 +260,7 @@ class LoopAnswer:
         if not configuration_file.has(path, "calibration"):
             configuration_file.save(path, camera_calibration(star))
         save_tables(path, {"loop": self._loop_table(best, flux)})
-        loop = path.with_name(f"{path.stem}-loop.toml")
+        loop = derived(path, "-loop.toml")
         gain = {} if arm.gain is None else {"gain": arm.gain}
         write_atomically(loop, star.replace("control", **gain).to_text())
         return loop

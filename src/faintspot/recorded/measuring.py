@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shlex
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -317,7 +316,7 @@ def _files_of_the_spot(configuration_file: str | Path) -> dict[str, str]:
     path = Path(configuration_file).resolve()
     if not path.exists():  # everything was in a file of telemetry
         return {}
-    tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    tables = read_tables(path)
     return {
         f"{part}_file": str(path.parent / tables[part].get("file", path.name))
         for part in ("psf", "score")

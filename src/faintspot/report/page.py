@@ -10,7 +10,7 @@ from pathlib import Path
 
 import faintspot
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import write_atomically
+from faintspot.files import derived, write_atomically
 from faintspot.report.figure_data import FigureWithData
 
 POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."
@@ -170,7 +170,7 @@ def write_page(page: Page, path: str | Path) -> list[Path]:
         if "csv" in figure.contents
         for ending, content in figure.contents.items()
     }
-    folder = path.with_name(f"{path.stem}-figures")
+    folder = derived(path, "-figures")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

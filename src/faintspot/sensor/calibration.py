@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between, numbers_between, real_array
 from faintspot.errors import InputError
-from faintspot.files import save_arrays
+from faintspot.files import derived, save_arrays
 from faintspot.io.frames import read_array
 from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_map, read_tables, save_tables
 
@@ -154,7 +154,7 @@ class Calibration:
         path = Path(path)
         values = chosen_fields(self)
         maps = {key: value for key, value in values.items() if is_map(value)}
-        store = path.with_suffix(".calibration.npz")
+        store = derived(path, ".calibration.npz")
         if maps:
             save_arrays(store, maps)
         save_tables(path, {"calibration": {**values, **{key: f"{store.name}:{key}" for key in maps}}})
@@ -254,11 +254,24 @@ def _mask_or_list(value: Any) -> NDArray[Any]:
     return array
 
 
+def read_map(key: str, location: str | Path) -> NDArray[Any]:
+    """Read `dark` or `flat` (the mean of several frames), or `bad_pixels`.
+
+    Bad pixels are a map in which every value but 0 is bad, or rows of (row, column).
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    """
+    array = read_array(location)
+    if key != "bad_pixels":
+        return array.mean(axis=0, dtype=np.float64) if array.ndim == 3 else array.astype(np.float64)
+    if array.ndim == 2 and array.shape[1] == 2:
+        return array
+    return np.asarray((array != 0) | ~np.isfinite(array))
+
+
 def _map_or_value(path: Path, key: str, value: Any) -> Any:
     """A map named by its file, relative to the configuration."""
-    if key in _MAPS and isinstance(value, str):
-        array = read_array(str(path.parent / value))
-        return (
-            array.astype(bool) if key == "bad_pixels" and array.ndim == 2 and array.shape[1] != 2 else array
-        )
-    return value
+    return read_map(key, str(path.parent / value)) if key in _MAPS and isinstance(value, str) else value

@@ -321,7 +321,12 @@ class Layout:
     @classmethod
     def load(cls, path: str | Path) -> Layout:
         """Read the table [layout] of a configuration file (TOML)."""
-        values = table_of(path, read_tables(path), "layout")
+        return cls.from_tables(path, read_tables(path))
+
+    @classmethod
+    def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Layout:
+        """Make a layout from the tables of a configuration file."""
+        values = table_of(path, document, "layout")
         with errors_of_table(path, "layout"):
             return cls.from_table(values)
 

@@ -17,7 +17,7 @@ from faintspot.errors import InputError
 from faintspot.sizes import check_size
 from faintspot.study.arm_names import DEFAULT_ARMS, kind_of, knows_the_spot
 from faintspot.study.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
-from faintspot.toml_files import check_keys, checked_table, parse_file, parse_text
+from faintspot.toml_files import check_keys, checked_table, parse_text, read_text
 
 __all__ = ["BEST", "CORRECTED", "PROFILES", "StudySpecification", "Sweep"]
 
@@ -209,7 +209,7 @@ class StudySpecification:
         InputError
             When it is not TOML, has an unknown key, lacks one or has a bad value.
         """
-        document: dict[str, Any] = parse_text(text, where).unwrap()
+        document = parse_text(text, where)
         try:
             return _build(document)
         except InputError as error:
@@ -217,15 +217,14 @@ class StudySpecification:
 
     @classmethod
     def from_file(cls, path: str | Path) -> StudySpecification:
-        """Read a specification from a TOML file; its name is the file's where it gives none.
+        """Read a specification from a TOML file.
 
         Raises
         ------
         InputError
             As `from_text`, and when the file cannot be read.
         """
-        document = parse_file(path)
-        return cls.from_text(tomlkit.dumps(document), str(path))
+        return cls.from_text(read_text(path), str(path))
 
 
 def _checked_list(name: str, given: Any) -> list[Any]:
