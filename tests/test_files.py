@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
 import pytest
 
 from faintspot import files
@@ -25,14 +24,6 @@ def test_permissions_are_those_of_any_new_file(tmp_path: Path) -> None:
     (tmp_path / "usual").touch()
     files.write_atomically(tmp_path / "a", b"")
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "usual").stat().st_mode
-
-
-def test_arrays(tmp_path: Path) -> None:
-    arrays = {"file": np.arange(3), "allow_pickle": np.eye(2)}
-    files.save_arrays(tmp_path / "a.npz", {"x": arrays["file"], "y": arrays["allow_pickle"]})
-    with np.load(tmp_path / "a.npz") as stored:
-        np.testing.assert_array_equal(stored["x"], np.arange(3))
-        np.testing.assert_array_equal(stored["y"], np.eye(2))
 
 
 @pytest.mark.parametrize(

@@ -150,14 +150,16 @@ class TestFilesThatClaimMore:
         zarr = pytest.importorskip("zarr")
         path = tmp_path / "frames.zarr"
         zarr.create_array(str(path), shape=(1 << 40, 64, 64), chunks=(1, 64, 64), dtype="f4")
+        for read in (lambda path: open_frames([path]), read_array):
+            with pytest.raises(fs.InputError, match="1,099,511,627,776 chunks that it states, found 0"):
+                read(path)
+        zarr.create_array(str(path), shape=(500, 64, 64), chunks=(1, 64, 64), dtype="f4", overwrite=True)
         with open_frames([path]) as frames:  # frames that are absent are the fill value, by Zarr's definition
-            assert frames.block((1 << 40) - 1, 1 << 40).shape == (1, 64, 64)
-        with pytest.raises(fs.InputError, match="GiB of memory"):
-            read_array(path)
+            assert frames.block(499, 500).shape == (1, 64, 64)
 
     def test_frames_beyond_any_camera(self, tmp_path: Path) -> None:
         zarr = pytest.importorskip("zarr")
         path = tmp_path / "frames.zarr"
-        zarr.create_array(str(path), shape=(2, 1 << 20, 1 << 20), chunks=(1, 64, 64), dtype="f4")
-        with pytest.raises(fs.InputError, match="its frames = 1048576 x 1048576"):
+        zarr.create_array(str(path), shape=(2, 1 << 17, 1 << 17), chunks=(1, 1 << 14, 1 << 14), dtype="f4")
+        with pytest.raises(fs.InputError, match="its frames = 131072 x 131072"):
             open_frames([path])

@@ -8,11 +8,9 @@ import json
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
-
-import numpy as np
+from typing import Any, BinaryIO
 
 from faintspot.errors import InputError
 
@@ -27,8 +25,6 @@ _ADVICE = {
 _ENDINGS = (".toml", ".npz", ".zarr", ".fits", ".fits.gz", ".csv", ".html", ".json")
 Content = bytes | str | Callable[[BinaryIO], object]
 """What a file is to contain, a text as UTF-8; or what writes that to a stream."""
-
-Made = TypeVar("Made")
 
 # Folders that cannot be synchronised: of some file systems, and those that may be written but not read.
 _CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
@@ -73,15 +69,16 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
     OSError
         When it cannot be read.
     """
-    check_file_size(path, what, most)
+    size = check_file_size(path, what, most)
     with Path(path).open("rb") as stream:
-        return stream.read(most)
+        return stream.read(size)
 
 
-def check_file_size(path: str | Path, what: str, most: int) -> None:
-    """Refuse a file of more than so many bytes; raises what `read_bytes` raises."""
+def check_file_size(path: str | Path, what: str, most: int) -> int:
+    """Return a file's size, refuse one of more than so many bytes; raises what `read_bytes` raises."""
     if (size := check_regular(path)) > most:
         raise InputError(f"{path}: has {size:,} bytes: expected {what} of at most {most:,}")
+    return size
 
 
 def derived(path: str | Path, ending: str) -> Path:
@@ -114,70 +111,6 @@ def write_atomically(path: str | Path, content: Content) -> None:
                 "create it or choose another"
             )
         replace_file(path, content)
-
-
-def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays to a compressed NumPy file (.npz) in one step, as `write_atomically` does.
-
-    Raises
-    ------
-    InputError
-        When it cannot be written.
-    """
-    write_atomically(path, lambda stream: np.savez_compressed(stream, **arrays))
-
-
-def read_arrays(
-    path: str | Path, what: str, names: Sequence[str] | None = None, optional: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Return the arrays of these names, or all, from a NumPy file (.npz) that should hold `what`.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read, or one that is not optional is missing.
-    """
-    try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            wanted = list(stored) if names is None else names
-            values: dict[str, Any] = {name: stored[name] for name in wanted if name in stored}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except Exception:  # a damaged archive raises whatever its decoder meets
-        raise InputError(f"{path}: expected {what} (.npz), got something else") from None
-    for name in names or ():
-        if name not in values and name not in optional:
-            raise InputError(f"{path}: expected {what}, but {name} is missing")
-    return values
-
-
-def save_fields(path: str | Path, item: object, names: Sequence[str]) -> None:
-    """Write the attributes of these names that are not None with `save_arrays`.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
-    """
-    values = {name: getattr(item, name) for name in names}
-    save_arrays(path, {name: value for name, value in values.items() if value is not None})
-
-
-def load_fields(
-    make: Callable[..., Made], path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
-) -> Made:
-    """Return what is made of the arrays that `save_fields` wrote, see `read_arrays`.
-
-    Raises
-    ------
-    InputError
-        As `read_arrays`; what `make` raises, with the file's name.
-    """
-    values = read_arrays(path, what, names, optional)
-    try:
-        return make(**values)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def replace_file(path: Path, content: Content) -> None:

@@ -12,6 +12,10 @@ MOST_NUMBERS = 1 << 28
 """A gigabyte of float32: a frame of 16,384 x 16,384 pixels."""
 
 
+MOST_TEXT_BYTES = 1 << 26
+"""Of metadata, JSON text."""
+
+
 def check_size(
     name: str, sides: Sequence[int], most: int = MOST_NUMBERS, what: str = "", hint: str = ""
 ) -> None:
@@ -39,6 +43,19 @@ def check_size(
         raise InputError(
             f"{name} = {shape}: expected at most {most:,} {what or 'numbers'}{hint and f'; {hint}'}"
         )
+
+
+def check_bytes(name: object, total: int, most: int, what: str) -> None:
+    """Refuse `what` is read from a file when it takes more than `most` bytes of memory.
+
+    Raises
+    ------
+    InputError
+        When it does.
+    """
+    if total > most:
+        size, limit = f"{total / 2**20:,.0f} MiB", f"{most / 2**20:,.0f} MiB"
+        raise InputError(f"{name}: takes {size} of memory, expected {what} of at most {limit}")
 
 
 def memory_bytes() -> int:

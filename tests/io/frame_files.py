@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
@@ -17,6 +19,9 @@ zarr = pytest.importorskip("zarr")
 
 FORMATS = ["npy", "fortran.npy", "npz", "deflated.npz", "fits", "fits.gz", "fits.fz"]
 FORMATS += ["v2.zarr", "v3.zarr", "group.zarr", "stack.tif", "pages.tif", "deflated.tif", "imagej.tif"]
+FORMATS += ["mat", "deflated.mat"]
+if importlib.util.find_spec("h5py") is not None:
+    FORMATS += ["h5", "gzip.h5", "7.3.mat"]
 
 
 def cube(n: int = 11, height: int = 6, width: int = 8, dtype: str = "int16") -> NDArray[Any]:
@@ -48,6 +53,22 @@ def save(path: Path, frames: NDArray[Any]) -> Path:
         if name.endswith("imagej.tif") and frames.dtype in (np.uint8, np.uint16, np.float32):
             options = {"imagej": True}  # which knows no other types
         tifffile.imwrite(path, frames, photometric="minisblack", **options)
+    elif name.endswith(".h5"):
+        import h5py
+
+        with h5py.File(path, "w") as file:
+            options = {"chunks": (1, *frames.shape[1:]), "compression": "gzip"} if "gzip" in name else {}
+            file.create_dataset("detector/frames", data=frames, **options)
+    elif name.endswith("7.3.mat"):
+        import h5py
+
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file["frames"], file["dark"] = frames.swapaxes(-1, -2), frames[0].T
+        with path.open("r+b") as stream:
+            stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
+    elif name.endswith(".mat"):
+        variables = {"frames": np.moveaxis(frames, 0, -1) if frames.ndim == 3 else frames, "gain": 2.0}
+        scipy.io.savemat(path, variables, do_compression="deflated" in name)
     elif "group" in name:
         group = zarr.create_group(str(path))
         group.create_array("frames", data=frames, chunks=(4, *frames.shape[1:]))

@@ -76,5 +76,5 @@ def test_slopes_are_written_resumed_and_guarded(tmp_path: Path) -> None:
 def test_it_is_listed(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("text")
     assert_refused(tmp_path / "b.txt", ".csv or .plain")
-    with pytest.raises(ValueError, match="TIFF or plain file or a Zarr store"):
+    with pytest.raises(ValueError, match="MATLAB or plain file or a Zarr store"):
         open_frames([tmp_path / "a.txt"])

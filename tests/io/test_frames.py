@@ -248,7 +248,7 @@ class TestRefused:
             "missing.fits": "no such file",
             "missing.npz:frames": "no such file",
             "empty.fits": "empty",
-            "text.txt": "expected a FITS, .npy, .npz or TIFF file or a Zarr store",
+            "text.txt": "HDF5 or MATLAB file or a Zarr store",
             "folder": "expected a Zarr store",
             "short.npy": "expected a NumPy array",
             "cut.npy": "truncated",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -72,7 +73,11 @@ def without(layout: Layout, text: str | None) -> Layout:
 def calibration(target: Path, **given: Any) -> Calibration:
     """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
     known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
-    maps = {"dark": dark_level, "flat": flat_field, "bad_pixels": partial(read_map, "bad_pixels")}
+    maps: dict[str, Callable[[str], Any]] = {
+        "dark": dark_level,
+        "flat": flat_field,
+        "bad_pixels": partial(read_map, "bad_pixels"),
+    }
     changes = {
         name: maps[name](value) if name in maps else value
         for name, value in given.items()

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from faintspot.control.configuration import INTERACTION, REFERENCE, save_control
 from faintspot.control.mirror_calibration import MirrorCalibration
-from faintspot.files import derived, save_arrays, write_atomically
+from faintspot.files import derived, write_atomically
+from faintspot.npz import save_arrays
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]

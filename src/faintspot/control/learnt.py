@@ -23,7 +23,7 @@ from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
 from faintspot.control.telemetry import Telemetry, replayed
 from faintspot.errors import InputError
-from faintspot.files import read_arrays, save_arrays
+from faintspot.npz import read_arrays, save_arrays
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandLine], Controller]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import finite_array
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import parse_json
+from faintspot.files import check_regular, parse_json
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_fits
 from faintspot.sensor.layout import Layout
@@ -79,6 +79,7 @@ def is_aot(path: str | Path) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
+            check_regular(path)
             return AOT_VERSION in load_fits().getheader(path, 0)
         except Exception:  # another file, or a damaged one, about which its reader says more
             return False

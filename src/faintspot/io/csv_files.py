@@ -7,8 +7,9 @@ from typing import IO
 
 import numpy as np
 
+from faintspot.files import check_file_size
 from faintspot.io.file_format import FileFormat
-from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, with_absent
+from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes, with_absent
 from faintspot.io.slopes_writer import Begun
 
 _LINES = 1 << 12
@@ -46,6 +47,7 @@ class Csv(FileFormat):
 
     def read(self, path: Path) -> StoredSlopes:
         """Read the whole table."""
+        check_file_size(path, "slopes", most_slopes_bytes() // 4)  # a number may take two characters
         with path.open(encoding="utf-8") as stream:
             names = stream.readline().strip().split(",")
         unit = next((unit for unit in UNITS if column_name("x", unit) in names), "px")

@@ -25,7 +25,8 @@ from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
-from faintspot.io.slopes_format import REQUIRED, StoredSlopes
+from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, check_stated, most_slopes_bytes
+from faintspot.sizes import check_bytes
 
 _BLOCK_BYTES = 2880
 _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
@@ -63,6 +64,9 @@ class Fits(FileFormat):
         """Read a file of slopes, and verify its checksums."""
         from faintspot.io.slopes_fits import read_fits
 
+        units = {unit.name.lower(): unit for unit in _units(path)}
+        check_bytes(path, sum(unit.data_bytes for unit in units.values()), most_slopes_bytes(), "slopes")
+        check_stated(path, {name: units[name].shape for name in VARIABLES if name in units})
         return read_fits(path)
 
     def has_slopes(self, path: Path) -> bool:

@@ -5,14 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 
 from faintspot.errors import InputError
+from faintspot.files import check_regular
 from faintspot.io.csv_files import Csv
 from faintspot.io.file_format import FileFormat
 from faintspot.io.fits_files import Fits, FitsGz
+from faintspot.io.hdf5_files import Hdf5, Matlab73
+from faintspot.io.matlab_files import Matlab
 from faintspot.io.numpy_files import Npy, Npz
+from faintspot.io.png_files import Png
 from faintspot.io.tiff_files import Tiff
 from faintspot.io.zarr_files import Zarr
 
-FORMATS: tuple[FileFormat, ...] = (Zarr(), Fits(), FitsGz(), Npy(), Npz(), Tiff(), Csv())
+FORMATS: tuple[FileFormat, ...] = (
+    Zarr(),
+    Fits(),
+    FitsGz(),
+    Npy(),
+    Npz(),
+    Tiff(),
+    Png(),
+    Hdf5(),
+    Matlab73(),
+    Matlab(),
+    Csv(),
+)
 _SIGNATURE_BYTES = 8
 
 
@@ -28,6 +44,7 @@ def frame_format(path: Path) -> FileFormat:
     """
     start = b""
     if not path.is_dir():
+        check_regular(path)
         with path.open("rb") as stream:
             start = stream.read(_SIGNATURE_BYTES)
         if not start:
@@ -35,7 +52,7 @@ def frame_format(path: Path) -> FileFormat:
     for item in FORMATS:
         if item.has_frames(path, start):
             return item
-    known = [item.name for item in FORMATS if item.signatures]
+    known = list(dict.fromkeys(item.name for item in FORMATS if item.signatures))
     raise InputError(f"{path}: expected a {_listed(known)} file or a Zarr store, it is none of them")
 
 

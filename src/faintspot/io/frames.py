@@ -16,7 +16,10 @@ from faintspot.closing import Closing
 from faintspot.errors import InputError
 from faintspot.io.formats import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
-from faintspot.sizes import check_size, memory_bytes
+from faintspot.io.raw import MOST_WHOLE_BYTES
+from faintspot.sizes import check_bytes, check_size
+
+_MOST_PIXELS = 1 << 26  # of a frame: 8192 x 8192
 
 
 class FrameSource(Closing):
@@ -181,12 +184,7 @@ def read_array(location: str | Path) -> NDArray[Any]:
         raise InputError(f"{array.name}: expected real numbers, got dtype {array.dtype}")
     if 0 in array.shape:
         raise InputError(f"{array.name}: expected at least one value, got shape {array.shape}")
-    # What it says may be more than it has: a damaged header, or a store whose chunks were never written.
-    gigabytes, present = (n / 2**30 for n in (math.prod(array.shape) * array.dtype.itemsize, memory_bytes()))
-    if gigabytes > present:
-        raise InputError(
-            f"{array.name}: its shape {array.shape} needs {gigabytes:.3g} GiB of memory, of {present:.3g}"
-        )
+    check_bytes(array.name, math.prod(array.shape) * array.dtype.itemsize, MOST_WHOLE_BYTES, "an array")
     try:
         return array.read(0, array.shape[0])
     finally:
@@ -216,7 +214,7 @@ def _check_frames(array: StoredArray) -> None:
         )
     if 0 in array.shape:
         raise InputError(f"{array.name}: expected at least one frame and pixel, got shape {array.shape}")
-    check_size(f"{array.name}: its frames", array.shape[-2:], what="pixels")
+    check_size(f"{array.name}: its frames", array.shape[-2:], _MOST_PIXELS, "pixels")
 
 
 def _frame_count(array: StoredArray) -> int:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 
 PREFERRED_NAME = "frames"
+_MOST_LISTED = 20
 
 
 class StoredArray(Protocol):
@@ -78,7 +79,9 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
     InputError
         When there is no such array, or no way to choose one.
     """
-    listed = ", ".join(dimensions) or "none"
+    listed = ", ".join(list(dimensions)[:_MOST_LISTED]) or "none"
+    if len(dimensions) > _MOST_LISTED:
+        listed += f" and {len(dimensions) - _MOST_LISTED} more"
     if key is not None:
         if key not in dimensions:
             raise InputError(f"{path}: no array {key!r}; it contains: {listed}")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -15,20 +13,16 @@ from faintspot.errors import InputError
 from faintspot.files import parse_json
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
-from faintspot.io.raw import DAMAGE, MappedArray, RawArray, pieces
-from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, with_absent
-
-
-@dataclass(frozen=True)
-class _Header:
-    shape: tuple[int, ...]
-    fortran_order: bool
-    dtype: np.dtype[Any]
-    offset: int
-
-    @property
-    def total_bytes(self) -> int:
-        return self.offset + math.prod(self.shape) * self.dtype.itemsize
+from faintspot.io.raw import MOST_WHOLE_BYTES, MappedArray, RawArray, WholeArray, pieces
+from faintspot.io.slopes_format import (
+    REQUIRED,
+    VARIABLES,
+    StoredSlopes,
+    check_stated,
+    most_slopes_bytes,
+    with_absent,
+)
+from faintspot.npz import DAMAGE, Header, headers_of, open_archive, read_header, unpacked
 
 
 class Npy(FileFormat):
@@ -71,9 +65,10 @@ class Npz(FileFormat):
 
     def read(self, path: Path) -> StoredSlopes:
         """Read a file of slopes; zip verifies the checksum of each array."""
-        # numpy.load leaves a file that it opened itself open when the archive is damaged.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        shapes = {name: header.shape for name, header in headers_of(path).items()}
+        shapes.pop("attributes")
+        check_stated(path, shapes)
+        arrays = unpacked(path, "slopes", most=most_slopes_bytes())
         variables = with_absent({name: arrays.pop(name) for name in VARIABLES if name in arrays})
         attributes = parse_json(str(arrays.pop("attributes")))
         return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
@@ -81,10 +76,11 @@ class Npz(FileFormat):
     def has_slopes(self, path: Path) -> bool:
         """Tell by the names of the arrays."""
         try:
-            with zipfile.ZipFile(path) as archive:
-                return {f"{name}.npy" for name in (*REQUIRED, "attributes")} <= set(archive.namelist())
+            archive, members = open_archive(path)
         except DAMAGE:
             return False  # whoever reads it says what is wrong with it
+        archive.close()
+        return {*REQUIRED, "attributes"} <= members.keys()
 
 
 def _find_npy(path: Path, key: str | None) -> StoredArray:
@@ -98,8 +94,7 @@ def _find_npy(path: Path, key: str | None) -> StoredArray:
     if key is not None:
         raise InputError(f"{path}: a .npy file holds one array without a name, got key {key!r}")
     with path.open("rb") as stream:
-        header = _read_header(str(path), stream)
-    _check(str(path), header, path.stat().st_size)
+        header = read_header(str(path), stream, path.stat().st_size)
     if header.fortran_order and len(header.shape) > 1:
         return MappedArray(str(path), np.load(path, mmap_mode="r", allow_pickle=False))
     return RawArray(
@@ -121,45 +116,30 @@ def _find_npz(path: Path, key: str | None) -> StoredArray:
         When the file is damaged, or has no such array, or several and no key is given.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            members = {
-                name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")
-            }
-            wanted = _candidates(members, key)
-            headers = {}
-            for name, member in wanted.items():
-                with archive.open(member) as stream:
-                    headers[name] = _read_header(f"{path}:{name}", stream)
-            dimensions = dict.fromkeys(members, 0) | {
-                name: len(header.shape) for name, header in headers.items()
-            }
-            chosen = choose_name(path, dimensions, key)
-            member_bytes = archive.getinfo(members[chosen]).file_size
+        archive, members = open_archive(path)
+        archive.close()
+        wanted = PREFERRED_NAME if key is None else key
+        # The headers decide which one to read only where nothing is named.
+        headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
     except DAMAGE as error:
         raise InputError(f"{path}: expected a whole .npz file, which it is not ({one_line(error)})") from None
-    return _npz_array(path, chosen, members[chosen], headers[chosen], member_bytes)
+    dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
+    chosen = choose_name(path, dimensions, key)
+    return _npz_array(path, chosen, members[chosen], headers[chosen])
 
 
-def _candidates(members: dict[str, str], key: str | None) -> dict[str, str]:
-    """Return the members whose headers decide which one to read; all of them only when nothing is named."""
-    name = key if key is not None else PREFERRED_NAME
-    if name in members:
-        return {name: members[name]}
-    return members if key is None else {}
-
-
-def _npz_array(path: Path, key: str, member: str, header: _Header, member_bytes: int) -> StoredArray:
+def _npz_array(path: Path, key: str, member: zipfile.ZipInfo, header: Header) -> StoredArray:
     """Return the array of a zip member; Fortran order cannot be streamed by frame, only loaded."""
     name = f"{path}:{key}"
-    _check(name, header, member_bytes)
     if header.fortran_order and len(header.shape) > 1:
         if len(header.shape) > 2:
             raise InputError(
                 f"{name}: stored in Fortran order, which cannot be read frame by frame: "
                 "save numpy.ascontiguousarray of it"
             )
-        with np.load(path, allow_pickle=False) as archive:
-            return MappedArray(name, archive[key])
+        return WholeArray(
+            name, header.shape, header.dtype, lambda: unpacked(path, "a frame", [key], MOST_WHOLE_BYTES)[key]
+        )
 
     def open_member() -> IO[bytes]:
         # The member keeps the file open after the archive object is closed.
@@ -169,29 +149,3 @@ def _npz_array(path: Path, key: str, member: str, header: _Header, member_bytes:
     return RawArray(
         name, open_member, offset=header.offset, dtype=header.dtype, shape=header.shape, forward_only=True
     )
-
-
-def _read_header(name: str, stream: IO[bytes]) -> _Header:
-    """Read the header that starts every .npy file and .npz member."""
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    try:
-        version = np.lib.format.read_magic(stream)
-        shape, fortran_order, dtype = readers[version](stream)
-    except KeyError:
-        raise InputError(f"{name}: expected .npy format version 1 or 2, got another") from None
-    except DAMAGE:
-        raise
-    except Exception as error:  # NumPy evaluates the header as Python, which fails in many ways
-        raise InputError(f"{name}: expected a NumPy array ({one_line(error)})") from None
-    return _Header(shape, fortran_order, dtype, stream.tell())
-
-
-def _check(name: str, header: _Header, actual_bytes: int) -> None:
-    if header.dtype.hasobject:
-        raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
-    if any(side < 0 for side in header.shape):
-        raise InputError(f"{name}: damaged: its header has the shape {header.shape}")
-    if actual_bytes < header.total_bytes:
-        raise InputError(
-            f"{name}: truncated: its header promises {header.total_bytes} bytes, there are {actual_bytes}"
-        )

@@ -16,6 +16,24 @@ def load_fits() -> Any:
     return fits
 
 
+def load_hdf5() -> Any:
+    """Return the package h5py; MissingExtraError when it is not installed."""
+    try:
+        import h5py
+    except ImportError:
+        raise MissingExtraError("h5py", "io", "Reading an HDF5 or MATLAB 7.3 file") from None
+    return h5py
+
+
+def load_pillow() -> Any:
+    """Return the module PIL.Image; MissingExtraError when it is not installed."""
+    try:
+        from PIL import Image
+    except ImportError:
+        raise MissingExtraError("pillow", "io", "Reading a PNG file or a compressed TIFF file") from None
+    return Image
+
+
 def load_zarr() -> Any:
     """Return the package zarr; MissingExtraError when it is not installed."""
     try:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import gzip
-import lzma
 import math
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, cast
@@ -15,20 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.files import check_regular
 from faintspot.io.locations import one_line
+from faintspot.npz import DAMAGE
+from faintspot.sizes import check_bytes
 
 GZIP_SIGNATURE = b"\x1f\x8b"
 _PIECE_BYTES = 1 << 20
 _PIECE_NUMBERS = 1 << 18
-DAMAGE = (
-    OSError,
-    EOFError,
-    zlib.error,
-    lzma.LZMAError,
-    zipfile.BadZipFile,
-    RuntimeError,
-    NotImplementedError,
-)
+MOST_WHOLE_BYTES = 1 << 30
+"""Of an array, or a part of one, that can only be read whole."""
 
 
 def open_plain_or_gzip(path: Path) -> IO[bytes]:
@@ -37,7 +30,8 @@ def open_plain_or_gzip(path: Path) -> IO[bytes]:
 
 
 def is_gzip(path: Path) -> bool:
-    """Tell by its first bytes whether a file is gzip-compressed."""
+    """Tell by its first bytes whether a regular file is gzip-compressed."""
+    check_regular(path)
     with path.open("rb") as stream:
         return stream.read(2) == GZIP_SIGNATURE
 
@@ -167,8 +161,51 @@ class RawArray:
             self._position += len(piece)
 
 
+class WholeArray:
+    """An array that can only be read whole, which its first reading does.
+
+    Parameters
+    ----------
+    name : str
+        File and key, for messages.
+    shape : tuple of int
+    dtype : numpy.dtype
+        Shape and type that the file states: before anything is read, they must not take too much memory.
+    load : callable
+        Returns the array; it may raise whatever a damaged file leads to.
+    """
+
+    def __init__(
+        self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], load: Callable[[], NDArray[Any]]
+    ) -> None:
+        self.name, self.shape = name, shape
+        self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
+        self._load = load
+        self._array: NDArray[Any] | None = None
+        check_bytes(name, math.prod(shape) * dtype.itemsize, MOST_WHOLE_BYTES, "an array")
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Return items `start` to `stop` of the first axis, C-ordered in native byte order."""
+        try:
+            array = self._load() if self._array is None else self._array
+            if array.shape != self.shape:
+                raise ValueError(f"its shape is {array.shape} instead of {self.shape}")
+        except InputError:
+            raise
+        except Exception as error:  # decoders raise whatever they like
+            raise InputError(
+                f"{self.name}: cannot be read: the file is damaged ({one_line(error)})"
+            ) from None
+        self._array = array
+        return np.array(array[start:stop], dtype=self.dtype, order="C")
+
+    def close(self) -> None:
+        """Forget the array; a later `read` reads it again."""
+        self._array = None
+
+
 class MappedArray:
-    """An array that NumPy has mapped or loaded already."""
+    """An array that NumPy has mapped."""
 
     def __init__(self, name: str, array: NDArray[Any]) -> None:
         self.name = name

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import finite_array, number_between, one_of
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import output_errors
+from faintspot.files import check_regular, output_errors
 from faintspot.io.file_format import FileFormat
 from faintspot.io.formats import slope_format
 from faintspot.io.locations import one_line
@@ -148,6 +148,8 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
         partial = partial_folder(path)
         hint = f"; an unfinished run has left {partial}" if is_partial(partial) else ""
         raise InputError(f"{path}: no such file{hint}")
+    if not path.is_dir():
+        check_regular(path)
     one_of("unit", unit, UNITS)
     if is_partial(path):
         stored = _read(path, lambda folder: _consistent(read_partial(folder)))

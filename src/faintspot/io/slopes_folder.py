@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import parse_json, replace_file, sync_file, sync_folder
+from faintspot.files import check_regular, parse_json, read_bytes, replace_file, sync_file, sync_folder
 from faintspot.io.slopes_format import VARIABLES, Run, StoredSlopes, with_absent
 from faintspot.io.slopes_writer import Begun
+from faintspot.sizes import MOST_TEXT_BYTES
 
 _RUN = "run.json"
 _MARK = "finished"
@@ -132,6 +133,7 @@ def read_partial(folder: Path) -> StoredSlopes:
     for name, variable in VARIABLES.items():
         empty = np.empty(shape, variable.dtype)
         if (folder / name).exists():
+            check_regular(folder / name)
             variables[name] = (
                 np.memmap(folder / name, variable.dtype, "r", shape=shape) if finished else empty
             )
@@ -146,7 +148,8 @@ def read_partial(folder: Path) -> StoredSlopes:
 
 def _read_description(folder: Path) -> dict[str, Any]:
     try:
-        description: dict[str, Any] = parse_json((folder / _RUN).read_text(encoding="utf-8"))
+        text = read_bytes(folder / _RUN, "a description", MOST_TEXT_BYTES)
+        description: dict[str, Any] = parse_json(text)
     except ValueError:
         raise _damaged(folder) from None
     return description
@@ -155,7 +158,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
 def _read_mark(folder: Path) -> tuple[str, int]:
     """Return fingerprint ("" where an earlier version has not written it) and number of whole frames."""
     try:
-        finished, _, fingerprint = (folder / _MARK).read_text(encoding="utf-8").partition("\n")
+        finished, _, fingerprint = read_bytes(folder / _MARK, "a mark", 1 << 10).decode().partition("\n")
         return fingerprint, int(finished)
     except (OSError, ValueError):
         raise _damaged(folder) from None

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
+from faintspot.sizes import check_bytes, memory_bytes
 from faintspot.slopes import Slopes
 
 
@@ -100,6 +101,37 @@ class StoredSlopes:
     def first(self, n_frames: int) -> Slopes:
         """Return the slopes of the first frames."""
         return Slopes(**{item.name: self.variables[item.name][:n_frames] for item in fields(Slopes)})
+
+
+def most_slopes_bytes() -> int:
+    """Return how much memory slopes that are read from a file may take: half of what the machine has."""
+    return memory_bytes() // 2
+
+
+def check_stated(path: Path, shapes: Mapping[str, tuple[int, ...]], n_frames: int | None = None) -> None:
+    """Refuse slopes whose file states shapes that do not fit together, or too much memory to be read.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    shapes : mapping
+        Shapes of variables and coordinates.
+    n_frames : int, optional
+        Number of frames to read. Default: all.
+    """
+    shape = shapes.get("x", ())
+    if len(shape) != 2:
+        raise InputError(f"{path}: expected slopes x of shape (frames, sub-apertures), got {shape}")
+    for name, other in shapes.items():
+        expected = shape if name in VARIABLES else shape[1:]
+        if other != expected:
+            raise InputError(f"{path}: {name}: expected shape {expected}, got {other}")
+    if n_frames is not None and not 0 <= n_frames <= shape[0]:
+        raise InputError(f"{path}: expected up to {shape[0]} finished frames, got {n_frames}")
+    row = sum(np.dtype(variable.dtype).itemsize for variable in VARIABLES.values())
+    total = (shape[0] if n_frames is None else n_frames) * shape[1] * row
+    check_bytes(path, total, most_slopes_bytes(), "slopes")
 
 
 def unit_of(name: str, attributes: Mapping[str, Any]) -> str:

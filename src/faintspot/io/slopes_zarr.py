@@ -18,17 +18,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import parse_json, sync_file, sync_folder
+from faintspot.files import sync_file, sync_folder
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, Run, StoredSlopes, unit_of, with_absent
+from faintspot.io.slopes_format import (
+    COORDINATE_UNITS,
+    VARIABLES,
+    Run,
+    StoredSlopes,
+    check_stated,
+    unit_of,
+    with_absent,
+)
 from faintspot.io.slopes_writer import Begun
 from faintspot.io.zarr_store import (
     checked_codecs,
     chunk_files,
     is_store,
+    open_store,
     read_items,
     replace_attributes,
+    stored_attributes,
 )
 
 zarr = load_zarr()
@@ -162,7 +172,9 @@ def read_store(path: Path) -> StoredSlopes:
     coordinates = attributes.pop(_COORDINATES, "").split()
     for size in ("n_frames", "n_subapertures"):
         del attributes[size]
-    group: Any = zarr.open_group(str(path), mode="r", use_consolidated=False)
+    group: Any = open_store(path)
+    stored = [name for name in (*VARIABLES, *coordinates) if name in group]
+    check_stated(path, {name: group[name].shape for name in stored}, finished)
     return StoredSlopes(
         variables=with_absent(
             {name: _read(path, group[name], 0, finished) for name in VARIABLES if name in group}
@@ -219,7 +231,7 @@ def _create_arrays(path: Path, run: Run) -> None:
 
 def _stored_attributes(path: Path) -> dict[str, Any]:
     """Return the attributes of a store of slopes; KeyError when it is something else."""
-    attributes: dict[str, Any] = parse_json((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+    attributes = stored_attributes(path)
     for name in (_MARK, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
         attributes[name]
     return attributes

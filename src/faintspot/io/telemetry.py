@@ -17,12 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import output_errors, parse_json
+from faintspot.files import output_errors
 from faintspot.flags import INVALID
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.io.zarr_store import TELEMETRY, checked_codecs, is_store, read_items, replace_attributes
+from faintspot.io.zarr_store import (
+    TELEMETRY,
+    checked_codecs,
+    is_store,
+    open_store,
+    read_items,
+    replace_attributes,
+    stored_attributes,
+)
+from faintspot.sizes import check_bytes, memory_bytes
 
 zarr = load_zarr()
 FORMAT = TELEMETRY
@@ -224,9 +233,15 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     store = Path(path)
     attributes = attributes_of(store)
     try:
-        group: Any = zarr.open_group(str(store), mode="r")
+        group: Any = open_store(store)
         finished = {"frame": int(attributes[_FRAMES]), "image": int(attributes[_IMAGES]) if images else 0}
         arrays = {}
+        total = sum(
+            array.nbytes
+            for name, array in group.arrays()
+            if images or "image" not in _dimensions(name, array.ndim)
+        )
+        check_bytes(store, total, memory_bytes() // 2, "telemetry")
         for name in _ARRAYS:
             if name in _NO_LOOP and name not in group:
                 arrays[name] = np.zeros((finished["frame"], *_NO_LOOP[name].shape[1:]), _NO_LOOP[name].dtype)
@@ -255,9 +270,7 @@ def attributes_of(store: Path) -> dict[str, Any]:
     if not store.exists():
         raise InputError(f"{store}: no such file or directory")
     try:
-        attributes: dict[str, Any] = parse_json((store / "zarr.json").read_text(encoding="utf-8"))[
-            "attributes"
-        ]
+        attributes = stored_attributes(store)
         known = attributes["format"] == FORMAT and attributes["version"] == 1
     except (OSError, ValueError, KeyError, TypeError):
         known = False

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.io.locations import one_line
-from faintspot.io.optional_packages import load_zarr
 from faintspot.io.telemetry import attributes_of, finished_of, stored_names
-from faintspot.io.zarr_store import read_items
+from faintspot.io.zarr_store import open_store, read_items
 
 
 class StoredTelemetry:
@@ -44,7 +43,7 @@ class StoredTelemetry:
         self.path = Path(path)
         self.attributes = attributes_of(self.path)
         try:
-            self._group: Any = load_zarr().open_group(str(self.path), mode="r")
+            self._group: Any = open_store(self.path)
             self.frames, self.images = finished_of(self.attributes)
             self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
             self.frames_together = int(self._group["x"].chunks[0])

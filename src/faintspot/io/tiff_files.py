@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 from pathlib import Path
 from typing import Any, Literal
@@ -11,8 +12,12 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.file_format import FileFormat
+from faintspot.io.inflation import check_inflated
 from faintspot.io.locations import StoredArray, one_line
+from faintspot.io.optional_packages import load_pillow
 from faintspot.io.raw import RawArray
+
+_PLAIN = (1, 8, 32946)  # not compressed, or deflated
 
 
 class Tiff(FileFormat):
@@ -165,12 +170,26 @@ class _Pages:
             self._file = None
             self._pages = []
 
+    def _decoded(self, page: Any) -> NDArray[Any]:
+        """Decode a page: with tifffile where it can, else with Pillow."""
+        with self._path.open("rb") as stream:
+            for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
+                stream.seek(offset)
+                check_inflated(self.name, stream.read(count), 2 * page.nbytes)
+        if page.compression in _PLAIN or importlib.util.find_spec("imagecodecs"):
+            return np.asarray(page.asarray(maxworkers=1))
+        if self.dtype.itemsize > 4:
+            raise MissingExtraError("imagecodecs", "io", f"Reading {page.compression.name} of {self.dtype}")
+        with load_pillow().open(self._path, formats=["TIFF"]) as image:
+            image.seek(page.index)
+            return np.asarray(image)
+
     def _page(self, number: int) -> NDArray[Any]:
         try:
             if self._file is None:
                 self._file = _load_tifffile().TiffFile(self._path)
                 self._pages = [page for i in self._numbers for page in self._file.series[i].pages]
-            values = np.asarray(self._pages[number].asarray())
+            values = self._decoded(self._pages[number])
         except Exception as error:  # the decompressors raise whatever they like
             self.close()
             raise InputError(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import os
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,9 @@ from faintspot.io.locations import StoredArray, choose_name, one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import Run, StoredSlopes
 from faintspot.io.slopes_writer import Begun, Storage
-from faintspot.io.zarr_store import is_store
+from faintspot.io.zarr_store import check_array, is_store, open_store
+
+_MOST_ABSENT = 1000  # chunks for each that is there
 
 
 class Zarr(FileFormat):
@@ -36,7 +41,7 @@ class Zarr(FileFormat):
             raise InputError(f"{path}: expected a Zarr store or a file of frames, this directory is neither")
         zarr = load_zarr()
         try:
-            node: Any = zarr.open(str(path), mode="r", path=key or "")
+            node: Any = open_store(path, key or "")
             if isinstance(node, zarr.Group):
                 arrays = dict(node.arrays())
                 node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
@@ -46,8 +51,8 @@ class Zarr(FileFormat):
             where = f"{path}:{key}" if key else str(path)
             raise InputError(f"{where}: cannot be opened as a Zarr array ({one_line(error)})") from None
         name = f"{path}:{node.path}" if node.path else str(path)
-        if any(getattr(codec, "codec_id", "") == "pickle" for codec in (*node.filters, *node.compressors)):
-            raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+        check_array(name, node)
+        _check_presence(path, name, node)
         return _ZarrArray(name, node)
 
     def require(self) -> None:
@@ -86,6 +91,19 @@ class Zarr(FileFormat):
         from faintspot.io.slopes_zarr import StoreStorage
 
         return StoreStorage(path, run)
+
+
+def _check_presence(path: Path, name: str, array: Any) -> None:
+    """Refuse an array of which hardly a chunk is there: its frames would be the fill value, for ever."""
+    parts = array.shards or array.chunks
+    promised = math.prod(-(-side // part) for side, part in zip(array.shape, parts, strict=True))
+    if promised <= _MOST_ABSENT:
+        return
+    folder = path / array.path
+    files = (file for _, _, files in os.walk(folder) for file in files if not file.endswith(".json"))
+    present = sum(1 for _ in islice(files, promised // _MOST_ABSENT + 1))
+    if present * _MOST_ABSENT < promised:
+        raise InputError(f"{name}: expected the {promised:,} chunks that it states, found {present:,}")
 
 
 class _ZarrArray:

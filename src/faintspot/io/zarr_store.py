@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import parse_json, replace_file
+from faintspot.files import check_regular, parse_json, read_bytes, replace_file
+from faintspot.io.inflation import check_inflated
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
+from faintspot.io.raw import MOST_WHOLE_BYTES
+from faintspot.sizes import MOST_TEXT_BYTES, check_bytes
 
 TELEMETRY = "faintspot telemetry"
 """What a store of telemetry has as its format."""
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
+_METADATA = (*_MARKS, ".zattrs", ".zmetadata")
+_COMPRESSORS = ("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd")
 
 
 def is_store(path: Path) -> bool:
@@ -25,11 +31,75 @@ def is_store(path: Path) -> bool:
     return any((path / mark).is_file() for mark in _MARKS)
 
 
+def open_store(path: Path, key: str = "") -> Any:
+    """Open a group or an array of a store to be read.
+
+    A pipe or a device in place of a file, and a chunk that inflates to more than `MOST_WHOLE_BYTES`, are
+    refused when they are read.
+
+    Raises
+    ------
+    Exception
+        Broken metadata makes zarr raise many things.
+    """
+    zarr = load_zarr()
+    local: Any = zarr.storage.LocalStore
+
+    class Checked(local):  # type: ignore[misc]  # Any, as zarr is imported here
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            file = self.root / key
+            try:
+                size = check_regular(file)
+            except OSError:
+                return None
+            described = Path(key).name in _METADATA
+            if described or byte_range is None:
+                what = "metadata" if described else "a chunk"
+                check_bytes(file, size, MOST_TEXT_BYTES if described else MOST_WHOLE_BYTES, what)
+            found = await super().get(key, prototype, byte_range)
+            if found is not None and not described:
+                check_inflated(str(file), found.to_bytes())
+            return found
+
+    return zarr.open(store=Checked(path, read_only=True), mode="r", path=key, use_consolidated=False)
+
+
+def check_array(name: str, array: Any) -> None:
+    """Refuse an array whose chunks are too large when unpacked, or compressed twice, or Python objects.
+
+    Raises
+    ------
+    InputError
+        When it is such an array.
+    """
+    codecs = [
+        getattr(codec, "codec_id", type(codec).__name__) for codec in (*array.filters, *array.compressors)
+    ]
+    if "pickle" in codecs:
+        raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+    inflating = [codec for codec in codecs if codec.lower().removesuffix("codec") in _COMPRESSORS]
+    if len(inflating) > 1:
+        raise InputError(f"{name}: expected chunks compressed once, got {' and '.join(inflating)}")
+    check_bytes(name, math.prod(array.chunks) * array.dtype.itemsize, MOST_WHOLE_BYTES, "a chunk")
+
+
+def stored_attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of the group that a store is.
+
+    Raises
+    ------
+    OSError, ValueError, KeyError, TypeError
+        When it is no group of format 3.
+    """
+    text = read_bytes(path / "zarr.json", "metadata", MOST_TEXT_BYTES)
+    attributes: dict[str, Any] = parse_json(text)["attributes"]
+    return attributes
+
+
 def holds_telemetry(path: Path) -> bool:
     """Tell whether a path is a store of telemetry, as `faintspot.io.telemetry` writes it."""
     try:
-        attributes = parse_json((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
-        return bool(attributes["format"] == TELEMETRY)
+        return bool(stored_attributes(path)["format"] == TELEMETRY)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -65,6 +135,7 @@ def read_items(path: Path, array: Any, start: int, stop: int, *, whole: bool) ->
                     f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
                     "(counted from 0) and later is lost"
                 )
+    check_array(f"{path}: {array.basename}", array)
     try:
         return np.asarray(array[start:stop])
     except Exception as error:  # a broken chunk makes each codec raise its own kind

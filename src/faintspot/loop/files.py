@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.files import read_arrays, save_arrays
+from faintspot.npz import read_arrays, save_arrays
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from faintspot.estimate.noise import suggested_strength
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.files import read_arrays, save_arrays
 from faintspot.loop.arms import LoopArm
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.files import make_folder
@@ -26,6 +25,7 @@ from faintspot.loop.record import LoopRecord
 from faintspot.loop.results import InterleavedResult, set_file
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.tuning import FIRST_TUNING_REALISATION
+from faintspot.npz import read_arrays, save_arrays
 from faintspot.settings import Settings
 
 KIND = "interleaved"

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from faintspot.checks import number_between, numbers_between, real_array
 from faintspot.errors import InputError
-from faintspot.files import derived, save_arrays
-from faintspot.io.frames import read_array
+from faintspot.files import derived
+from faintspot.io.frames import open_frames, read_array
+from faintspot.npz import save_arrays
 from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_map, read_tables, save_tables
 
+_BLOCK_PIXELS = 1 << 22  # in memory at a time
 _MAPS = ("dark", "flat", "bad_pixels")
 # What the kernels square in float32, with a wide margin; no camera comes near.
 _GAINS = 1e-9, 1e9
@@ -264,9 +266,13 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     InputError
         When the file cannot be read.
     """
-    array = read_array(location)
     if key != "bad_pixels":
-        return array.mean(axis=0, dtype=np.float64) if array.ndim == 3 else array.astype(np.float64)
+        with open_frames([location]) as frames:
+            total = np.zeros(frames.shape)
+            for _, block in frames.blocks(0, frames.n_frames, max(1, _BLOCK_PIXELS // total.size)):
+                total += block.sum(axis=0, dtype=np.float64)
+            return total / frames.n_frames
+    array = read_array(location)
     if array.ndim == 2 and array.shape[1] == 2:
         return array
     return np.asarray((array != 0) | ~np.isfinite(array))

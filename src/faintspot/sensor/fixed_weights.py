@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, number_between, numbers_between
 from faintspot.errors import InputError
-from faintspot.files import load_fields, save_fields
+from faintspot.npz import load_fields, save_fields
 
 Floats = NDArray[np.float64]
 

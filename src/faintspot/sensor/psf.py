@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.errors import InputError
-from faintspot.files import load_fields, save_fields
+from faintspot.npz import load_fields, save_fields
 from faintspot.simulate.spots import image_shape, per_spot, position_array, spots
 from faintspot.sizes import check_size
 

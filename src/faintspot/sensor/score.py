@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.checks import finite_array, image_stack, number_between, numbers_between, one_of
 from faintspot.errors import InputError
-from faintspot.files import load_fields, save_fields
+from faintspot.npz import load_fields, save_fields
 from faintspot.sensor.fixed_weights import FixedWeights
 
 STARTS = ("reference", "peak")
