@@ -50,7 +50,7 @@ def frames(geometry: str = "square", n_frames: int = 3) -> NDArray[Any]:
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw nothing, which takes most of a second, where the picture is not what is tested."""
-    monkeypatch.setattr("faintspot.recorded.layout_picture.layout_picture", lambda frame, layout, path: None)
+    monkeypatch.setattr("faintspot.recorded.layout_picture.layout_picture", lambda *given, **named: None)
 
 
 def is_png(path: Path) -> bool:

@@ -24,6 +24,16 @@ def test_hot_pixels_among_spots_are_found_and_spots_are_not() -> None:
     assert found == {(row, column) for row, column, _ in hot}
 
 
+@pytest.mark.parametrize("step", [(0, 1), (1, 0), (1, 1), (1, -1)])
+@pytest.mark.parametrize("second", [0.2, 1.0])
+def test_pairs_of_hot_pixels_are_found(step: tuple[int, int], second: float) -> None:
+    image = np.random.default_rng(2).normal(100, 3, (30, 30))
+    pair = np.array([[12, 17], [12 + step[0], 17 + step[1]]])
+    image[tuple(pair.T)] += [900.0, 900.0 * second]
+    found = find_hot_pixels(image)
+    assert sorted(map(tuple, found.tolist())) == sorted(map(tuple, pair.tolist()))
+
+
 @pytest.mark.parametrize("size", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("profile", ["diffraction", "gaussian"])
 def test_no_noiseless_spot_is_a_hot_pixel(profile: str, size: float) -> None:

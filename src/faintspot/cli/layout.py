@@ -28,6 +28,7 @@ from faintspot.sensor.layout import GEOMETRIES, Layout
 from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
+_MOST_NAMED = 12  # sub-apertures in one line
 _FIRST_FRAMES = 20  # measured for the settings
 # What the finder calls what these options give.
 _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels": "--bad-pixels"}
@@ -108,7 +109,7 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
 @click.option(
     "--mask-hot-pixels",
     is_flag=True,
-    help="Enter isolated bright pixels as bad pixels. Not for spots sharper than Nyquist sampling.",
+    help="Enter isolated bright pixels and pairs as bad pixels. Not for spots sharper than Nyquist sampling.",
 )
 @click.option(
     "--pixel-scale",
@@ -198,15 +199,19 @@ def command(
             found = layout_grid.illuminated(source.description, mean, grid, calibration, options)
         else:
             found = _found(source.description, mean, options)
-        layout = replace(layout_options.without(found.layout, exclude), **optics)
+        kept = layout_options.kept(len(found.layout), exclude)
+        layout = replace(found.layout[kept], **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
     settings, noise, flux = _first_settings(layout, calibration, first)
     if keeps_settings:
         settings = configuration.load(target, "settings")
         notes.append(f"  the settings that {output} has are kept")
+    marks = {}
+    if isinstance(found, FoundLayout):
+        marks = {"outside": found.outside, "doubtful": (found.clipped | found.unlike)[kept]}
     drawn = with_picture and _draw(
-        np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, picture, target
+        np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, marks, picture, target
     )
     # The layout last: it may be long, and whatever is saved after it reads it again.
     for item in (settings, calibration, layout):
@@ -214,7 +219,7 @@ def command(
     if isinstance(found, KnownGrid):
         lines = layout_grid.describe(output, found, layout, flux, calibration)
     else:
-        lines = _describe(output, found, layout, settings, noise, flux)
+        lines = _describe(output, found[kept], layout, settings, noise, flux)
     for line in [*lines, *notes]:
         click.echo(line)
     if calibration.gain_e_per_adu == 1.0:
@@ -262,12 +267,41 @@ def _describe(
             f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "
             f"{_sides(found)}; smaller windows (--pixels) or --move-windows take more"
         )
+    lines += _doubtful_spots(found)
     moved = np.abs(np.median(layout.offsets, axis=0))
     if moved.max() > 1:
         lines.append(
             f"  windows moved off the spots by ({moved[0]:.1f}, {moved[1]:.1f}) px: "
             "centres of gravity are worse in them"
         )
+    return lines
+
+
+def _doubtful_spots(found: FoundLayout) -> list[str]:
+    """Say which spots are outside all windows, far from their lattice, or doubtful."""
+    lines = []
+    if (count := len(found.outside)) > 0:
+        size = np.array(found.layout.frame_shape[::-1])
+        depth = np.minimum(found.outside, size - 1 - found.outside).min(axis=1)
+        at_edge = np.count_nonzero(depth < 0.5 * found.lenslets.pitch_px)
+        where = f", {at_edge} of them at the frame's edge" if at_edge else ""
+        spots = "1 bright spot lies" if count == 1 else f"{count} bright spots lie"
+        lines.append(f"  {spots} outside all windows{where}: see the circles in the picture")
+    if (drift := np.linalg.norm(found.lenslets.drifts, axis=1).max()) > 0:
+        lines.append(
+            f"  the windows follow spots that lie up to {drift:.1f} px from the regular lattice, which stays "
+            "the reference"
+        )
+    for reason, doubtful in (
+        ("at their window's edge, which cuts them", found.clipped),
+        ("displaced unlike those of all neighbours", found.unlike),
+    ):
+        if doubtful.any():
+            numbers = np.flatnonzero(doubtful)
+            named = ", ".join(map(str, numbers[:_MOST_NAMED])) + (
+                ", ..." if len(numbers) > _MOST_NAMED else ""
+            )
+            lines.append(f"  doubtful slopes of {named} ({len(numbers)}): spots {reason}")
     return lines
 
 
@@ -296,12 +330,14 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
     return electrons
 
 
-def _draw(frame: NDArray[Any], layout: Layout, picture: str | None, target: Path) -> str:
+def _draw(
+    frame: NDArray[Any], layout: Layout, marks: dict[str, Any], picture: str | None, target: Path
+) -> str:
     """Draw frame and windows, and say where."""
     from faintspot.recorded.layout_picture import layout_picture
 
     path = picture or str(derived(target, ".png"))
-    layout_picture(frame, layout, path)
+    layout_picture(frame, layout, path, **marks)
     return f"picture: {path}"
 
 

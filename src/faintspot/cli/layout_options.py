@@ -50,11 +50,11 @@ def grid_shape(text: str) -> tuple[int, int]:
     return int(rows), int(columns)
 
 
-def without(layout: Layout, text: str | None) -> Layout:
-    """Return the layout without the sub-apertures of a text such as 3,17,40-45."""
+def kept(count: int, text: str | None) -> NDArray[np.bool_]:
+    """Return which of so many sub-apertures a text such as 3,17,40-45 does not exclude."""
+    kept = np.ones(count, dtype=bool)
     if text is None:
-        return layout
-    kept = np.ones(len(layout), dtype=bool)
+        return kept
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         if not first.isdecimal() or not (last.isdecimal() or not dash):
@@ -62,12 +62,12 @@ def without(layout: Layout, text: str | None) -> Layout:
                 f"--exclude {text}: expected numbers and ranges of sub-apertures, such as 3,17,40-45"
             )
         low, high = int(first), int(last or first)
-        if not low <= high < len(layout):
-            raise InputError(f"--exclude {part.strip()}: expected sub-apertures from 0 to {len(layout) - 1}")
+        if not low <= high < count:
+            raise InputError(f"--exclude {part.strip()}: expected sub-apertures from 0 to {count - 1}")
         kept[low : high + 1] = False
     if not kept.any():
-        raise InputError(f"--exclude {text}: no sub-aperture is left of {len(layout)}")
-    return layout[kept]
+        raise InputError(f"--exclude {text}: no sub-aperture is left of {count}")
+    return kept
 
 
 def calibration(target: Path, **given: Any) -> Calibration:

@@ -18,12 +18,20 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+_WINDOW, _DOUBTFUL = "#E69F00", "#56B4E9"
 _MOST_NUMBERED = 1500
 _MOST_PIXELS = 1400  # a side of the frame; of more, pixels are averaged rather than left out
 
 
 @styled
-def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
+def layout_picture(
+    frame: ArrayLike,
+    layout: Layout,
+    path: str | Path,
+    *,
+    outside: ArrayLike = (),
+    doubtful: ArrayLike | None = None,
+) -> None:
     """Write a PNG picture of a frame with the sub-apertures' windows and numbers drawn on it.
 
     The brightness follows asinh of the light above the sky, cut at the 99.5th percentile of the windows'
@@ -36,6 +44,10 @@ def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
     layout : Layout
     path : str or Path
         Replaced when it exists.
+    outside : (m, 2) array
+        x, y of spots outside all windows, drawn as circles.
+    doubtful : (n_subapertures,) array of bool, optional
+        Sub-apertures whose windows are drawn in another colour.
 
     Raises
     ------
@@ -46,10 +58,14 @@ def layout_picture(frame: ArrayLike, layout: Layout, path: str | Path) -> None:
     if array.ndim == 3:
         array = array.mean(axis=0)
     inside = layout.images(array)
-    write_atomically(path, png(_layout_figure(array, inside, layout), tight=False))
+    marked = np.zeros(len(layout), bool) if doubtful is None else np.asarray(doubtful, bool)
+    figure = _layout_figure(array, inside, layout, np.reshape(outside, (-1, 2)), marked)
+    write_atomically(path, png(figure, tight=False))
 
 
-def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
+def _layout_figure(
+    array: Floats, inside: Floats, layout: Layout, outside: Floats, doubtful: NDArray[np.bool_]
+) -> Figure:
     from matplotlib import patheffects
     from matplotlib.collections import PolyCollection
 
@@ -62,7 +78,16 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
     colour_bar(axes, image, "frame's units")
     points = 72 * side * 0.85 * layout.window[1] / n_columns  # a window's width in points
     boxes, line = _window_outlines(layout), min(max(points / 14, 0.2), 0.9)  # lines never hide the spots
-    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors="#E69F00", linewidths=line))
+    colours = [_DOUBTFUL if marked else _WINDOW for marked in doubtful]
+    axes.add_collection(PolyCollection(boxes, facecolors="none", edgecolors=colours, linewidths=line))
+    axes.scatter(
+        outside[:, 0],
+        outside[:, 1],
+        s=(0.8 * points) ** 2,
+        facecolors="none",
+        edgecolors=_DOUBTFUL,
+        linewidths=1.0,
+    )
     axes.set_xlabel("column (px)")
     axes.set_ylabel("row (px)")
     pitch = "" if layout.pitch_px is None else f", pitch {layout.pitch_px:.2f} px"
@@ -81,7 +106,7 @@ def _layout_figure(array: Floats, inside: Floats, layout: Layout) -> Figure:
                 column - 0.5 + 0.06 * layout.window[1],
                 row - 0.5 + 0.95 * layout.window[0],
                 str(number),
-                color="#E69F00",
+                color=_WINDOW,
                 fontsize=font,
                 va="top",
                 clip_on=True,

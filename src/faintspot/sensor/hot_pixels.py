@@ -1,4 +1,4 @@
-"""Hot pixels: single pixels that stand out from their surroundings as no spot does."""
+"""Hot pixels: single pixels and pairs that stand out from their surroundings as no spot does."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from faintspot.checks import number_between, real_array
 from faintspot.errors import InputError
 
 _MAD_TO_STD = 1.4826
-_SHARPNESS = 4.0  # excess over the spread of the neighbours; a Nyquist-sampled spot's peak has 2.7 at most
+_SHARPNESS = 4.0  # excess over the spread of the neighbours; a Nyquist-sampled spot's peak has 3 at most
 
 
 def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.int64]:
-    """Find isolated bright pixels in a frame.
+    """Find isolated bright pixels, and pairs of them, in a frame.
 
     A pixel is hot when it exceeds the median of its 8 neighbours by more than `threshold` standard deviations
-    of the frame's noise and by more than 4 times the spread (largest minus smallest) of these neighbours. The
-    peaks of spots that are sampled at the Nyquist rate or better stay below that; those of sharper spots
-    do not.
+    of the frame's noise and by more than 4 times the spread (second largest minus smallest) of these
+    neighbours. The largest may be hot too. The peaks of spots that are sampled at the Nyquist rate or better
+    stay below that; those of sharper spots do not.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.i
     InputError
         When the frame is not a real two-dimensional array.
     """
-    from scipy.ndimage import maximum_filter, median_filter, minimum_filter
+    from scipy.ndimage import median_filter, minimum_filter, rank_filter
 
     image = real_array("frame", frame, minimum_dimensions=2).astype(np.float64)
     if image.ndim != 2:
@@ -48,7 +48,6 @@ def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.i
     ring[1, 1] = False
     excess = image - median_filter(image, footprint=ring, mode="mirror")
     noise = _MAD_TO_STD * np.median(np.abs(excess - np.median(excess)))
-    spread = maximum_filter(image, footprint=ring, mode="mirror") - minimum_filter(
-        image, footprint=ring, mode="mirror"
-    )
+    second_largest = rank_filter(image, -2, footprint=ring, mode="mirror")
+    spread = second_largest - minimum_filter(image, footprint=ring, mode="mirror")
     return np.argwhere((excess > level * noise) & (excess > _SHARPNESS * spread) & ~known)

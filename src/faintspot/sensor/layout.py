@@ -42,7 +42,7 @@ class Layout:
         Row and column of each window's first pixel.
     centres : (n, 2) array, optional
         x, y of each sub-aperture's centre in frame pixels (pixel i has its centre at i), from which positions
-        are measured, at most the window's longer side from its middle. Default: that middle.
+        are measured, at most three times the window's longer side from its middle. Default: that middle.
     cells : (n, 2) array of int, optional
         Row and column of each lenslet in its array, for maps.
     geometry : {"square", "hexagonal"}
@@ -282,8 +282,9 @@ class Layout:
         -------
         Layout
             Of the lit sub-apertures whose windows lie within the frame. Windows have the spots' mean lattice
-            in their middle, unless they were moved; `centres` always holds the lattice.
-            `faintspot.sensor.found_layout.find_layout` says which lenslets were left out at the frame's edge.
+            in their middle, unless they were moved or follow spots that an aberration moves by more than a
+            quarter of the pitch; `centres` always holds the lattice.
+            `faintspot.sensor.found_layout.find_layout` says which lenslets and spots were left out.
 
         Raises
         ------
@@ -413,11 +414,11 @@ def _check_inside(corners: NDArray[np.int64], window: tuple[int, int], frame_sha
 
 
 def _check_centres(offsets: NDArray[np.float64], window: tuple[int, int]) -> None:
-    """Refuse centres that no spot of their window can belong to."""
+    """Refuse centres that no spot of their window can belong to; aberrations may move spots by a pitch."""
     away = np.abs(offsets).max(axis=1)
-    if away.max() > max(window):
+    if away.max() > 3 * max(window):
         raise InputError(
-            f"layout.centres: expected centres up to {max(window)} px from their windows' middles, "
+            f"layout.centres: expected centres up to {3 * max(window)} px from their windows' middles, "
             f"got one {away.max():g} px away (sub-aperture {np.argmax(away)})"
         )
 

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
+from faintspot.sensor.following import follow
 from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std
 from faintspot.sensor.lit import Lit, find_lit
-from faintspot.sensor.nodes import NodeLight, measure_nodes, spot_width
+from faintspot.sensor.nodes import (
+    Drift,
+    NodeLight,
+    SpotLight,
+    find_spots,
+    measure_nodes,
+    no_drift,
+    spot_width,
+)
 from faintspot.sensor.region import Pupil, Rectangle
 
 _FIT_PASSES = 4
+# A spot of this signal-to-noise ratio that is as bright as lit ones and this far (pitches) from all of them
+# belongs to another lenslet: a smooth aberration brings two spots no closer.
+_CLEAR, _ELSEWHERE = 6.0, 0.5
+# Displacements are followed when that reaches so many of these spots, or half of them: one may be a ghost's.
+_REACHED = 4
+# Its shape is like that of the lit ones: it explains at least this part of what it explains of theirs.
+_LIKE = 0.6
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 _SMALLEST_GIVEN_PITCH_PX = 4
 
@@ -42,6 +59,14 @@ class LensletGrid:
     flux : float array (n,)
         Flux above the local background in the frame's units, within 2.5 spot widths (standard deviations)
         of the spot's peak, at most half a pitch.
+    drifts : float array (n, 2)
+        x, y from the centres to where a smooth aberration moves the spots, px; 0 where none was followed.
+    spots : float array (n, 2)
+        x, y of each lit lenslet's spot in frame pixels.
+    spot_px : float
+        Standard deviation of the spots' shape.
+    elsewhere : float array (m, 2)
+        x, y of the other spots that are as bright as those of lit lenslets.
     doubt : str
         Why the choice of lit lenslets may be wrong, in one line; empty when it is clear.
     """
@@ -52,6 +77,10 @@ class LensletGrid:
     cells: NDArray[np.int64]
     centres: NDArray[np.float64]
     flux: NDArray[np.float64]
+    drifts: NDArray[np.float64]
+    spots: NDArray[np.float64]
+    spot_px: float
+    elsewhere: NDArray[np.float64]
     doubt: str = ""
 
 
@@ -122,7 +151,8 @@ def find_lenslets(
     lattice = find_lattice(image, geometries, pitch_range_px) if np.ptp(image) > 0 else None
     if lattice is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
-    lattice, spots, lit = _fitted(image, lattice, lit_fraction, circle)
+    fit = _fitted(image, lattice, lit_fraction, circle)
+    lattice, spots, lit = fit.lattice, fit.spots, fit.lit
     cells = spots.cells[lit.nodes]
     if len(cells) < 4 or np.any(np.ptp(cells, axis=0) < 1):
         raise InputError(_too_few(len(cells), lattice, circle))
@@ -132,10 +162,19 @@ def find_lenslets(
         pitch_px=lattice.pitch_px,
         angle_deg=lattice.angle_deg,
         cells=cells - cells.min(axis=0),
-        centres=np.column_stack([at.real, at.imag]),
+        centres=_rows(at),
         flux=spots.flux[lit.nodes],
+        drifts=_rows(spots.drifts[lit.nodes]),
+        spots=_rows(spots.positions[lit.nodes] + corner),
+        spot_px=fit.width_px,
+        elsewhere=_rows(fit.elsewhere + corner),
         doubt=lit.doubt,
     )
+
+
+def _rows(at: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return complex positions as rows of x, y."""
+    return np.column_stack([at.real, at.imag])
 
 
 def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float, float]:
@@ -254,10 +293,25 @@ def _median_of_good(image: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArr
     return filled
 
 
+@dataclass(frozen=True)
+class _Fit:
+    """A lattice fitted to the spots, what was measured at its nodes, and which are lit.
+
+    `bright` are all spots as bright as the lit ones, `elsewhere` those of them that belong to no lit node.
+    """
+
+    lattice: Lattice
+    width_px: float
+    spots: NodeLight
+    lit: Lit
+    bright: NDArray[np.complex128]
+    elsewhere: NDArray[np.complex128]
+
+
 def _fitted(
     image: NDArray[np.float64], lattice: Lattice, lit_fraction: float | None, pupil: Pupil | None
-) -> tuple[Lattice, NodeLight, Lit]:
-    """Return the lattice fitted to the spots, what was measured at its nodes, and which nodes are lit."""
+) -> _Fit:
+    """Fit the lattice to the spots; where spots are left over, follow them from neighbour to neighbour."""
     image = image - np.median(image)
     width_px = spot_width(image, lattice)
     for _ in range(_FIT_PASSES):
@@ -270,8 +324,46 @@ def _fitted(
         lattice = lattice.fitted(spots.cells[used], spots.positions[used]).canonical(image.shape)
         if abs(lattice.step - before.step) * max(image.shape) < 0.02 * abs(lattice.step) ** 2:
             break
-    spots = measure_nodes(image, lattice, width_px)
-    lit = find_lit(spots, lattice, lit_fraction)
+    everywhere = find_spots(image, lattice, width_px)
+    fit = _lit_of(image, lattice, width_px, lit_fraction, everywhere)
+    for _ in range(_FIT_PASSES):
+        if len(fit.elsewhere) == 0:
+            break
+        followed = follow(fit.bright, fit.lattice, image.shape)
+        if followed is None:
+            break
+        better = _lit_of(image, followed[0], width_px, lit_fraction, everywhere, followed[1])
+        reached = len(fit.elsewhere) - len(better.elsewhere)
+        if reached < max(1.0, min(_REACHED, 0.5 * len(fit.elsewhere))):
+            break
+        fit = better
     if pupil is not None:
-        lit = Lit(pupil.holds(lattice.positions(spots.cells)), "")
-    return lattice, spots, lit
+        held = pupil.holds(fit.lattice.positions(fit.spots.cells))
+        fit = replace(fit, lit=replace(fit.lit, nodes=held, doubt=""))
+    return fit
+
+
+def _lit_of(
+    image: NDArray[np.float64],
+    lattice: Lattice,
+    width_px: float,
+    lit_fraction: float | None,
+    everywhere: SpotLight,
+    drift: Drift = no_drift,
+) -> _Fit:
+    """Decide which lenslets of a lattice are lit, and which bright spots belong to none of them."""
+    spots = measure_nodes(image, lattice, width_px, drift)
+    lit = find_lit(spots, lattice, lit_fraction)
+    elsewhere = bright = np.empty(0, dtype=np.complex128)
+    if lit.nodes.any():
+        likeness = float(np.median(spots.likeness[lit.nodes]))
+        bright = everywhere.positions[_bright(everywhere, lit, likeness)]
+        distance = cKDTree(_rows(spots.positions[lit.nodes])).query(_rows(bright))[0]
+        elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
+    return _Fit(lattice, width_px, spots, lit, bright, elsewhere)
+
+
+def _bright(spots: SpotLight, lit: Lit, likeness: float) -> NDArray[np.bool_]:
+    """Return which spots are as bright as those of lit lenslets, and about of their shape."""
+    clear = (spots.signal_to_noise > _CLEAR) & (spots.likeness > _LIKE * likeness)
+    return np.asarray(clear & (spots.flux >= lit.least_flux))

@@ -57,10 +57,14 @@ _PASSES = 4
 
 @dataclass(frozen=True)
 class Lit:
-    """Which nodes are lit (n,), and why that may be wrong: one line, empty when it is clear."""
+    """Which nodes are lit (n,), and why that may be wrong: one line, empty when it is clear.
+
+    `least_flux` is the flux that divides lit from dark.
+    """
 
     nodes: NDArray[np.bool_]
     doubt: str
+    least_flux: float
 
 
 def find_lit(spots: NodeLight, lattice: Lattice, lit_fraction: float | None) -> Lit:
@@ -77,7 +81,7 @@ def find_lit(spots: NodeLight, lattice: Lattice, lit_fraction: float | None) -> 
     detected = _detection(spots)
     certain = detected > 1
     if not certain.any():
-        return Lit(certain, "")
+        return Lit(certain, "", np.inf)
     choose = _Chooser(spots, detected, lattice)
     # Dim spots outside the pupil may be as many as those in it: the start is among the bright ones.
     bright = float(np.quantile(spots.flux[certain], 0.8))
@@ -91,7 +95,7 @@ def find_lit(spots: NodeLight, lattice: Lattice, lit_fraction: float | None) -> 
         lit = choose.lit(reference, max(min(lit_fraction, fraction), 1e-6), scatter)
         lit &= spots.flux >= lit_fraction * reference
         fraction = lit_fraction
-    return Lit(lit, _doubt(spots, lit, detected, fraction * reference))
+    return Lit(lit, _doubt(spots, lit, detected, fraction * reference), fraction * reference)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ spot, and noise in one part of the frame hides none in another.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,9 @@ from faintspot.sensor.lattice import Lattice, robust_std
 SEARCH = 0.35
 # A node this near to the frame's edge (part of the pitch) has its spot cut in two.
 _MARGIN = 0.12
+# Spots that are looked for anywhere are at least this far apart, along x or y; those of a node that lies
+# outside the frame are followed as far as `REACH`. Both in pitches.
+_APART, REACH = 0.3, 1.5
 # A spot and its plane are fitted to the pixels within this part of the pitch: a little beyond half-way to the
 # neighbour, so that a plane is told from the top of a broad spot.
 _CELL = 0.55
@@ -33,35 +37,60 @@ _WIDTHS, _STARTS = 9, (1, 4, 7)
 _MOST_FOR_WIDTH = 500  # spots; the width of so many is known far better than is needed
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 
+Drift = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
+
+
+def no_drift(nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return displacements of zero: spots are expected at their nodes."""
+    return np.zeros_like(nodes)
+
 
 @dataclass(frozen=True)
-class NodeLight:
-    """What was measured at the nodes of a lattice, each array (n,).
+class SpotLight:
+    """Positions, fluxes and significance of spots, each array (n,).
 
     Parameters
     ----------
-    cells : int array (n, 2)
     positions : complex array
-        Of the brightest peak near the node, x + 1j * y.
+        Tops of the peaks, x + 1j * y, px.
     flux, flux_noise : arrays
-        Light above the local plane within 2.5 standard deviations of the spot's shape (at most half a
+        Flux above the local plane within 2.5 standard deviations of the spot's shape (at most half a
         pitch), and its noise.
     signal_to_noise : array
         Of the fitted spot, by the noise of the cell itself.
-    shifts : complex array
-        From the node to the peak, in pitches.
+    likeness : array
+        Part of the squared flux there that the spot's shape explains: little for cosmic rays and hot pixels.
     """
 
-    cells: NDArray[np.int64]
     positions: NDArray[np.complex128]
     flux: NDArray[np.float64]
     flux_noise: NDArray[np.float64]
     signal_to_noise: NDArray[np.float64]
+    likeness: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NodeLight(SpotLight):
+    """The brightest spot near each node of a lattice, each array (n,).
+
+    Parameters
+    ----------
+    cells : int array (n, 2)
+    drifts : complex array
+        From the node to the place where its spot is expected, px.
+    shifts : complex array
+        From that place to the peak, in pitches.
+    """
+
+    cells: NDArray[np.int64]
+    drifts: NDArray[np.complex128]
     shifts: NDArray[np.complex128]
 
 
-def measure_nodes(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> NodeLight:
-    """Return what is at every node that lies inside the frame.
+def measure_nodes(
+    image: NDArray[np.float64], lattice: Lattice, width_px: float, drift: Drift = no_drift
+) -> NodeLight:
+    """Measure the spot of every node whose spot is expected inside the frame.
 
     Parameters
     ----------
@@ -69,10 +98,45 @@ def measure_nodes(image: NDArray[np.float64], lattice: Lattice, width_px: float)
     lattice : Lattice
     width_px : float
         Standard deviation of the spots' shape.
+    drift : function
+        Gives the expected displacements (px) of the spots of nodes at given positions, x + 1j * y.
     """
     band = _band(image, _haze(image, lattice), width_px)
-    cells = lattice.cells_inside(image.shape, _MARGIN * lattice.pitch_px)
-    peaks, _ = _peaks(band, lattice, cells)
+    margin_px = _MARGIN * lattice.pitch_px
+    cells = lattice.cells_inside(image.shape, margin_px if drift is no_drift else -REACH * lattice.pitch_px)
+    drifts = drift(lattice.positions(cells))
+    at = lattice.positions(cells) + drifts
+    inside = inside_frame(at, image.shape, margin_px - 0.5)
+    cells, drifts, at = cells[inside], drifts[inside], at[inside]
+    peaks, _ = _peaks(band, lattice, at)
+    spots = _measured(image, band, lattice, width_px, peaks)
+    return NodeLight(**vars(spots), cells=cells, drifts=drifts, shifts=(peaks - at) / lattice.pitch_px)
+
+
+def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> SpotLight:
+    """Measure all peaks of a frame that are clearly spots, wherever they lie."""
+    band = _band(image, _haze(image, lattice), width_px)
+    side = 2 * max(1, int(_APART * lattice.pitch_px)) + 1
+    high = (band == scipy.ndimage.maximum_filter(band, side)) & (band > _CERTAIN * _noise(band, lattice))
+    y, x = np.nonzero(high)
+    return _measured(image, band, lattice, width_px, x + 1j * y)
+
+
+def inside_frame(at: NDArray[np.complex128], shape: tuple[int, ...], margin_px: float) -> NDArray[np.bool_]:
+    """Return which positions lie at least so many pixels within the centres of a frame's outer pixels."""
+    x, y = at.real, at.imag
+    inside = (np.minimum(x, y) >= margin_px) & (x <= shape[1] - 1 - margin_px)
+    return np.asarray(inside & (y <= shape[0] - 1 - margin_px))
+
+
+def _measured(
+    image: NDArray[np.float64],
+    band: NDArray[np.float64],
+    lattice: Lattice,
+    width_px: float,
+    peaks: NDArray[np.complex128],
+) -> SpotLight:
+    """Fit a spot on a plane to the pixels around each peak."""
     offsets = _cell_offsets(lattice)
     values = _around(image, peaks, offsets)
     inside = ~np.isnan(values)
@@ -87,14 +151,15 @@ def measure_nodes(image: NDArray[np.float64], lattice: Lattice, width_px: float)
     variance += _coloured(image, band, lattice, width_px)
     variance = np.maximum(variance, (1e-9 * float(np.ptp(image))) ** 2)
     near = np.abs(offsets) <= max(1.5, min(2.5 * width_px, 0.5 * lattice.pitch_px))
-    flux = (residual + numbers[:, 3:] * spot)[:, near].sum(axis=1)
-    return NodeLight(
-        cells,
+    fitted = (numbers[:, 3:] * spot)[:, near]
+    flux = (residual[:, near] + fitted).sum(axis=1)
+    explained = (fitted**2).sum(axis=1)
+    return SpotLight(
         peaks + _subpixel(band, peaks),
         flux,
         np.sqrt(variance * np.count_nonzero(near)),
         numbers[:, 3] / np.sqrt(variance * inverse[:, 3, 3]),
-        (peaks - lattice.positions(cells)) / lattice.pitch_px,
+        explained / np.maximum(explained + (residual[:, near] ** 2).sum(axis=1), 1e-300),
     )
 
 
@@ -111,7 +176,7 @@ def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
     best = (-np.inf, float(widths[0]))
     for start in _STARTS:
         band = _band(image, haze, float(widths[start]))
-        peaks, heights = _peaks(band, lattice, cells)
+        peaks, heights = _peaks(band, lattice, lattice.positions(cells))
         certain = np.flatnonzero(heights >= _CERTAIN * _noise(band, lattice))
         if len(certain) < 4:
             continue
@@ -167,16 +232,15 @@ def _around(
 
 
 def _peaks(
-    band: NDArray[np.float64], lattice: Lattice, cells: NDArray[np.int64]
+    band: NDArray[np.float64], lattice: Lattice, at: NDArray[np.complex128]
 ) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return the position and height of the highest pixel near every node."""
-    at = lattice.positions(cells)
+    """Return the position and height of the highest pixel near every place."""
     offsets = _disc(max(SEARCH * lattice.pitch_px, 1.5))
     values = _around(band, at, offsets)
     values = np.where(np.isnan(values), -np.inf, values)
     highest = values.argmax(axis=1)
     middle = np.rint(at.real) + 1j * np.rint(at.imag)
-    return middle + offsets[highest], values[np.arange(len(cells)), highest]
+    return middle + offsets[highest], values[np.arange(len(at)), highest]
 
 
 def _model(offsets: NDArray[np.complex128], lattice: Lattice, width_px: float) -> NDArray[np.float64]:

@@ -70,7 +70,7 @@ def find_windows(
     window = None if pixels is None else window_size("pixels", pixels)
     grid = find_lenslets(array, **options)
     shape = (int(array.shape[-2]), int(array.shape[-1]))
-    middles = grid.centres[:, ::-1]
+    middles = (grid.centres + grid.drifts)[:, ::-1]
     if window is None:
         window = _largest_window(middles, grid.pitch_px)
     middles = _spread(middles, window)

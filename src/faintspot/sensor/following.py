@@ -1,0 +1,143 @@
+"""Follow spots that an aberration moves far from their nodes, from neighbour to neighbour.
+
+An aberration is smooth: the displacement of a spot is about what its neighbours' displacements extrapolate
+to. So nodes and spots are matched outwards from the largest part of the lattice in which neighbours agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from faintspot.sensor.lattice import Lattice
+from faintspot.sensor.nodes import REACH
+
+# Parts of a pitch: how far a spot lies from its node where the matching starts, how much neighbours'
+# displacements may differ there, and how far a spot may lie from where its neighbours say that it is.
+_START, _AGREE, _NEAR = 0.3, 0.2, 0.3
+# A displacement and its gradient are fitted to so many neighbours, with Gaussian weights of this standard
+# deviation (pitches); the ridge (square pitches) makes the gradient of neighbours in a line solvable.
+_FITTED, _REACH, _RIDGE = 12, 1.5, 0.1
+_ROUNDS = 200  # more than any frame has rings of lenslets
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedDrift:
+    """Displacements of spots, continued to any place by a plane through the nearest ones.
+
+    Parameters
+    ----------
+    nodes, shifts : complex arrays (n,)
+        Places and displacements, x + 1j * y, px.
+    pitch_px : float
+    """
+
+    nodes: NDArray[np.complex128]
+    shifts: NDArray[np.complex128]
+    pitch_px: float
+
+    def __call__(self, nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return the displacements of spots whose nodes lie at x + 1j * y."""
+        distance, near = _tree(self.nodes).query(_xy(nodes), min(_FITTED, len(self.nodes)))
+        distance, near = distance.reshape(len(nodes), -1) / self.pitch_px, near.reshape(len(nodes), -1)
+        weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / _REACH**2)
+        weight /= weight.sum(axis=1, keepdims=True)
+        middle = (weight * self.nodes[near]).sum(axis=1)
+        away = (self.nodes[near] - middle[:, None]) / self.pitch_px
+        shifts = self.shifts[near]
+        x, y = away.real, away.imag
+        xx, yy = ((weight * axis**2).sum(axis=1) + _RIDGE for axis in (x, y))
+        xy = (weight * x * y).sum(axis=1)
+        along, across = ((weight * axis * shifts).sum(axis=1) for axis in (x, y))
+        gradient_x = (yy * along - xy * across) / (xx * yy - xy**2)
+        gradient_y = (xx * across - xy * along) / (xx * yy - xy**2)
+        to = (nodes - middle) / self.pitch_px
+        # No farther than the fit reaches: a plane goes on for ever.
+        to *= np.minimum(1.0, 2.5 / np.maximum(np.abs(to), 1e-12))
+        return np.asarray((weight * shifts).sum(axis=1) + gradient_x * to.real + gradient_y * to.imag)
+
+
+def follow(
+    spots: NDArray[np.complex128], lattice: Lattice, shape: tuple[int, ...]
+) -> tuple[Lattice, FollowedDrift] | None:
+    """Match spots (n,) x + 1j * y to nodes, and fit the lattice to them.
+
+    Returns
+    -------
+    (Lattice, FollowedDrift) or None
+        None when fewer than four spots agree with a neighbour.
+    """
+    for _ in range(3):
+        cells = lattice.cells_inside(shape, -REACH * lattice.pitch_px)
+        of_node = _matched(spots, lattice, cells)
+        used = of_node >= 0
+        if np.count_nonzero(used) < 4:
+            return None
+        found = spots[of_node[used]]
+        before, lattice = lattice, lattice.fitted(cells[used], found)
+        nodes = lattice.positions(cells[used])
+        if np.abs(nodes - before.positions(cells[used])).max() < 0.02 * lattice.pitch_px:
+            break
+        lattice = lattice.canonical(shape)
+    return lattice.canonical(shape), FollowedDrift(nodes, found - nodes, lattice.pitch_px)
+
+
+def _matched(spots: NDArray[np.complex128], lattice: Lattice, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of the spot of every node, -1 where there is none."""
+    nodes = lattice.positions(cells)
+    neighbours = lattice.neighbours(cells)
+    tree = _tree(spots)
+    distance, nearest = tree.query(_xy(nodes))
+    matched = np.where(distance < _START * lattice.pitch_px, nearest, -1)
+    matched = _agreeing(spots[matched] - nodes, matched, neighbours, _AGREE * lattice.pitch_px)
+    for _ in range(_ROUNDS):
+        used = matched >= 0
+        if not used.any():
+            break
+        drift = FollowedDrift(nodes[used], spots[matched[used]] - nodes[used], lattice.pitch_px)
+        reached = used | np.append(used, False)[neighbours].any(axis=1)
+        distance, nearest = tree.query(_xy(nodes + drift(nodes)))
+        near = reached & (distance < _NEAR * lattice.pitch_px)
+        before, matched = matched, _each_once(np.where(near, nearest, -1), distance)
+        if np.array_equal(before, matched):
+            break
+    return matched
+
+
+def _agreeing(
+    shifts: NDArray[np.complex128],
+    matched: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    tolerance_px: float,
+) -> NDArray[np.int64]:
+    """Keep the matches of the largest part of the lattice in which neighbours are displaced alike."""
+    count = len(matched)
+    first = np.repeat(np.arange(count), neighbours.shape[1])
+    second = neighbours.ravel()
+    first, second = first[second < count], second[second < count]
+    alike = (matched[first] >= 0) & (matched[second] >= 0)
+    alike &= np.abs(shifts[first] - shifts[second]) < tolerance_px
+    links = coo_matrix((np.ones(alike.sum()), (first[alike], second[alike])), shape=(count, count))
+    _, part = connected_components(links, directed=False)
+    return np.where(part == np.bincount(part[matched >= 0], minlength=1).argmax(), matched, -1)
+
+
+def _each_once(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Leave a spot that several nodes have to the one that expects it nearest."""
+    order = np.lexsort((distance, matched))
+    again = np.zeros(len(matched), dtype=bool)
+    again[order[1:]] = matched[order[1:]] == matched[order[:-1]]
+    return np.where(again, -1, matched)
+
+
+def _tree(at: NDArray[np.complex128]) -> cKDTree:
+    return cKDTree(_xy(at))
+
+
+def _xy(at: NDArray[np.complex128]) -> NDArray[np.float64]:
+    return np.column_stack([at.real, at.imag])
