@@ -3,7 +3,7 @@
 # make fuzz   hostile values at every door for MINUTES=60; a finding names its seed
 # make docs   the documentation as pages, build/docs/index.html; QUICK=1 leaves out what tutorials compute
 # make release  wheel and sdist, tried in new environments with every extra (long; TRY="--extras none,io")
-# make bench  speed against other packages, as ratios in one run, as a page (about 15 minutes)
+# make bench  speed against other packages, as ratios in one run (about 15 minutes)
 # make bench-compare  what changed since the run before, beyond noise (or: OLD=file NEW=file)
 # make clean  remove what these made
 

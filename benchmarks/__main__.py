@@ -1,6 +1,6 @@
-"""Benchmarks: `python -m benchmarks [NAME ...]`, `... compare [OLD NEW]`, `... page FILE`, in the root.
+"""Benchmarks: `python -m benchmarks [NAME ...]`, `... compare [OLD NEW]`, in the root.
 
-A run prints its tables and writes them, with the machine and the versions, as JSON and as a page.
+A run prints its tables and writes them, with the machine and the versions, as JSON.
 """
 
 from __future__ import annotations
@@ -40,11 +40,10 @@ _ORDER = (
     "study",
     "startup",
     "gpu",
-    "schedules",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained", "closed_loop_long", "schedules"}
-"""Run only when named, or with --full: 12, 40 and 30 minutes."""
+LONG = {"realtime_sustained", "closed_loop_long"}
+"""Run only when named, or with --full: 12 and 40 minutes."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",
@@ -62,8 +61,7 @@ _FOLDER = click.option(
 def run(names: tuple[str, ...], full: bool, folder: Path) -> None:
     """Run the benchmarks NAMES, by default all but the long ones.
 
-    `python -m benchmarks compare` says what changed since the run before, `... page FILE` makes the page of
-    stored results again.
+    `python -m benchmarks compare` says what changed since the run before.
     """
     chosen = [name for name in names or NAMES if names or full or name not in LONG]
     found = results.Results(
@@ -79,7 +77,7 @@ def run(names: tuple[str, ...], full: bool, folder: Path) -> None:
             _show(found.benchmarks[-1])
     finally:  # an interrupted run keeps what is finished
         if found.benchmarks:
-            _write_page(found, folder / f"{found.stem}.json")
+            click.echo(f"\n{folder / f'{found.stem}.json'}")
     if any(benchmark.failure for benchmark in found.benchmarks):
         sys.exit(1)
 
@@ -87,16 +85,15 @@ def run(names: tuple[str, ...], full: bool, folder: Path) -> None:
 def measured(name: str) -> results.Benchmark:
     """Run one benchmark; when it fails, say why, so that the others can go on."""
     load, start = machine.load_average(), time.monotonic()
-    about, failure = "", ""
+    failure = ""
     tables: list[Table] = []
     try:
         module = importlib.import_module(f"benchmarks.{name}")
-        about = module.__doc__ or ""
         tables = module.run()
     except Exception as error:
         traceback.print_exc()
         failure = f"{type(error).__name__}: {error}".splitlines()[0]
-    return results.Benchmark(name, about, time.monotonic() - start, load, tables, failure)
+    return results.Benchmark(name, time.monotonic() - start, load, tables, failure)
 
 
 def _show(benchmark: results.Benchmark) -> None:
@@ -105,14 +102,6 @@ def _show(benchmark: results.Benchmark) -> None:
     if benchmark.failure:
         click.echo(f"  FAILED: {benchmark.failure}")
     click.echo(f"  {benchmark.seconds:.0f} s; load average when it began: {benchmark.load}")
-
-
-def _write_page(found: results.Results, stored: Path) -> None:
-    from benchmarks.page import write_page
-
-    path = stored.with_suffix(".html")
-    write_page(found, path)
-    click.echo(f"\n{path}\n{stored}")
 
 
 @click.command("compare")
@@ -136,21 +125,9 @@ def compare_runs(files: tuple[Path, ...], anyway: bool, folder: Path) -> None:
     sys.exit(any(change.verdict == compare.WORSE for change in found))
 
 
-@click.command("page")
-@click.argument("file", type=_FILE)
-def make_page(file: Path) -> None:
-    """Make the page of stored results again."""
-    try:
-        found = results.read(file)
-    except results.ResultsError as error:
-        click.echo(str(error), err=True)
-        sys.exit(2)
-    _write_page(found, file)
-
-
 def main() -> None:
     """Run the command that the first argument names; without one, benchmarks."""
-    commands = {"compare": compare_runs, "page": make_page}
+    commands = {"compare": compare_runs}
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name in commands:
         commands[name](sys.argv[2:], prog_name=f"python -m benchmarks {name}")

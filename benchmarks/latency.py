@@ -53,12 +53,6 @@ def quantile_columns(latencies_us: Floats) -> dict[str, float]:
     return {**columns, "max": float(latencies_us.max()), "p99.9/p50": columns["p99.9"] / columns["p50"]}
 
 
-def tail_curve(latencies_us: Floats) -> list[tuple[float, float]]:
-    """Return (latency, fraction of frames beyond it), as far as the number of frames tells."""
-    levels = _LEVELS[_LEVELS * len(latencies_us) >= 1]
-    return [(float(np.quantile(latencies_us, 1 - level)), float(level)) for level in levels]
-
-
 def spread_of_tail(latencies_us: Floats) -> float:
     """Return the relative standard error of p99.9 / p50."""
     return spread({"us": latencies_us}, lambda part: quantile_columns(part["us"])["p99.9/p50"])
@@ -78,7 +72,7 @@ def _measure(path: FramePath, frames: int) -> tuple[Floats, NDArray[np.bool_]]:
     return times / 1e3, np.diff(switches) > 0
 
 
-def _run(n: int, threads: int) -> tuple[Row, dict[str, list[tuple[float, float]]]]:
+def _run(n: int, threads: int) -> Row:
     """Measure the frames of one sensor on so many pinned threads."""
     case, frames = problem(n, **settings()), FRAMES[n]
     slots = np.repeat(case.frame[None], SLOTS, axis=0)
@@ -101,14 +95,13 @@ def _run(n: int, threads: int) -> tuple[Row, dict[str, list[tuple[float, float]]
             workers.close()
     name = f"{n} of 16 x 16, {threads} thread{'s' if threads > 1 else ''}"
     columns = {"frames": float(frames), "switched out": float(switched_out), **quantile_columns(latencies)}
-    known, curves = {"p99.9/p50": spread_of_tail(latencies)}, {name: tail_curve(latencies)}
+    known = {"p99.9/p50": spread_of_tail(latencies)}
     calm = latencies[~disturbed]
     if threads == 1 and len(calm) >= FEWEST:
         quantiles = quantile_columns(calm)
         columns |= {f"{UNDISTURBED} {column}": quantiles[column] for column in ("p99.9", "p99.9/p50")}
         known[f"{UNDISTURBED} p99.9/p50"] = spread_of_tail(calm)
-        curves[f"{name}, {UNDISTURBED}"] = tail_curve(calm)
-    return Row(name, columns, spread=known, better="lower"), curves
+    return Row(name, columns, spread=known, better="lower")
 
 
 def run() -> list[Table]:
@@ -117,10 +110,5 @@ def run() -> list[Table]:
     if not hasattr(os, "sched_setaffinity"):
         return [Table("latency", title, [], ["Linux only: threads cannot be pinned here"])]
     cases = [(36, 1), (1208, 1)] + ([(1208, 2)] if available_cpus() > 1 else [])
-    rows: list[Row] = []
-    curves: dict[str, list[tuple[float, float]]] = {}
-    for n, threads in cases:
-        row, drawn = _run(n, threads)
-        rows.append(row)
-        curves |= drawn
-    return [Table("latency", title, rows, [f"{settings_in_words()}; {available_cpus()} processors"], curves)]
+    rows = [_run(*case) for case in cases]
+    return [Table("latency", title, rows, [f"{settings_in_words()}; {available_cpus()} processors"])]

@@ -19,8 +19,6 @@ PACKAGES = (
     "jax",
     "torch",
     "scikit-image",
-    "opencv-python-headless",
-    "prox_tv",
     "pyrtcao",
     "hcipy",
 )

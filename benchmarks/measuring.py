@@ -63,8 +63,6 @@ class Table:
     title: str
     rows: list[Row]
     notes: list[str] = field(default_factory=list)
-    curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    """What is drawn but not tabulated: points (x, y) by name."""
 
 
 @contextmanager

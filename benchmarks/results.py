@@ -12,7 +12,7 @@ from benchmarks.machine import short
 from benchmarks.measuring import Row, Table
 
 FOLDER = Path(__file__).with_name("results")
-FORMAT = 1
+FORMAT = 2
 
 
 class ResultsError(Exception):
@@ -25,8 +25,6 @@ class Benchmark:
 
     Attributes
     ----------
-    about : str
-        How it was measured: the module's own words.
     load : str
         Load average when it began.
     failure : str
@@ -34,7 +32,6 @@ class Benchmark:
     """
 
     name: str
-    about: str
     seconds: float
     load: str
     tables: list[Table] = field(default_factory=list)
@@ -102,8 +99,7 @@ def _table(item: dict[str, Any]) -> Table:
         Row(**{**row, "values": _numbers(row["values"]), "spread": _numbers(row["spread"])})
         for row in item.pop("rows")
     ]
-    curves = {name: [(x, y) for x, y in points] for name, points in item.pop("curves").items()}
-    return Table(**item, rows=rows, curves=curves)
+    return Table(**item, rows=rows)
 
 
 def _numbers(values: dict[str, float | None]) -> dict[str, float]:

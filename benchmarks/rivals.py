@@ -10,7 +10,6 @@ handed the stack of images, ready made.
   solution than 20 of faintspot's; its positions are therefore compared where both have converged.
 - NumPy, JAX and PyTorch: faintspot's algorithm, see rival_numpy.py, rival_jax.py and rival_torch.py. All
   images at once, and in blocks that fit the cache; the faster one counts.
-- OpenCV and prox_tv: other functionals, in a table of their own, see rival_others.py.
 - C++: only the sweep, see sweep.cpp.
 
 Optional packages that are not installed are named below the table.
@@ -22,14 +21,13 @@ import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from benchmarks import rival_others, sweeps
+from benchmarks import sweeps
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio
 from benchmarks.rival_numpy import NumpyRival, locate
 from faintspot.estimators import estimator_named
@@ -42,8 +40,6 @@ MODULES = {
     "skimage": "scikit-image",
     "jax": "jax",
     "torch": "torch",
-    "cv2": "opencv-python-headless",
-    "prox_tv": "prox_tv",
 }
 """Optional rivals: what to import, and what to install."""
 SKIMAGE_IMAGES = 36  # takes one image after the other: so many tell the time of one
@@ -240,43 +236,6 @@ def _against_skimage(n: int) -> Row:
     return _row(f"{n}: scikit-image", n, times, "rival", differs, TARGETS["scikit-image"])
 
 
-def _other_rivals(case: Problem) -> tuple[dict[str, Candidate], list[str]]:
-    """Return what solves another problem, ready to run, and what is not there."""
-    solved = fs.tv_denoise(case.images, NOISE_STD, tolerance=0.0, max_iterations=ITERATIONS, full_output=True)
-    makers: dict[str, tuple[str, Callable[[], Candidate]]] = {
-        f"OpenCV TV-L1, {count} iterations": ("cv2", partial(rival_others.opencv_rival, case.images, count))
-        for count in rival_others.OPENCV_ITERATIONS
-    }
-    prox_tv = partial(rival_others.prox_tv_rival, case.images, solved.multiplier)
-    makers["prox_tv, anisotropic"] = "prox_tv", prox_tv
-    rivals, notes = {}, _missing("cv2", "prox_tv")
-    for name, (module, make) in makers.items():
-        if available(module):
-            try:
-                rivals[name] = make()
-            except ImportError as error:  # compiled where it was installed, so that libraries may be missing
-                notes.append(f"left out, {MODULES[module]}: {error}")
-    return rivals, notes
-
-
-def _others() -> Table:
-    """Compare with what solves another problem."""
-    n = 36
-    case = problem(n)
-    title = (
-        "Other TV denoisers, other problems, one thread: theirs denoising alone, faintspot frame to slopes"
-    )
-    rivals, notes = _other_rivals(case)
-    if not rivals:
-        return Table("rivals_others", title, [], notes)
-    times = interleaved({"faintspot": case.slopes, **rivals}, seconds=5.0)
-    ours, rows = case.slopes(), []
-    for name, rival in rivals.items():
-        theirs = locate(rival().astype(np.float32), KEEP)
-        rows.append(_row(f"{n}: {name}", n, times, name, float(np.sqrt(np.mean((theirs - ours) ** 2)))))
-    return Table("rivals_others", title, rows, [*notes, *rival_others.NOTES])
-
-
 def _missing(*modules: str) -> list[str]:
     return [f"not installed: pip install {MODULES[name]}" for name in modules if not available(name)]
 
@@ -337,4 +296,4 @@ def run() -> list[Table]:
             notes.append(f"JAX used {used:.2f} threads")
         notes += _missing("skimage", "jax", "torch")
         title = "Frame to slopes, one thread: faintspot against others"
-        return [Table("rivals", title, rows, notes), _others(), _against_cpp()]
+        return [Table("rivals", title, rows, notes), _against_cpp()]

@@ -39,9 +39,8 @@ def scale_table() -> Table:
 
 
 def latency_table() -> Table:
-    curve = [(100.0, 1.0), (110.0, 0.5), (300.0, 0.01), (4000.0, 0.001)]
     row = Row("36, 1 thread", {"p50": 110.0, "p99.9/p50": 36.4}, spread={"p99.9/p50": 0.2}, better="lower")
-    return Table("latency", "Latency", [row], [], {row.name: curve, f"{row.name}, undisturbed": curve[:2]})
+    return Table("latency", "Latency", [row])
 
 
 def roofline_table() -> Table:
@@ -52,7 +51,6 @@ def roofline_table() -> Table:
 def results(
     tables: Sequence[Table] = (), *, started: str = "2026-01-02T03:04:05", machine: dict[str, str] = MACHINE
 ) -> Results:
-    about = "What it is.\n\nHow it\nis measured:\n- one\n  way\n- another\n\nWhat it leaves out."
     chosen = tables or [rivals_table(), scale_table(), latency_table(), roofline_table()]
-    found = [Benchmark(table.name, about, 1.5, "0.1, 0.2, 0.3", [table]) for table in chosen]
+    found = [Benchmark(table.name, 1.5, "0.1, 0.2, 0.3", [table]) for table in chosen]
     return Results(started, machine, {"numpy": "2.0"}, found)

@@ -96,7 +96,6 @@ def test_a_benchmark_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
     (path,) = results.newest_first(tmp_path)
     found = results.read(path)
     assert [each.failure for each in found.benchmarks] == ["AssertionError: differs", ""]
-    assert path.with_suffix(".html").exists()
 
 
 @pytest.mark.usefixtures("made_up")
@@ -105,7 +104,6 @@ def test_an_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
     assert answer.exit_code == 1
     (path,) = results.newest_first(tmp_path)
     assert [each.name for each in results.read(path).benchmarks] == ["rivals"]
-    assert "rivals" in path.with_suffix(".html").read_text()
 
 
 def test_long_ones_are_known_names() -> None:

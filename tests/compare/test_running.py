@@ -128,12 +128,6 @@ def test_processes_give_the_same() -> None:
             run_units(function, UNITS[:1], MemoryStore(), Workplace(1))
 
 
-def test_arguments_may_be_made_when_it_is_their_turn() -> None:
-    units = [Unit(unit.key, lambda number=number: (number,)) for number, unit in enumerate(UNITS)]  # type: ignore[misc]
-    for workers in (0, 1):
-        assert values(run_units(double, units, MemoryStore(), Workplace(workers))) == [0, 2, 4, 6]
-
-
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads /proc")
 def test_nobody_can_reach_the_processes() -> None:
     result = run_units(sockets_of, UNITS[:1], MemoryStore(), Workplace(1))
@@ -141,7 +135,7 @@ def test_nobody_can_reach_the_processes() -> None:
 
 
 def test_a_process_dies(tmp_path: Path) -> None:
-    units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]  # type: ignore[misc]
+    units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]
     assert values(run_units(die_once, units, MemoryStore(), Workplace(1))) == [0, 2, 4, 6]
     with pytest.raises(InputError, match="died repeatedly") as raised:
         run_units(die, UNITS[:1], MemoryStore(), Workplace(1))

@@ -89,20 +89,3 @@ def test_nothing_spills(
     assert "__local_depot" not in text
     assert ".f64 \t" not in text  # no double precision, which small GPUs do 64 times slower
     assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in linked(text)
-
-
-def test_studies_spill_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Positions for every k, after the denoising; drawing. Double precision there is on purpose."""
-    pytest.importorskip("numba_cuda", reason="needs the extra gpu")
-    from faintspot.cuda import drawing, every_k
-
-    tables = [("float32", 3), ("uint8", 2)]
-    options = ["float32", "float32", "int32", ("float32", 1), ("float32", 2)]
-    positions = [("float32", 3), *options, "float64", "float64", *tables]
-    text = assembly(lambda: every_k.positions_kernel(16, every_k.DENOISE, 0), positions, monkeypatch)
-    assert "__local_depot" not in text
-    assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in linked(text)
-    spots = [("uint64", 1), "int64", "float64", ("float32", 2), ("float32", 1), "float64", "float64"]
-    images = [("float32", 2), ("float64", 2)]
-    drawn = linked(assembly(lambda: drawing.drawing_kernel(16), [*spots, *images], monkeypatch))
-    assert "0 bytes spill stores, 0 bytes spill loads" in drawn

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.study.study_runs import N_CELLS, SPECIFICATION, assert_identical, assert_same
 
 from faintspot import InputError, study
-from faintspot.study import running
-from faintspot.study.cell import score_cell
 
 pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
@@ -79,49 +76,3 @@ def test_bad_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
         study.run(SPECIFICATION, workers=-1)
     with pytest.raises(InputError, match="expected a StudySpecification"):
         study.run("mine.toml", workers=0)  # type: ignore[arg-type]
-
-
-ON_GPU = replace(SPECIFICATION, device="cuda")
-
-
-def test_no_gpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    pytest.importorskip("numba_cuda", reason="needs the extra gpu")
-    from numba import cuda
-
-    monkeypatch.setattr(cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match="no NVIDIA GPU") as raised:
-        study.run(ON_GPU, tmp_path / "s.zarr")
-    assert "\n" not in str(raised.value)
-    assert not (tmp_path / "s.zarr").exists()
-
-
-@pytest.mark.parametrize(
-    ("specification", "scheduler", "message"),
-    [
-        (ON_GPU, "tcp://host:8786", "works on this machine's GPU, not on a cluster"),
-        (replace(ON_GPU, sweeps=[study.Sweep("a", pixels=40)]), None, "window of 40 x 40 pixels"),
-    ],
-)
-def test_what_a_gpu_cannot_do(
-    specification: study.StudySpecification, scheduler: str | None, message: str
-) -> None:
-    with pytest.raises(InputError, match=message):
-        study.run(specification, scheduler=scheduler)
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_statistics_of_a_gpu_are_worked_out_beside_it(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In other processes or here: the numbers are the same. The CPU stands in for the GPU."""
-
-    def score_on_cpu(cell: study.Cell, specification: study.StudySpecification) -> Any:
-        return score_cell(cell, replace(specification, device="cpu"))
-
-    monkeypatch.setattr(running, "score_cell", score_on_cpu)
-    monkeypatch.setattr(running, "_check_device", lambda specification, scheduler: None)
-    few = replace(ON_GPU, sweeps=[study.Sweep("a", flux_e=[30, 100, 300], pixels=8)], realisations=40)
-    announced: list[str] = []
-    found = study.run(few, workers=workers, announce=announced.append)
-    expected = study.run(replace(few, device="cpu"), workers=0)
-    for name in study.store.VARIABLES:
-        np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
-    assert len(announced) == (workers > 0)

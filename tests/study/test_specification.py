@@ -189,14 +189,3 @@ def test_bad_objects() -> None:
     StudySpecification("x", [Sweep("a", pixels=[4, 16])])
     with pytest.raises(InputError, match="fixed_k = 20"):
         StudySpecification("x", [Sweep("a", pixels=4)])
-
-
-def test_device() -> None:
-    on_gpu = StudySpecification.from_text('device = "cuda"\n' + TEXT)
-    on_cpu = StudySpecification.from_text(TEXT)
-    assert (on_gpu.device, on_cpu.device) == ("cuda", "cpu")
-    assert StudySpecification.from_text(on_gpu.to_text()) == on_gpu
-    assert on_gpu.fingerprint != on_cpu.fingerprint
-    assert "device" not in on_cpu.to_text()  # as before there was a choice
-    with pytest.raises(InputError, match="device = 'tpu': expected one of 'cpu', 'cuda'"):
-        replace(on_cpu, device="tpu")

@@ -8,7 +8,7 @@ from faintspot.compare.statistics import slope_statistics
 from faintspot.study import StudySpecification, Sweep
 from faintspot.study.arms import CellArms
 from faintspot.study.cell import realisations
-from faintspot.study.tables import HostTables, position_table
+from faintspot.study.tables import position_table
 from faintspot.study.tuning import Tuning
 
 SPECIFICATION = StudySpecification(
@@ -27,7 +27,7 @@ ARMS = CellArms(CELL, SPECIFICATION, 30.0)
 
 
 def tuning() -> Tuning:
-    return Tuning(ARMS, SPECIFICATION, HostTables(1.0))
+    return Tuning(ARMS, SPECIFICATION)
 
 
 def test_choices_are_those_of_the_smallest_error() -> None:
@@ -70,6 +70,6 @@ def test_images_may_come_in_parts() -> None:
 def test_nothing_to_choose_needs_no_images() -> None:
     specification = StudySpecification("s", [Sweep("a")], arms=["ml", "trained"], fixed_k=[])
     arms = CellArms(specification.cells()[0], specification)
-    choices = Tuning(arms, specification, HostTables()).choices()
+    choices = Tuning(arms, specification).choices()
     assert choices["ml", "best"].candidate == (("blur_px", 0.0), ("model_error", 0.0))
     assert choices["trained", "best"].candidate == ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -28,11 +27,6 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.IntRange(0),
             metavar="N",
             help="Processes on this machine. Default: all processors. 0: this process alone.",
-        ),
-        click.option(
-            "--device",
-            metavar="NAME",
-            help="cpu or cuda: an NVIDIA GPU. Default: what the specification says, else cpu.",
         ),
         click.option(
             "--scheduler",
@@ -71,7 +65,6 @@ def command() -> None:
 def run(
     specification: str,
     output: str | None,
-    device: str | None,
     scheduler: str | None,
     workers: int | None,
     overwrite: bool,
@@ -88,13 +81,12 @@ def run(
     Examples:
       faintspot study run my-study.toml -o my-study.zarr
       faintspot study run my-study.toml --scheduler tls://head-node:8786
-      faintspot study run my-study.toml --device cuda
     """
     from faintspot.study.specification import StudySpecification
 
     described = StudySpecification.from_file(specification)
     target = output or str(derived(specification, ".zarr"))
-    _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
@@ -115,7 +107,6 @@ def paper(
     quick: bool,
     figures: tuple[str, ...],
     output: str | None,
-    device: str | None,
     scheduler: str | None,
     workers: int | None,
     overwrite: bool,
@@ -135,7 +126,7 @@ def paper(
 
     described = study_of_paper.specification(quick, figures or None)
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
-    results = _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = derived(target, ".html")
     study_of_paper.report(results, page)
     click.echo(f"{page}: open it in a browser")
@@ -156,7 +147,6 @@ def estimators(
     quick: bool,
     output: str | None,
     table: str | None,
-    device: str | None,
     scheduler: str | None,
     workers: int | None,
     overwrite: bool,
@@ -176,7 +166,7 @@ def estimators(
 
     described = study_of_estimators.specification(quick)
     target = output or f"estimators{'-quick' if quick else ''}.zarr"
-    results = _measure(described, target, device, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = derived(target, ".html")
     study_of_estimators.report(results, page)
     click.echo(f"{page}: open it in a browser")
@@ -187,14 +177,10 @@ def estimators(
         click.echo(f"{table}: tables")
 
 
-def _measure(
-    described: StudySpecification, target: str, device: str | None, **options: Any
-) -> xarray.Dataset:
+def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:
     """Run a study with a progress bar."""
     from faintspot.study.running import run as run_study
 
-    if device is not None:
-        described = replace(described, device=device)
     realisations, measured = described.realisations, 0
 
     def advance_by_cells(finished: int, total: int) -> None:

@@ -13,7 +13,6 @@ import signal
 import threading
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -52,8 +51,7 @@ class Unit:
 
     key: str
     """What its result is stored under."""
-    arguments: tuple[Any, ...] | Callable[[], tuple[Any, ...]]
-    """Or what makes them in the calling process, when it is the unit's turn."""
+    arguments: tuple[Any, ...]
     size: int = 1
     """How much work it is, for the progress."""
 
@@ -183,11 +181,7 @@ def _finished(
 
 def _here(function: Callable[..., Arrays], units: list[Unit], count: _Count) -> Finished:
     for unit in units:
-        yield unit, function(*_arguments(unit), lambda done, key=unit.key: count.at(key, done))
-
-
-def _arguments(unit: Unit) -> tuple[Any, ...]:
-    return unit.arguments() if callable(unit.arguments) else unit.arguments
+        yield unit, function(*unit.arguments, lambda done, key=unit.key: count.at(key, done))
 
 
 # Processes of this machine --------------------------------------------------------------------------------
@@ -215,19 +209,17 @@ def _by_processes(
 def _by_one_pool(
     function: Callable[..., Arrays], units: list[Unit], processes: int, count: _Count
 ) -> Iterator[tuple[str, Arrays]]:
-    # A process that was forked could not go on with a GPU driver's threads.
+    # A process that was forked could not go on with the threads of this one.
     context = multiprocessing.get_context("spawn")
     news = context.SimpleQueue()
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(processes, context, _begin_worker, (news,))
-    waiting, pending = deque(units), dict[Future[Arrays], str]()
+    pending: dict[Future[Arrays], str] = {}
     try:
         with _worker_environment():
-            while waiting or pending:
-                # No more at a time than keeps all busy: arguments that are made here may be large.
-                while waiting and len(pending) < 2 * processes:
-                    unit = waiting.popleft()
-                    pending[pool.submit(_in_process, function, unit.key, _arguments(unit))] = unit.key
+            for unit in units:
+                pending[pool.submit(_in_process, function, unit.key, unit.arguments)] = unit.key
+            while pending:
                 finished = wait(pending, _TELLING_S, FIRST_COMPLETED).done
                 while not news.empty():
                     count.at(*news.get())
@@ -309,7 +301,7 @@ def _by_dask(
         try:
             for unit in units:
                 future = client.submit(
-                    _on_worker, function, unit.key, _arguments(unit), topic, __version__, pure=False
+                    _on_worker, function, unit.key, unit.arguments, topic, __version__, pure=False
                 )
                 futures[unit.key] = future
                 future.add_done_callback(lambda done, key=unit.key: news.put((key, done)))

@@ -6,7 +6,7 @@ with the number of realisations.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -15,17 +15,19 @@ from numpy.typing import NDArray
 from faintspot.compare.statistics import OUTLIER_PX, slope_statistics
 from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 from faintspot.simulate import subapertures
-from faintspot.study.arm_names import kind_of, knows_the_spot
+from faintspot.study.arm_names import keeps_every_k, knows_the_spot
 from faintspot.study.arms import Candidate, CellArms, Images, detector_of, shown
 from faintspot.study.specification import BEST, StudySpecification
 from faintspot.study.sweep import Cell
-from faintspot.study.tables import Block, Floats, HostTables, Tables, errors_of
+from faintspot.study.tables import Floats, errors_of, position_table
 from faintspot.study.tuning import Choice, Tuning
 
 _BLOCK_PIXELS = 1 << 18  # small enough for the processor's cache
 _STACK_PIXELS = 1 << 21  # that an estimator measures at once
 
 
+Block = tuple[Images, Floats]
+"""Images (n, side, side) and the true positions of their spots, (n, 2) px."""
 STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
 """Variables beside R that are made with their standard errors, from `slope_statistics`."""
 
@@ -47,43 +49,19 @@ def realisations(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[B
             detector=detector,
             rng=rng,
         )
-        yield Block(images - np.float32(cell.background_e), truth)
+        yield images - np.float32(cell.background_e), truth
 
 
-class _Source:
-    """Blocks of a cell's images, and the tables that measure them, on the CPU or on a GPU."""
-
-    def __init__(self, cell: Cell, specification: StudySpecification) -> None:
-        self._cell, self._seed = cell, specification.seed
-        self._rng = np.random.default_rng(cell.seed(specification.seed))
-        self._on_device: Any = None
-        search, self._drawn = specification.search_range_of(cell), 0
-        self.tables: Tables = HostTables(search)
-        if specification.device == "cuda":
-            from faintspot.study import on_device
-
-            self._on_device = on_device
-            self.tables = on_device.DeviceTables(search)
-
-    def stacks(self, count: int) -> Iterator[list[Any]]:
-        """Yield the next images, several blocks at a time."""
-        stack: list[Any] = []
-        for block in self._blocks(count):
-            stack.append(block)
-            if sum(len(each.truth) for each in stack) * self._cell.pixels**2 >= _STACK_PIXELS:
-                yield stack
-                stack = []
-        if stack:
+def _stacks(blocks: Iterable[Block], pixels: int) -> Iterator[list[Block]]:
+    """Yield several blocks at a time."""
+    stack: list[Block] = []
+    for block in blocks:
+        stack.append(block)
+        if sum(len(truth) for _, truth in stack) * pixels**2 >= _STACK_PIXELS:
             yield stack
-
-    def _blocks(self, count: int) -> Iterator[Any]:
-        if self._on_device is None:
-            yield from realisations(self._cell, count, self._rng)
-        elif self._on_device.draws(self._cell):
-            yield from self._on_device.realisations(self._cell, self._seed, self._drawn, count)
-        else:
-            yield from map(self._on_device.brought, realisations(self._cell, count, self._rng))
-        self._drawn += count
+            stack = []
+    if stack:
+        yield stack
 
 
 def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDArray[Any]]:
@@ -109,39 +87,27 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
     >>> print(f"R = {measured['error'][0, 0]:.2f} px, {measured['chosen_k'][0, 0]:.0f} pixels kept")
     R = 0.07 px, 12 pixels kept
     """
-    return results_of(cell, specification, score_cell(cell, specification))
-
-
-def score_cell(cell: Cell, specification: StudySpecification) -> Scores:
-    """Choose each arm's settings on the first half of a cell's images, measure the second half with them."""
+    rng = np.random.default_rng(cell.seed(specification.seed))
     half = specification.realisations // 2
-    source, arms, tuning = _Source(cell, specification), None, None
-    for stack in source.stacks(half):
-        if tuning is None:
-            arms = CellArms(cell, specification, _light_e(specification, source.tables, stack))
-            tuning = Tuning(arms, specification, source.tables)
+    arms: CellArms | None = None
+    for stack in _stacks(realisations(cell, half, rng), cell.pixels):
+        if arms is None:
+            light = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
+            arms = CellArms(cell, specification, float(light.mean()))
+            tuning = Tuning(arms, specification)
         tuning.add(stack)
     assert arms is not None
-    assert tuning is not None
-    scores = Scores(tuning.choices())
-    for stack in source.stacks(specification.realisations - half):
-        scores.add(stack, source.tables, arms)
-    return scores
-
-
-def _light_e(specification: StudySpecification, tables: Tables, stack: list[Any]) -> float | None:
-    """Return the mean light of images, which arms without tables are told."""
-    if all(tables.takes(kind_of(arm)) for arm in specification.arms):
-        return None  # images may stay where they are
-    light = np.concatenate([block.images.sum(axis=(1, 2), dtype=np.float64) for block in stack])
-    return float(light.mean())
+    scores = Scores(arms, tuning.choices())
+    for stack in _stacks(realisations(cell, specification.realisations - half, rng), cell.pixels):
+        scores.add(stack)
+    return _results(cell, specification, scores)
 
 
 class Scores:
     """Positions with the chosen settings, stack after stack."""
 
-    def __init__(self, choices: dict[tuple[str, str], Choice]) -> None:
-        self.choices = choices
+    def __init__(self, arms: CellArms, choices: dict[tuple[str, str], Choice]) -> None:
+        self._arms, self.choices = arms, choices
         self._truth: list[Floats] = []
         self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
         self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
@@ -153,23 +119,23 @@ class Scores:
         """True positions (n, 2), px."""
         return np.concatenate(self._truth)
 
-    def add(self, blocks: list[Any], tables: Tables, arms: CellArms) -> None:
+    def add(self, blocks: list[Block]) -> None:
         """Score images."""
-        self._truth += [block.truth for block in blocks]
+        self._truth += [truth for _, truth in blocks]
         for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
-            if tables.takes(arms.kinds[arm]):
+            if keeps_every_k(self._arms.kinds[arm]):
                 for block in blocks:
-                    self._add_table(arm, candidate, block, tables, arms)
+                    self._add_table(arm, candidate, *block)
             else:
-                self._add_measured(arm, candidate, np.concatenate([block.images for block in blocks]), arms)
+                self._add_measured(arm, candidate, np.concatenate([images for images, _ in blocks]))
 
     def _modes(self, arm: str, candidate: Candidate) -> list[str]:
         """Modes in which an arm chose a candidate."""
         same = (arm, candidate)
         return [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
 
-    def _add_measured(self, arm: str, candidate: Candidate, images: Images, arms: CellArms) -> None:
-        slopes = arms.measure(arm, candidate, images)
+    def _add_measured(self, arm: str, candidate: Candidate, images: Images) -> None:
+        slopes = self._arms.measure(arm, candidate, images)
         modes = self._modes(arm, candidate)
         for mode in modes:
             self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
@@ -178,15 +144,18 @@ class Scores:
         if BEST in modes and knows_the_spot(arm):
             self._stated.setdefault(arm, []).append(stated.astype(np.float64))
 
-    def _add_table(self, arm: str, candidate: Candidate, block: Any, tables: Tables, arms: CellArms) -> None:
+    def _add_table(self, arm: str, candidate: Candidate, images: Images, truth: Floats) -> None:
+        estimator: Any = self._arms.estimator(arm, candidate)
+        positions, valid = position_table(estimator, images, self._arms.search_range_px)
         modes = self._modes(arm, candidate)
-        columns = [self.choices[arm, mode].column or 0 for mode in modes]
-        scored = tables.scored(arms.estimator(arm, candidate), block, columns)
-        for i, mode in enumerate(modes):
-            self._positions[arm, mode].append(scored.positions[:, i])
-            self._valid[arm, mode].append(scored.valid[:, i])
-        if BEST in modes and scored.sums.shape[1] > 1:
-            self.sums[arm] = self.sums.get(arm, 0.0) + scored.sums
+        for mode in modes:
+            column = self.choices[arm, mode].column or 0
+            self._positions[arm, mode].append(positions[:, column])
+            self._valid[arm, mode].append(valid[:, column])
+        if BEST in modes:
+            errors = errors_of(positions, truth[:, None])
+            sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
+            self.sums[arm] = self.sums.get(arm, 0.0) + sums
 
     def positions(self, arm: str, mode: str) -> Floats:
         """Return the positions of all realisations, (n, 2) px."""
@@ -201,7 +170,7 @@ class Scores:
         return np.concatenate(self._stated[arm]) if arm in self._stated else None
 
 
-def results_of(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
+def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
     """Arrange choices and scores as the dataset has them."""
     arms, modes, truth = specification.arms, specification.modes, scores.truth
     names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from faintspot.compare.running import Advance, Unit, Workplace, run_units
 from faintspot.compare.store import Arrays, MemoryStore
 from faintspot.errors import InputError
-from faintspot.study.cell import Scores, measure_cell, results_of, score_cell
+from faintspot.study.cell import measure_cell
 from faintspot.study.specification import StudySpecification
 from faintspot.study.store import dataset_of, open_study, stored_units
 from faintspot.study.sweep import Cell
@@ -46,8 +46,7 @@ def run(
     progress : callable, optional
         Called with the number of cells measured in this run and the number to measure.
     workers : int, optional
-        Processes on this machine; as many as there are processors by default. 0 works in this process. Of a
-        study on a GPU, which this process drives: processes that work out the statistics of measured cells.
+        Processes on this machine; as many as there are processors by default. 0 works in this process.
     overwrite : bool
         Replace the store, if it is one of a study.
     announce : callable, optional
@@ -61,10 +60,9 @@ def run(
     Raises
     ------
     InputError
-        When the store belongs to another study or cannot be written, or the scheduler is not to be reached;
-        for a study on a GPU without one, with a scheduler, or with images of more than 32 x 32 pixels.
+        When the store belongs to another study or cannot be written, or the scheduler is not to be reached.
     MissingExtraError
-        When Dask or, for a GPU, numba-cuda is needed and not installed.
+        When Dask is needed and not installed.
 
     Examples
     --------
@@ -78,44 +76,14 @@ def run(
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
     place = Workplace(workers, scheduler, progress, announce)
-    on_device = specification.device != "cpu"
-    if on_device:
-        _check_device(specification, scheduler)
-    units = [_unit(index, cell, specification) for index, cell in enumerate(specification.cells())]
-    function = _results if on_device else _measured
+    units = [Unit(str(index), (cell, specification)) for index, cell in enumerate(specification.cells())]
     if store is None:
         memory = MemoryStore()
-        run_units(function, units, memory, place)
+        run_units(_measured, units, memory, place)
         return dataset_of(specification, memory)
-    run_units(function, units, stored_units(specification, Path(store), overwrite=overwrite), place)
+    run_units(_measured, units, stored_units(specification, Path(store), overwrite=overwrite), place)
     return open_study(store)
-
-
-def _unit(index: int, cell: Cell, specification: StudySpecification) -> Unit:
-    if specification.device == "cpu":
-        return Unit(str(index), (cell, specification))
-    # Scored by this process on the GPU, while others work out the statistics of the cells before.
-    return Unit(str(index), lambda: (cell, specification, score_cell(cell, specification)))
 
 
 def _measured(cell: Cell, specification: StudySpecification, advance: Advance) -> Arrays:
     return measure_cell(cell, specification)
-
-
-def _results(cell: Cell, specification: StudySpecification, scores: Scores, advance: Advance) -> Arrays:
-    return results_of(cell, specification, scores)
-
-
-def _check_device(specification: StudySpecification, scheduler: str | None) -> None:
-    """Refuse a study that this machine's GPU cannot run."""
-    if scheduler is not None:
-        raise InputError(
-            f"scheduler = {scheduler!r}: device = {specification.device!r} works on this machine's GPU, "
-            "not on a cluster; leave one of both out"
-        )
-    from faintspot.cuda.availability import check_cuda
-    from faintspot.cuda.strips import strips_of
-
-    for cell in specification.cells():
-        strips_of((cell.pixels, cell.pixels))
-    check_cuda()

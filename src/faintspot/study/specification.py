@@ -22,7 +22,6 @@ from faintspot.toml_files import check_keys, checked_table, parse_text, read_tex
 __all__ = ["BEST", "CORRECTED", "PROFILES", "StudySpecification", "Sweep"]
 
 BEST, CORRECTED = "best", "corrected"
-DEVICES = ("cpu", "cuda")
 _MOST_CELLS = 100_000
 _CANDIDATE_RANGES = {
     "strengths": Range("1", 0.0, 10.0, low_open=True),
@@ -73,9 +72,6 @@ class StudySpecification:
     search_range_px : float, optional
         Largest position of any arm, on each axis. Default: the range of true positions of each cell where an
         arm is an estimator that knows the spot, so that all have the same; else none.
-    device : {"cpu", "cuda"}
-        "cuda" draws and measures images on an NVIDIA GPU, but for what only the CPU does: estimators that
-        know the spot, turbulence and EM gain. The draws are others than the CPU's, of the same distribution.
 
     Raises
     ------
@@ -106,7 +102,6 @@ class StudySpecification:
     fixed_k: Sequence[int] = (20, 40, 60)
     corrected: bool = False
     search_range_px: float | None = None
-    device: str = DEVICES[0]
 
     LISTED: ClassVar[Mapping[str, tuple[str, bool]]] = {
         "noise_std": ("strengths", False),
@@ -135,7 +130,6 @@ class StudySpecification:
         if self.search_range_px is not None:
             search = number_between("search_range_px", self.search_range_px, 0.0, low_open=True)
             self._set("search_range_px", search)
-        one_of("device", self.device, DEVICES)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -190,8 +184,6 @@ class StudySpecification:
         document = tomlkit.document()
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "device" and value == DEVICES[0]:
-                continue  # so that studies on the CPU keep the fingerprints they had when there was no other
             if field.name != "sweeps" and value is not None:  # TOML has no word for nothing
                 document[field.name] = list(value) if isinstance(value, tuple) else value
         sweeps = tomlkit.table()

@@ -1,22 +1,18 @@
-"""What a study asks of images: sums over them for every candidate and k, and positions at a chosen k.
+"""Errors and positions of images for every number of kept pixels at once, for arms that keep the brightest.
 
-`HostTables` answers on the CPU, `faintspot.study.on_device.DeviceTables` on a GPU, for arms that keep the
-brightest pixels: images are denoised once, each is sorted once, and all numbers of kept pixels are measured.
+Images are denoised once, each is sorted once, and all numbers of kept pixels are measured.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.estimators.base import Estimator
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.kernels import scoring
-from faintspot.study.arm_names import keeps_every_k
 from faintspot.study.arms import Images
 
 Floats = NDArray[np.float64]
@@ -25,93 +21,12 @@ Bools = NDArray[np.bool_]
 RULES = {"subtract_next": scoring.SUBTRACT_NEXT, "threshold": scoring.THRESHOLD}
 
 
-class Block(NamedTuple):
-    """Images in the host's memory."""
-
-    images: Images
-    """(n, side, side)."""
-    truth: Floats
-    """True positions of their spots, (n, 2), px."""
-
-
-class Scored(NamedTuple):
-    """Positions of a candidate."""
-
-    positions: Floats
-    """(n, columns, 2), px."""
-    valid: Bools
-    """(n, columns)."""
-    sums: Floats
-    """Of the errors and of their squares for every k, (2, K)."""
-
-
-class Tables(Protocol):
-    """Measures blocks with the arms that it has tables for."""
-
-    def takes(self, kind: type[Estimator]) -> bool:
-        """Whether there are tables for an estimator."""
-        ...
-
-    def sums(self, estimators: Sequence[Any], block: Any, *, moments: bool) -> tuple[Floats, Floats | None]:
-        """Return sums of (|dx| + |dy|) / 2, (estimators, K), and those of `moments_of`, if asked for."""
-        ...
-
-    def scored(self, estimator: Any, block: Any, columns: Sequence[int]) -> Scored:
-        """Return positions at k = column + 1."""
-        ...
-
-
-class HostTables:
-    """Measures blocks on the CPU.
-
-    Parameters
-    ----------
-    search_range_px : float
-        Positions beyond plus or minus this become it, on each axis.
-    """
-
-    def __init__(self, search_range_px: float = math.inf) -> None:
-        self._search_range_px = search_range_px
-
-    def takes(self, kind: type[Estimator]) -> bool:
-        """See `Tables`."""
-        return keeps_every_k(kind)
-
-    def sums(
-        self, estimators: Sequence[KeepingBrightest], block: Block, *, moments: bool
-    ) -> tuple[Floats, Floats | None]:
-        """See `Tables`."""
-        images, truth = block
-        tables = (error_table(each, images, truth, self._search_range_px)[0] for each in estimators)
-        sums = np.stack([table.sum(axis=0, dtype=np.float64) for table in tables])
-        if not moments:
-            return sums, None
-        positions = (position_table(each, images, self._search_range_px)[0] for each in estimators)
-        return sums, np.stack([moments_of(table, truth) for table in positions], axis=1)
-
-    def scored(self, estimator: KeepingBrightest, block: Block, columns: Sequence[int]) -> Scored:
-        """See `Tables`."""
-        images, truth = block
-        positions, valid = position_table(estimator, images, self._search_range_px)
-        errors = errors_of(positions, truth[:, None])
-        sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
-        return Scored(positions[:, list(columns)], valid[:, list(columns)], sums)
-
-
-def mean_errors(
-    estimators: Mapping[str, Sequence[KeepingBrightest]],
-    blocks: Iterable[tuple[Images, Floats]],
-    search_range_px: float = math.inf,
-) -> dict[str, Floats]:
-    """Return R of lists of estimators for every k, (estimators, K) px each, over images with their truth."""
-    tables = HostTables(search_range_px)
-    sums: dict[str, Any] = dict.fromkeys(estimators, 0.0)
-    count = 0
-    for images, truth in blocks:
-        count += len(images)
-        for name, each in estimators.items():
-            sums[name] = sums[name] + tables.sums(each, Block(images, truth), moments=False)[0]
-    return {name: total / count for name, total in sums.items()}
+def error_sums(
+    estimators: Sequence[KeepingBrightest], images: Images, truth: Floats, search_range_px: float = math.inf
+) -> Floats:
+    """Return sums of (|dx| + |dy|) / 2 over images for every estimator and k, (estimators, K)."""
+    tables = (error_table(each, images, truth, search_range_px)[0] for each in estimators)
+    return np.stack([table.sum(axis=0, dtype=np.float64) for table in tables])
 
 
 def error_table(
@@ -165,15 +80,11 @@ def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
 def moments_of(positions: Floats, truth: Floats) -> Floats:
     """Sums that a regression of (n, K, 2) positions on the truth needs, (8, K)."""
     x, y = positions[..., 0], positions[..., 1]
+    whole = [len(truth), *truth.sum(axis=0), np.square(truth).sum()]
     own = [x.sum(axis=0), y.sum(axis=0), np.square(positions).sum(axis=(0, 2))]
     across = (x * truth[:, :1]).sum(axis=0) + (y * truth[:, 1:]).sum(axis=0)
-    return with_truth(np.stack([*own, across]), truth)
-
-
-def with_truth(own: Floats, truth: Floats) -> Floats:
-    """Put what the truth alone decides before the sums (4, K) of x, y, their squares and their product."""
-    whole = [len(truth), *truth.sum(axis=0), np.square(truth).sum()]
-    return np.concatenate([np.repeat(np.array(whole)[:, None], own.shape[1], axis=1), own])
+    same = np.repeat(np.array(whole)[:, None], positions.shape[1], axis=1)
+    return np.concatenate([same, np.stack([*own, across])])
 
 
 def errors_of(positions: Floats, truth: Floats) -> Floats:

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.study.arms import Candidate, CellArms
+from faintspot.study.arm_names import keeps_every_k
+from faintspot.study.arms import Candidate, CellArms, Images
 from faintspot.study.specification import CORRECTED, StudySpecification
-from faintspot.study.tables import Tables, moments_of
+from faintspot.study.tables import error_sums, moments_of, position_table
 
 Floats = NDArray[np.float64]
 
@@ -28,37 +29,38 @@ class Choice:
 class Tuning:
     """Errors of all candidates on the first half of a cell's images, and what follows from them."""
 
-    def __init__(self, arms: CellArms, specification: StudySpecification, tables: Tables) -> None:
-        self._arms, self._tables = arms, tables
+    def __init__(self, arms: CellArms, specification: StudySpecification) -> None:
+        self._arms = arms
         self._modes = specification.kept_pixels(arms.cell)
         self._candidates = {arm: arms.candidates(arm) for arm in specification.arms}
         self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
         self._moments: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)
 
     def add(self, blocks: list[Any]) -> None:
-        """Add images and their true positions, in a form that the tables take."""
+        """Add images and their true positions."""
         for arm, candidates in self._candidates.items():
-            if self._tables.takes(self._arms.kinds[arm]):
+            if keeps_every_k(self._arms.kinds[arm]):
                 for block in blocks:
-                    self._add_table(arm, candidates, block)
+                    self._add_table(arm, candidates, *block)
             elif len(candidates) > 1:  # else there is nothing to choose
                 self._add_measured(arm, candidates, blocks)
 
-    def _add_table(self, arm: str, candidates: Sequence[Candidate], block: Any) -> None:
-        estimators = [self._arms.estimator(arm, candidate) for candidate in candidates]
-        sums, moments = self._tables.sums(estimators, block, moments=CORRECTED in self._modes)
-        self._errors[arm] = self._errors[arm] + sums
-        if moments is not None:
-            self._moments[arm] = self._moments[arm] + moments
+    def _add_table(self, arm: str, candidates: Sequence[Candidate], images: Images, truth: Floats) -> None:
+        estimators: list[Any] = [self._arms.estimator(arm, candidate) for candidate in candidates]
+        reach = self._arms.search_range_px
+        self._errors[arm] += error_sums(estimators, images, truth, reach)
+        if CORRECTED in self._modes:
+            tables = (position_table(each, images, reach)[0] for each in estimators)
+            self._moments[arm] += np.stack([moments_of(table, truth) for table in tables], axis=1)
 
     def _add_measured(self, arm: str, candidates: Sequence[Candidate], blocks: list[Any]) -> None:
         images, truth = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
         slopes = [self._arms.measure(arm, candidate, images) for candidate in candidates]
         positions = [np.stack([s.x, s.y], axis=-1).astype(np.float64) for s in slopes]
         sums = np.array([[np.abs(part - truth).mean(axis=1).sum()] for part in positions])
-        self._errors[arm] = self._errors[arm] + sums
+        self._errors[arm] += sums
         moments = [moments_of(part[:, None], truth) for part in positions]
-        self._moments[arm] = self._moments[arm] + np.stack(moments, axis=1)
+        self._moments[arm] += np.stack(moments, axis=1)
 
     def choices(self) -> dict[tuple[str, str], Choice]:
         """Return the choice of every arm and mode."""
