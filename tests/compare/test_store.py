@@ -20,8 +20,7 @@ from faintspot.compare.store import (
     MemoryStore,
     ZarrStore,
     fingerprint_of,
-    refuse_former_folder,
-    store_attributes,
+    kind_of_store,
 )
 
 pytest.importorskip("zarr")
@@ -76,31 +75,14 @@ def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not the store of a loop"):
         ZarrStore(path, "loop", "one", ["a"], overwrite=True)
     ZarrStore(path, "study", "other", ["a"], overwrite=True)
-    attributes = store_attributes(path)
-    assert attributes is not None
-    assert attributes["fingerprint"] == "other"
+    assert kind_of_store(path) == "study"
+    assert ZarrStore(path, "study", "other", ["a"]).is_empty
     folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(InputError, match="not the store of a study"):
         ZarrStore(folder, "study", "one", ["a"], overwrite=True)
     with pytest.raises(InputError, match="does not exist"):
         ZarrStore(tmp_path / "no" / "s.zarr", "study", "one", ["a"])
-
-
-def test_of_version_0_1(tmp_path: Path) -> None:
-    path = tmp_path / "s.zarr"
-    path.mkdir()
-    old = {"attributes": {"fingerprint": "0", "specification": ""}, "zarr_format": 3, "node_type": "group"}
-    (path / "zarr.json").write_text(json.dumps(old))
-    with pytest.raises(InputError, match=r"of faintspot 0\.1, .*--overwrite") as raised:
-        ZarrStore(path, "study", "0", ["a"])
-    assert "\n" not in str(raised.value)
-    assert ZarrStore(path, "study", "0", ["a"], overwrite=True).is_empty
-    refuse_former_folder(tmp_path)
-    (tmp_path / "units").mkdir()
-    (tmp_path / "units" / "magnitude.json").write_text("{}")
-    with pytest.raises(InputError, match=r"units of faintspot 0\.1"):
-        refuse_former_folder(tmp_path)
 
 
 def test_damaged(tmp_path: Path) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from faintspot.compare.statistics import slope_error
 from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings
 from faintspot.simulate import Detector, sensor_frames, subapertures
-from faintspot.study.metric import slope_error
 
 
 @pytest.mark.parametrize("read_noise_e", [1.0, 3.0])

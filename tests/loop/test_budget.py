@@ -11,7 +11,8 @@ from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
 from faintspot.loop.arms import LOOP_GAIN, arm_kind
 from faintspot.loop.budget import TERMS, budget_run, run_budget
-from faintspot.loop.results import BUDGET_FILE, BudgetResult
+from faintspot.loop.files import BUDGET_FILE
+from faintspot.loop.results import BudgetResult
 from faintspot.loop.simulation import simulate_loop
 
 pytest.importorskip("hcipy")

@@ -9,8 +9,9 @@ from tests.loop.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_fi
 
 from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
+from faintspot.loop.files import MAGNITUDE_FILE
 from faintspot.loop.magnitude import quick_run, run_magnitude
-from faintspot.loop.results import MAGNITUDE_FILE, MagnitudeResult
+from faintspot.loop.results import MagnitudeResult
 
 pytest.importorskip("hcipy")
 ARMS = ("centroid", "brightest")

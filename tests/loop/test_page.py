@@ -8,9 +8,9 @@ import pytest
 from tests.loop.result_cases import made_up_budget, made_up_interleaved, made_up_magnitude, small_interleaved
 
 from faintspot.errors import InputError
+from faintspot.loop.files import MAGNITUDE_FILE
 from faintspot.loop.page import loop_report, write_loop_report
 from faintspot.loop.page_sections import loop_sections, loop_warnings
-from faintspot.loop.results import MAGNITUDE_FILE
 from faintspot.loop.verdict import NOWHERE, LoopResults
 
 pytest.importorskip("hcipy")

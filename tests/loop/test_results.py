@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from faintspot.errors import InputError
-from faintspot.loop.files import make_folder
-from faintspot.loop.results import (
+from faintspot.loop.files import (
     BUDGET_FILE,
     INTERLEAVED_FILE,
     MAGNITUDE_FILE,
+    holds_loop_results,
+    make_folder,
+)
+from faintspot.loop.results import (
     BudgetResult,
     InterleavedResult,
     MagnitudeResult,
 )
-from faintspot.loop.stored_results import holds_loop_results
 
 
 def magnitude_result() -> MagnitudeResult:
@@ -86,14 +88,6 @@ def test_damaged_description_is_refused(tmp_path: Path, text: str) -> None:
 def test_no_interleaved_result(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         InterleavedResult.load(tmp_path)
-
-
-def test_results_of_earlier_versions_are_recognised(tmp_path: Path) -> None:
-    path = tmp_path / MAGNITUDE_FILE
-    np.savez_compressed(path, format=1, labels=np.array(["brightest pixels"]))
-    with pytest.raises(InputError, match="earlier version of faintspot: measure again") as error:
-        MagnitudeResult.load(path)
-    assert "\n" not in str(error.value)
 
 
 def test_folders_that_cannot_be(tmp_path: Path) -> None:

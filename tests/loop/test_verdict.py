@@ -7,7 +7,7 @@ import pytest
 from tests.loop.result_cases import LABELS, made_up_budget, made_up_interleaved, made_up_magnitude
 
 from faintspot.errors import InputError
-from faintspot.loop.results import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.loop.files import BUDGET_FILE, MAGNITUDE_FILE
 from faintspot.loop.verdict import (
     NOWHERE,
     LoopResults,

@@ -107,12 +107,6 @@ def test_search_range_is_the_same_for_all_arms() -> None:
     assert replace(new, search_range_px=2).search_range_of(far) == 2.0
 
 
-def test_former_names_of_arms() -> None:
-    """Those of version 0.1 still work."""
-    former = StudySpecification("x", [Sweep("a")], arms=["plain", "tv", "gaussian", "brightest"])
-    assert former.arms == ("brightest", "tv", "smoothed")
-
-
 def test_modes() -> None:
     sweep = Sweep("a", pixels=[4, 16], d_over_r0=[0, 2])
     specification = StudySpecification("x", [sweep], fixed_k=[20], corrected=True, blurs=[0.0, 1.0])

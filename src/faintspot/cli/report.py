@@ -7,12 +7,12 @@ from pathlib import Path
 import click
 
 from faintspot.cli.needs import needs
+from faintspot.compare.store import kind_of_store
 from faintspot.errors import InputError
 from faintspot.files import derived
 from faintspot.io.locations import split_location
 from faintspot.io.zarr_store import holds_telemetry
-from faintspot.loop.stored_results import holds_loop_results
-from faintspot.study.stored_results import study_attributes
+from faintspot.loop.files import holds_loop_results
 
 
 @needs("web", "matplotlib", "jinja2")
@@ -63,7 +63,7 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
         write_loop_report(paths[0], page)
         click.echo(f"{page}: open it in a browser")
         return
-    if len(paths) == 1 and study_attributes(paths[0]) is not None:
+    if len(paths) == 1 and kind_of_store(paths[0]) == "study":
         html = report_of_study(paths[0])
     elif len(paths) == 1 and holds_telemetry(paths[0]):
         from faintspot.recorded.telemetry_page import report_of_telemetry

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 Arrays = Mapping[str, NDArray[Any]]
 
 FORMAT = 2
-"""Of stores; version 0.1 wrote others."""
 DONE = "done"
 _FORMAT, _KIND, _FINGERPRINT, _UNITS = "format", "kind", "fingerprint", "units"
 OWN_ATTRIBUTES = (_FORMAT, _KIND, _UNITS)
@@ -195,34 +194,20 @@ class ZarrStore:
             self._group.attrs[_UNITS] = list(self._rows)
 
 
-def store_attributes(path: Path) -> dict[str, Any] | None:
-    """Return the attributes of a store of any version; None when there is something else."""
+def kind_of_store(path: Path) -> str | None:
+    """Return what the units of a store are, such as "study"; None when there is something else."""
+    kind = (_attributes(path) or {}).get(_KIND)
+    return kind if isinstance(kind, str) else None
+
+
+def _attributes(path: Path) -> dict[str, Any] | None:
+    """Return the attributes of a store; None when there is something else."""
     try:
         text = (path / "zarr.json").read_text(encoding="utf-8")
         attributes: dict[str, Any] = parse_json(text)["attributes"]
     except (OSError, ValueError, KeyError):
         return None
     return attributes if isinstance(attributes, dict) and _FINGERPRINT in attributes else None
-
-
-def is_former(attributes: Mapping[str, Any]) -> bool:
-    """Whether a store with these attributes was written by version 0.1."""
-    return _FORMAT not in attributes
-
-
-def refuse_former_folder(folder: str | Path) -> None:
-    """Refuse a folder in which version 0.1 kept the finished units of closed loops.
-
-    Raises
-    ------
-    InputError
-        When it is one.
-    """
-    if any(Path(folder).glob("units/*.json")):
-        raise InputError(
-            f"{folder}: holds units of faintspot 0.1, which cannot be gone on with: choose another folder, "
-            "or delete its folder 'units'"
-        )
 
 
 def _check_place(path: Path, known: Mapping[str, Any], *, overwrite: bool) -> None:
@@ -232,15 +217,11 @@ def _check_place(path: Path, known: Mapping[str, Any], *, overwrite: bool) -> No
         raise InputError(f"{path}: the folder {path.parent} does not exist: create it or choose another")
     if not path.exists():
         return
-    found = store_attributes(path)
+    found = _attributes(path)
     if found is None or found.get(_KIND, kind) != kind:
         raise InputError(f"{path}: exists already and is not the store of a {kind}: choose another name")
     if overwrite:
         return
-    if is_former(found):
-        raise InputError(
-            f"{path}: of faintspot 0.1, which cannot be gone on with: choose another name, or --overwrite"
-        )
     if found[_FINGERPRINT] != known[_FINGERPRINT]:
         raise InputError(
             f"{path}: belongs to another {kind} ({found.get('name', 'without a name')!r}, or other "
@@ -298,7 +279,5 @@ __all__ = [
     "UnitStore",
     "ZarrStore",
     "fingerprint_of",
-    "is_former",
-    "refuse_former_folder",
-    "store_attributes",
+    "kind_of_store",
 ]

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.loop.arms import Arm as Arm
     from faintspot.loop.arms import LoopArm as LoopArm
     from faintspot.loop.budget import run_budget as run_budget
     from faintspot.loop.configuration import LoopConfiguration as LoopConfiguration
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from faintspot.loop.simulation import simulate_loop as simulate_loop
 
 _HOMES = {
-    "Arm": "faintspot.loop.arms",
     "LoopArm": "faintspot.loop.arms",
     "LoopConfiguration": "faintspot.loop.configuration",
     "LoopRecord": "faintspot.loop.record",

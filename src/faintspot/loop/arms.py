@@ -83,8 +83,8 @@ class LoopArm:
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.loop import Arm
-    >>> arm = Arm("a window, less gain", fs.Settings("window"), gain=0.4)
+    >>> from faintspot.loop import LoopArm
+    >>> arm = LoopArm("a window, less gain", fs.Settings("window"), gain=0.4)
     >>> arm.control, arm.gain
     ('integrator', 0.4)
     """
@@ -113,10 +113,6 @@ class LoopArm:
             number_between("arm.window_pixels", self.window_pixels, 2, 64, integer=True)
         one_of("arm.control", self.control, list(CONTROLS))
         number_between("arm.noise_scale", self.noise_scale, 0, 100, low_open=True)
-
-
-Arm = LoopArm
-"""Its name in version 0.1."""
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.loop.arms import ArmKind, Choice
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
-from faintspot.loop.files import make_folder
+from faintspot.loop.files import BUDGET_FILE, make_folder
 from faintspot.loop.magnitude import checked_arms, quick_run, tuned_choices, unit_store
-from faintspot.loop.results import BUDGET_FILE, BudgetResult
+from faintspot.loop.results import BudgetResult
 from faintspot.loop.simulation import Idealised, simulate_loop
 from faintspot.loop.tuning import QUICK, Search
 

@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.npz import read_arrays, save_arrays
 
+INTERLEAVED_FILE = "interleaved.json"
+MAGNITUDE_FILE = "magnitude.npz"
+BUDGET_FILE = "budget.npz"
+"""Names of the files in a folder of results; the sets beside the first are set-1.npz and so on."""
+
 
 @dataclass(frozen=True, eq=False)
 class Stored:
@@ -50,13 +55,14 @@ class Stored:
         """
         values = read_arrays(path, cls.WHAT)
         found = values.pop("format", None)
-        if found is not None and found.shape == () and 0 < int(found) < cls.FORMAT:
-            raise InputError(
-                f"{path}: {cls.WHAT} of an earlier version of faintspot: measure again, in another folder"
-            )
         if found != cls.FORMAT or set(values) != {item.name for item in fields(cls)}:
             raise InputError(f"{path}: expected {cls.WHAT} of format {cls.FORMAT}, got something else")
         return cls(**{name: _restored(value) for name, value in values.items()})
+
+
+def holds_loop_results(path: Path) -> bool:
+    """Return whether a folder holds results of `faintspot loop`."""
+    return any((path / name).is_file() for name in (INTERLEAVED_FILE, MAGNITUDE_FILE, BUDGET_FILE))
 
 
 def make_folder(folder: str | Path) -> Path:

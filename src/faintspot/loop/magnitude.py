@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.checks import numbers_between
 from faintspot.compare.running import Advance, Unit, Workplace, run_units
-from faintspot.compare.store import Arrays, ZarrStore, fingerprint_of, refuse_former_folder
+from faintspot.compare.store import Arrays, ZarrStore, fingerprint_of
 from faintspot.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
@@ -21,8 +21,8 @@ from faintspot.estimators.trained import Trained
 from faintspot.estimators.window import Window
 from faintspot.loop.arms import LOOP_GAIN, ArmKind, Choice, arm_kind, default_arms
 from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.files import make_folder
-from faintspot.loop.results import MAGNITUDE_FILE, MagnitudeResult
+from faintspot.loop.files import MAGNITUDE_FILE, make_folder
+from faintspot.loop.results import MagnitudeResult
 from faintspot.loop.simulation import simulate_loop
 from faintspot.loop.tuning import (
     QUICK,
@@ -169,7 +169,6 @@ def unit_store(
     InputError
         When the folder holds those of another experiment, or it cannot be written.
     """
-    refuse_former_folder(folder)
     configuration, plan = experiment
     identity = fingerprint_of(configuration.to_text(), str(asdict(plan)))
     keys = [unit.key for unit in units]

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 
 from faintspot.errors import InputError
 from faintspot.files import parse_json, write_atomically
-from faintspot.loop.files import Stored, make_folder
+from faintspot.loop.files import INTERLEAVED_FILE, Stored, make_folder
 from faintspot.loop.record import LoopRecord
-from faintspot.loop.stored_results import BUDGET_FILE as BUDGET_FILE
-from faintspot.loop.stored_results import INTERLEAVED_FILE as INTERLEAVED_FILE
-from faintspot.loop.stored_results import MAGNITUDE_FILE as MAGNITUDE_FILE
 
 Floats = NDArray[np.float64]
 _FORMAT = 1

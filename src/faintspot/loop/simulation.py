@@ -125,9 +125,9 @@ def simulate_loop(
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.loop import Arm, LoopConfiguration, simulate_loop
+    >>> from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
     >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
-    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record = simulate_loop(loop, [LoopArm("brightest", fs.Settings("brightest"))])
     >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
     ((40,), (40, 72), True)
     """

@@ -24,10 +24,8 @@ from faintspot.loop.analysis import (
     strehl_table,
 )
 from faintspot.loop.arms import VARIANTS
+from faintspot.loop.files import BUDGET_FILE, INTERLEAVED_FILE, MAGNITUDE_FILE
 from faintspot.loop.results import (
-    BUDGET_FILE,
-    INTERLEAVED_FILE,
-    MAGNITUDE_FILE,
     BudgetResult,
     InterleavedResult,
     MagnitudeResult,

@@ -15,7 +15,6 @@ from faintspot.compare.arms import Arm, Knowledge
 from faintspot.compare.curves import Curve
 from faintspot.compare.statistics import Estimate, SlopeStatistics
 from faintspot.errors import InputError
-from faintspot.estimators.registry import FORMER_NAMES
 from faintspot.notebook import table
 from faintspot.planner.promise import Promise
 from faintspot.planner.question import Question
@@ -175,7 +174,7 @@ class Answer:
             For one that was not tried.
         """
         results = {result.arm.name: result for result in self.results}
-        found = results.get(FORMER_NAMES.get(name, name))
+        found = results.get(name)
         if found is None:
             raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
         return found

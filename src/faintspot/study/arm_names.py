@@ -7,7 +7,7 @@ from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import KeepingBrightest
-from faintspot.estimators.registry import FORMER_NAMES, estimator_named, estimators
+from faintspot.estimators.registry import estimator_named, estimators
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.thresholded import Thresholded
 from faintspot.estimators.total_variation import TotalVariation
@@ -36,11 +36,10 @@ def kind_of(arm: str) -> Kind:
     InputError
         For an unknown name.
     """
-    name = FORMER_NAMES.get(arm, arm) if isinstance(arm, str) else arm
     known = [*estimators(), *_ONLY_HERE]
-    if name not in known:
+    if arm not in known:
         raise InputError(f"arms = {arm!r}: expected one of {', '.join(map(repr, known))}")
-    return _ONLY_HERE.get(name) or estimator_named(name)
+    return _ONLY_HERE.get(arm) or estimator_named(arm)
 
 
 def label_of(arm: str) -> str:

@@ -10,11 +10,10 @@ import numpy as np
 
 from faintspot import __version__
 from faintspot.compare.statistics import OUTLIER_PX
-from faintspot.compare.store import DONE, OWN_ATTRIBUTES, UnitStore, ZarrStore, is_former
+from faintspot.compare.store import DONE, OWN_ATTRIBUTES, UnitStore, ZarrStore, kind_of_store
 from faintspot.errors import InputError, MissingExtraError
 from faintspot.io.locations import one_line
 from faintspot.study.specification import StudySpecification
-from faintspot.study.stored_results import study_attributes
 from faintspot.study.sweep import PARAMETERS, RANGES
 
 try:
@@ -122,12 +121,9 @@ def open_study(path: str | Path) -> xarray.Dataset:
     (True, ('cell', 'arm', 'mode'))
     """
     path = Path(path)
-    attributes = study_attributes(path)
-    if attributes is None:
+    if kind_of_store(path) != KIND:
         found = "something else" if path.exists() else "nothing"
         raise InputError(f"{path}: expected the Zarr store of a study, found {found}")
-    if is_former(attributes):
-        raise InputError(f"{path}: of faintspot 0.1, whose arms had other names: measure it again")
     try:
         dataset: xarray.Dataset = xarray.open_zarr(path, chunks=None, consolidated=False).load()
     except Exception as error:  # a broken chunk makes each codec raise its own kind
