@@ -82,7 +82,7 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
         strehl,
         np.full(strehl.shape, 0.8),
         settings,
-        np.full(shape, 0.5),
+        np.full(shape, '{"loop_gain": 0.5}'),
         psf,
         LoopConfiguration().to_text(),
     )

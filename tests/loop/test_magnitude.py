@@ -36,7 +36,7 @@ def test_result(whole: Path) -> None:
     assert result.magnitudes[0] - result.magnitudes[1] == pytest.approx(2.5)
     assert result.strehl.shape == result.centroid_gain.shape == (2, 2, 2)
     assert (result.strehl[:, 1] > result.strehl[:, 0]).all()  # ten times the light: 0.1 and more
-    assert result.settings.shape == result.gains.shape == (2, 2)
+    assert result.settings.shape == result.choices.shape == (2, 2)
     assert "keep_brightest" in result.settings[1, 0]
     assert result.psf.shape[:2] == (2, 2)
     # On axis, the mean image is the long-exposure Strehl ratio.

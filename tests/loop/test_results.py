@@ -33,7 +33,7 @@ def magnitude_result() -> MagnitudeResult:
         strehl,
         rng.uniform(0, 1, (2, 3, 4)),
         np.full((2, 3), "[settings]"),
-        np.full((2, 3), 0.5),
+        np.full((2, 3), '{"loop_gain": 0.5}'),
         rng.uniform(0, 1, (2, 3, 5, 5)).astype(np.float32),
         "name = 'x'",
     )

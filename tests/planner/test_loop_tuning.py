@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,17 @@ from tests.loop.experiment_cases import HERE, StopsAfter, assert_same_units, sma
 
 from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
-from faintspot.loop.arms import LOOP_GAIN, Tunable, arm_kind
-from faintspot.planner import loop_tuning
+from faintspot.loop.arms import LOOP_GAIN, arm_kind
+from faintspot.loop.tuning import Search
 from faintspot.planner.loop_answer import LoopAnswer
 from faintspot.planner.loop_question import LoopQuestion
-from faintspot.planner.loop_tuning import LoopPlan, best_choice, tune_loop, values_at_end
+from faintspot.planner.loop_tuning import LoopPlan, tune_loop, values_at_end
 
 pytest.importorskip("hcipy")
-PLAN = LoopPlan(
-    fluxes=3, tuning_frames=25, tuning_settle_frames=10, frames=30, settle_frames=10, realisations=2
+SEARCH = Search(
+    coarse_frames=25, frames=25, settle_frames=10, realisations=1, finalists=1, climbs=1, rounds=0
 )
+PLAN = LoopPlan(fluxes=3, frames=30, settle_frames=10, realisations=2, search=SEARCH)
 
 
 def question(**asked: Any) -> LoopQuestion:
@@ -47,7 +47,7 @@ def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
     assert (answer["window"].strehl[-1] > answer["window"].strehl[0]).all()  # six times the light
     # What learns has the estimator's options that were tuned with the integrator.
     for plain, learning in zip(answer["window"].choices, answer["window+kalman"].choices, strict=True):
-        assert {name: learning[name] for name in plain} == plain
+        assert all(learning[name] == plain[name] for name in plain if name != LOOP_GAIN)
         assert "noise_scale" in learning
 
 
@@ -60,49 +60,24 @@ def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[
     np.testing.assert_array_equal(again["window+kalman"].strehl, answer["window+kalman"].strehl)
 
 
-def test_progress_is_that_of_all_stages(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    tuned(tmp_path, Workplace(0, progress=lambda done, total: seen.append((done, total))), arms=())
-    assert seen[0][0] == 0
-    assert seen[-1][0] == seen[-1][1]
-    assert {total for _, total in seen} == {seen[0][1]}
-    assert all(a[0] <= b[0] for a, b in itertools.pairwise(seen))
-
-
 def test_candidates_that_there_is_no_time_for_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(LoopQuestion, "_default", lambda self: ["window+kalman"])
     answer = tuned(tmp_path, arms=None, minutes=1e-6)
     assert [result.name for result in answer.results] == ["brightest", "window"]
-    assert "beyond the 1e-06 that were given" in answer.left_out["window+kalman"]
-    # Started again, everything before is there and takes no time.
-    answer = tuned(tmp_path, arms=None, minutes=1e-6)
+    assert "of the 1e-06 minutes" in answer.left_out["window+kalman"]
+    answer = tuned(tmp_path, arms=None, minutes=5.0)
     assert answer.results[-1].name == "window+kalman"
 
 
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
     tuned(tmp_path, arms=())
     other = LoopQuestion(small().replace("camera", read_noise_e=5.0), magnitudes=(9.0, 11.0), arms=())
-    with pytest.raises(InputError, match=r"tuning\.zarr"):
+    with pytest.raises(InputError, match=r"magnitude-tuning\.zarr"):
         tune_loop(other, tmp_path, plan=PLAN, place=HERE)
     answer = tune_loop(other, tmp_path, plan=PLAN, place=HERE, overwrite=True)
     assert answer.question is other
-
-
-def test_the_search_climbs_to_the_best_and_looks_at_nothing_twice() -> None:
-    tuned_values = {
-        "gain": Tunable((1, 2, 3, 4, 5, 6, 7), (2, 4, 6)),
-        "width": Tunable((1.0, 2.0, 3.0, 4.0), (1.0, 3.0)),
-    }
-    seen: list[tuple[Any, ...]] = []
-
-    def score(choice: Any) -> float:
-        seen.append((choice["gain"], choice["width"]))
-        return -float((choice["gain"] - 7) ** 2 + (choice["width"] - 2.0) ** 2)
-
-    assert best_choice(tuned_values, score) == {"gain": 7, "width": 2.0}
-    assert len(seen) == len(set(seen)) < 14
 
 
 def test_values_at_the_end_of_what_was_on_offer() -> None:
@@ -128,11 +103,3 @@ def test_bad_input(tmp_path: Path) -> None:
         LoopPlan(fluxes=2)
     with pytest.raises(InputError, match=r"plan\.frames = 60"):
         LoopPlan(frames=60)
-
-
-def test_sizes_are_of_work_that_grows_with_the_frames() -> None:
-    tune, score, learn = loop_tuning.LoopPlan().sizes(small())
-    longer = LoopPlan(frames=2 * LoopPlan().frames).sizes(small())
-    assert longer[0] == tune
-    assert longer[1] > score
-    assert learn > score

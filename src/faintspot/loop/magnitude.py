@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +20,7 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.trained import Trained
 from faintspot.estimators.window import Window
-from faintspot.loop.arms import LOOP_GAIN, ArmKind, Choice, arm_kind, default_arms
+from faintspot.loop.arms import ArmKind, Choice, arm_kind, default_arms
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.files import MAGNITUDE_FILE, make_folder
 from faintspot.loop.results import MagnitudeResult
@@ -270,7 +271,7 @@ def _gathered(
         of("strehl"),
         of("centroid_gain"),
         of("settings")[:, :, 0],
-        np.array([[choices[kind.name, flux][LOOP_GAIN] for flux in fluxes] for kind in kinds]),
+        np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
         of("psf").mean(axis=2),
         configuration.to_text(),
     )

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Sequence
-
-import numpy as np
 
 from faintspot.compare.statistics import paired_mean
 from faintspot.loop.analysis import (
@@ -17,6 +16,7 @@ from faintspot.loop.analysis import (
     seeing_of_sets,
     strehl_table,
 )
+from faintspot.loop.arms import LOOP_GAIN
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
 from faintspot.loop.values_with_errors import gain_in_words, in_words, with_error
 from faintspot.report.page import Table
@@ -166,7 +166,7 @@ def settings_table(result: MagnitudeResult) -> Table:
     rows = [
         [
             label,
-            *(_settings_words(*each) for each in zip(result.gains[arm], result.settings[arm], strict=True)),
+            *(_settings_words(*each) for each in zip(result.choices[arm], result.settings[arm], strict=True)),
         ]
         for arm, label in enumerate(result.labels)
     ]
@@ -177,11 +177,11 @@ def settings_table(result: MagnitudeResult) -> Table:
     )
 
 
-def _settings_words(gain: float, text: str) -> str:
+def _settings_words(choice: str, text: str) -> str:
     """Return tuned values as one line."""
     if not text:
         return "not tuned yet"
-    parts = [f"gain {gain:.2g}"] if np.isfinite(gain) else []
+    parts = [f"gain {json.loads(choice)[LOOP_GAIN]:.2g}"]
     for options in tomllib.loads(text).values():
         parts += [_value_words(name, value) for name, value in options.items() if name != "name"]
     return ", ".join(parts)

@@ -101,7 +101,7 @@ class MagnitudeResult(Stored):
     """Strehl ratio against the star's light: A arms, F fluxes, R realisations of the air."""
 
     WHAT: ClassVar[str] = "a magnitude experiment"
-    FORMAT: ClassVar[int] = 2
+    FORMAT: ClassVar[int] = 3
 
     names: tuple[str, ...]
     """(A,): of the arms, see `faintspot.loop.arms.arm_kind`."""
@@ -117,8 +117,8 @@ class MagnitudeResult(Stored):
     """(A, F, R)"""
     settings: NDArray[np.str_]
     """(A, F): TOML text of the tuned settings; "" where not tuned yet."""
-    gains: Floats
-    """(A, F): loop gain."""
+    choices: NDArray[np.str_]
+    """(A, F): JSON text of the tuned values, loop gain included; "{}" where not tuned yet."""
     psf: NDArray[np.float32]
     """(A, F, p, p): long-exposure image, mean over realisations; 1 at the peak of a flat wavefront's."""
     configuration: str
