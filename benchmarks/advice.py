@@ -18,7 +18,7 @@ from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gai
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
 from faintspot.advice.simulated import frames_of_record, seen_in_record
 from faintspot.compare.statistics import paired_mean
-from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.calibration import flat_psf, reference_slopes
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import ARCSEC
@@ -31,20 +31,20 @@ REALISATIONS, FRAMES, TURN, IMAGES_EVERY = 4, 1600, 100, 20
 PHOTONS = 100.0, 300.0
 
 
-def _arms(photons: float, width_px: float) -> dict[str, LoopArm]:
+def _arms(photons: float, width_px: float) -> dict[str, Arm]:
     window = Settings("window", flux_e=photons, window_fwhm_px=2.8 * width_px, centroid_gain=0.3)
     predicted: dict[str, Any] = {"correct_gain": False, "predict_prior": True}
     probable = Settings("map", flux_e=photons, prior_std_px=0.6)
     return {
-        "window, gain 0.4": LoopArm("-", window, 0.4, correct_gain=False),
-        "window, gain 0.2": LoopArm("-", window, 0.2, correct_gain=False),
-        "brightest, gain 0.4": LoopArm("-", Settings("brightest"), 0.4, correct_gain=False),
-        "map, gain 0.4": LoopArm("-", probable, 0.4, **predicted),
-        "narrow window, gain 0.4": LoopArm("-", Settings("window", flux_e=photons), 0.4, correct_gain=False),
+        "window, gain 0.4": Arm("-", window, 0.4, correct_gain=False),
+        "window, gain 0.2": Arm("-", window, 0.2, correct_gain=False),
+        "brightest, gain 0.4": Arm("-", Settings("brightest"), 0.4, correct_gain=False),
+        "map, gain 0.4": Arm("-", probable, 0.4, **predicted),
+        "narrow window, gain 0.4": Arm("-", Settings("window", flux_e=photons), 0.4, correct_gain=False),
     }
 
 
-def merits(configuration: LoopConfiguration, pair: list[LoopArm], realisation: int) -> np.ndarray:
+def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) -> np.ndarray:
     """Return by how much the second arm has more: the loop's figure, the truth, both nm^2, slopes' px^2."""
     schedule = np.arange(FRAMES) // TURN % 2
     run = configuration.replace("run", frames=FRAMES, settle_frames=TURN)

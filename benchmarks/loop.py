@@ -18,7 +18,7 @@ import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
 from faintspot.control.commands import CommandLine
 from faintspot.control.integrator import Integrator
-from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.loop.calibration import make_pipeline
 from faintspot.loop.camera import make_detector
@@ -138,7 +138,7 @@ def parts_table(configuration: LoopConfiguration) -> Table:
     light = optics.sensor.frame(optics.sensor.spots(wavefront)) * configuration.photons
     frame = detector.expose(light, np.random.default_rng(1))
     pipelines = {
-        name: make_pipeline(configuration, optics.sensor, LoopArm(name, settings))
+        name: make_pipeline(configuration, optics.sensor, Arm(name, settings))
         for name, settings in (("brightest", BRIGHTEST), ("TV", TV))
     }
     field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
@@ -165,10 +165,10 @@ def run() -> list[Table]:
     """Time the loop."""
     configuration = load_loop("emccd")
     short = replace(configuration, run=replace(configuration.run, frames=FRAMES))
-    simulate_loop(short, [LoopArm("brightest", BRIGHTEST)])  # makes screens and calibration, compiles
-    arms = {"brightest": LoopArm("brightest", BRIGHTEST), "TV": LoopArm("TV", TV)}
+    simulate_loop(short, [Arm("brightest", BRIGHTEST)])  # makes screens and calibration, compiles
+    arms = {"brightest": Arm("brightest", BRIGHTEST), "TV": Arm("TV", TV)}
 
-    def runs(arm: LoopArm) -> Any:
+    def runs(arm: Arm) -> Any:
         return lambda: simulate_loop(short, [arm])
 
     with pinned():

@@ -33,7 +33,7 @@ from faintspot.control.configuration import Control, ControlOptions, load_contro
 from faintspot.control.learnt import CONTROLS, KALMAN, POLC, Model
 from faintspot.control.models import SlopeModel
 from faintspot.kernels.compiling import Direct
-from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.control import slope_turbulence
 from faintspot.loop.engine_files import write_engine_files
 from faintspot.loop.observatory import prepare
@@ -199,7 +199,7 @@ def _observed(name: str, telescope: subprocess.Popen[bytes]) -> np.ndarray[Any, 
 
 
 def compared(
-    configuration: LoopConfiguration, arm: LoopArm, realisations: int = REALISATIONS
+    configuration: LoopConfiguration, arm: Arm, realisations: int = REALISATIONS
 ) -> dict[str, float]:
     """Return mean Strehl ratios of the engine's loop and of the simulated one, and their difference."""
     strehl = np.zeros((2, realisations))
@@ -239,9 +239,9 @@ def _loop() -> Table:
     flux_e = configuration.photons
     predicting = Settings("map", flux_e=flux_e, prior_std_px=1.0)  # the filter says how wide
     arms = [
-        LoopArm("30 brightest pixels, integrator", Settings("brightest", keep_brightest=30), 0.4),
-        LoopArm("fixed window, integrator", Settings("window", flux_e=flux_e), 0.4),
-        LoopArm(
+        Arm("30 brightest pixels, integrator", Settings("brightest", keep_brightest=30), 0.4),
+        Arm("fixed window, integrator", Settings("window", flux_e=flux_e), 0.4),
+        Arm(
             "maximum a posteriori, Kalman filter",
             predicting,
             0.3,

@@ -34,7 +34,7 @@ from faintspot.advice.simulated import frames_of_record, seen_in_record
 from faintspot.advice.trial import compared
 from faintspot.compare.statistics import mean_by_blocks
 from faintspot.control.learnt import Plant
-from faintspot.loop import LoopArm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.calibration import flat_psf, reference_slopes
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import ARCSEC
@@ -61,11 +61,11 @@ def night(stretches: int) -> list[LoopConfiguration]:
     return told
 
 
-def arm(settings: Settings, gain: float, loop: LoopConfiguration) -> LoopArm:
+def arm(settings: Settings, gain: float, loop: LoopConfiguration) -> Arm:
     """Return an arm with some settings in the light of a stretch, which all follow."""
     if settings.estimator.uses_light:
         settings = settings.replace(flux_e=loop.photons)
-    return LoopArm("-", settings, gain, correct_gain=False)
+    return Arm("-", settings, gain, correct_gain=False)
 
 
 def fixed_settings(loop: LoopConfiguration) -> list[tuple[Settings, float]]:
@@ -95,14 +95,12 @@ def sensor_of(loop: LoopConfiguration, settings: Settings) -> Sensor:
         "subaperture_m": loop.subaperture_m,
         "pixel_scale_arcsec": loop.pixel_scale_rad / ARCSEC,
     }
-    reference = reference_slopes(loop, sensor, LoopArm("-", settings)).astype(np.float64)
+    reference = reference_slopes(loop, sensor, Arm("-", settings)).astype(np.float64)
     psf = flat_psf(loop.spot_width_px, 1.0)
     return Sensor(replace(sensor.layout, **sizes), camera_calibration(loop), psf, None, reference)
 
 
-def observed(
-    loop: LoopConfiguration, frames: int, arms: list[LoopArm], schedule: Any, realisation: int
-) -> Any:
+def observed(loop: LoopConfiguration, frames: int, arms: list[Arm], schedule: Any, realisation: int) -> Any:
     """Run a stretch."""
     run = loop.replace("run", frames=frames, settle_frames=SETTLE)
     return simulate_loop(run, arms, schedule[:frames], realisation=realisation)
@@ -161,7 +159,7 @@ def tuned_night(
     return np.array(strehl), journal
 
 
-def planned(images: Any, seen: Seen, sensor: Sensor, present: LoopArm, answers: float) -> list[Proposal]:
+def planned(images: Any, seen: Seen, sensor: Sensor, present: Arm, answers: float) -> list[Proposal]:
     """Ask the planner, with what the images of a stretch tell."""
     known, psf = of_images(images, sensor.layout, sensor.calibration)
     residual, _ = seen.weighted([answers])
@@ -169,9 +167,7 @@ def planned(images: Any, seen: Seen, sensor: Sensor, present: LoopArm, answers: 
     return new_estimators(present.settings, sensor, images, known[0].value, psf, rms, answers)
 
 
-def verdict(
-    record: Any, arms: list[LoopArm], loop: LoopConfiguration, modes: Any, turns: Any, end: int
-) -> Any:
+def verdict(record: Any, arms: list[Arm], loop: LoopConfiguration, modes: Any, turns: Any, end: int) -> Any:
     """Say which of two arms in turn has left less before a frame."""
     whole = seen_in_record(record, arms)
     seen = whole.chosen(np.arange(len(whole)) < end - SETTLE)

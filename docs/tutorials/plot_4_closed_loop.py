@@ -14,7 +14,7 @@ times: same air, same photons, other slopes and other control.
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.loop import LoopArm, load_loop, simulate_loop
+from faintspot.loop import Arm, load_loop, simulate_loop
 
 loop = load_loop("diffraction_limit").replace("camera", photons_per_subaperture=20.0)
 loop = loop.replace("run", frames=400, settle_frames=80).replace("control", telemetry_frames=1000)
@@ -23,10 +23,10 @@ window = fs.Settings("window", window_fwhm_px=1.3 * loop.spot_width_px, flux_e=2
 posterior = fs.Settings("map", prior_std_px=0.7, flux_e=20.0)
 
 arms = [
-    LoopArm("brightest pixels", fs.Settings("brightest", keep_brightest=20), gain=0.1),
-    LoopArm("fixed window", window, gain=0.4),
-    LoopArm("maximum a posteriori", posterior, gain=0.4, predict_prior=True, correct_gain=False, psf=psf),
-    LoopArm(
+    Arm("brightest pixels", fs.Settings("brightest", keep_brightest=20), gain=0.1),
+    Arm("fixed window", window, gain=0.4),
+    Arm("maximum a posteriori", posterior, gain=0.4, predict_prior=True, correct_gain=False, psf=psf),
+    Arm(
         "the same, Kalman filter",
         posterior,
         gain=0.3,

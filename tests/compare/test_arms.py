@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from faintspot import PSF
-from faintspot.compare.arms import Arm, Knowledge, arm_for_scene, tuned_options
+from faintspot.compare.arms import Knowledge, arm_for_scene, tuned_options
 from faintspot.estimators import Scene, estimators
-from faintspot.settings import Settings
 
 SCENE = Scene(flux_e=123.456, read_noise_e=3.0, window=(12, 12), spot_fwhm_px=1.77, position_range_px=1.0)
 WITHOUT_OPTIONS = ("centroid", "trained")
@@ -17,9 +16,9 @@ WITHOUT_OPTIONS = ("centroid", "trained")
 def test_every_estimator_is_made_for_a_scene(name: str) -> None:
     kind = estimators()[name]
     arm = arm_for_scene(kind, SCENE, psf=PSF.analytic())
-    assert (arm.name, arm.label, arm.style) == (name, kind.label, kind.style)
+    assert (arm.name, arm.label) == (name, kind.label)
     assert arm.settings.search_range_px == 1.0
-    assert (arm.psf is None) == (arm.knowledge < Knowledge.SPOT or name == "trained")
+    assert (arm.psf is None) == (Knowledge.of(arm.estimator) < Knowledge.SPOT or name == "trained")
     options = tuned_options(arm, SCENE)
     for option, values in options.items():
         changed = arm.with_options({option: values[-1]})
@@ -47,8 +46,3 @@ def test_speckled_spots_are_blurred_or_doubted() -> None:
     arm = arm_for_scene(estimators()["ml"], speckled)
     assert set(tuned_options(arm, speckled)) == {"blur_px", "model_error"}
     assert tuned_options(arm, SCENE) == {}
-
-
-def test_a_title_replaces_the_label() -> None:
-    assert Arm(Settings("brightest"), title="mine").label == "mine"
-    assert Arm(Settings("brightest")).parts == {"psf": None, "score": None}

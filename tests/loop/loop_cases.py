@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import faintspot as fs
-from faintspot.loop import LoopArm, LoopConfiguration
+from faintspot.loop import Arm, LoopConfiguration
 from faintspot.loop.configuration import Camera
 
 PLAIN = fs.Settings("brightest", keep_brightest=80)
@@ -23,9 +23,9 @@ def faint() -> LoopConfiguration:
     return quiet().replace("camera", photons_per_subaperture=200.0, read_noise_e=1.0)
 
 
-def plain(label: str = "plain") -> LoopArm:
+def plain(label: str = "plain") -> Arm:
     """Brightest pixels and centre of gravity."""
-    return LoopArm(label, PLAIN)
+    return Arm(label, PLAIN)
 
 
 def expected_variance(amplitude: np.ndarray, spacing_m: float, r0_m: float, outer_scale_m: float) -> float:

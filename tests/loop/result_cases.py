@@ -9,7 +9,7 @@ import numpy as np
 
 import faintspot as fs
 from faintspot.configuration import to_text
-from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
+from faintspot.loop import Arm, LoopConfiguration, simulate_loop
 from faintspot.loop.configuration import Camera
 from faintspot.loop.results import BudgetResult, InterleavedResult, MagnitudeResult
 
@@ -34,9 +34,9 @@ def small_interleaved() -> InterleavedResult:
     schedule = np.tile(np.repeat(np.arange(len(STRENGTHS)), BLOCK), CYCLES)
     configuration = configuration.replace("run", frames=len(schedule), settle_frames=20)
     arms = [
-        LoopArm("no TV", fs.Settings("brightest", keep_brightest=80))
+        Arm("no TV", fs.Settings("brightest", keep_brightest=80))
         if np.isnan(strength)
-        else LoopArm(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
+        else Arm(f"TV {strength:g}", fs.Settings(noise_std=strength, keep_brightest=80))
         for strength in STRENGTHS
     ]
     records = tuple(simulate_loop(configuration, arms, schedule, realisation=number) for number in range(2))

@@ -12,7 +12,7 @@ from faintspot.errors import InputError
 from faintspot.estimators import registry
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.registry import estimators, register
-from faintspot.loop.arms import LOOP_GAIN, arm_kind, default_arms
+from faintspot.loop.arm_kinds import LOOP_GAIN, arm_kind, default_arms
 from faintspot.loop.simulation import simulate_loop
 from faintspot.options import option
 

@@ -9,7 +9,7 @@ from tests.loop.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_fi
 
 from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
-from faintspot.loop.arms import LOOP_GAIN, arm_kind
+from faintspot.loop.arm_kinds import LOOP_GAIN, arm_kind
 from faintspot.loop.budget import TERMS, budget_run, run_budget
 from faintspot.loop.files import BUDGET_FILE
 from faintspot.loop.results import BudgetResult

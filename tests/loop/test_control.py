@@ -9,8 +9,9 @@ from tests.loop.experiment_cases import small
 import faintspot as fs
 from faintspot.control.learning import CONTROLS, INTEGRATOR
 from faintspot.errors import InputError
-from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
-from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, PRIOR, arm_kind
+from faintspot.loop import Arm, LoopConfiguration, simulate_loop
+from faintspot.loop.arm_kinds import LOOP_GAIN, NOISE_SCALE, arm_kind
+from faintspot.loop.arms import PRIOR
 from faintspot.loop.control import learnt_control, telemetry_of
 from faintspot.loop.observatory import prepare
 from faintspot.loop.simulation import Idealised
@@ -25,14 +26,14 @@ FAINT = (
 MAP = fs.Settings("map", prior_std_px=0.5)
 
 
-def _arm(control: str = INTEGRATOR, gain: float = 0.4) -> LoopArm:
-    return LoopArm("map", MAP, gain, predict_prior=True, correct_gain=False, control=control)
+def _arm(control: str = INTEGRATOR, gain: float = 0.4) -> Arm:
+    return Arm("map", MAP, gain, predict_prior=True, correct_gain=False, control=control)
 
 
 def test_the_integrator_is_the_recursion() -> None:
     """To the last bit: every command is the one before and what the reconstructor makes of the slopes."""
     configuration = FAINT.replace("run", frames=80, settle_frames=20)
-    arm = LoopArm("plain", fs.Settings("brightest", keep_brightest=20), gain=0.35)
+    arm = Arm("plain", fs.Settings("brightest", keep_brightest=20), gain=0.35)
     record = simulate_loop(configuration, [arm])
     reconstructor, latest = prepare(configuration).reconstructor, np.zeros(record.commands.shape[1])
     for frame in range(record.frames - 2):
@@ -49,7 +50,7 @@ def test_never_below_the_integrator(told: float, kinds: list[str]) -> None:
     """
     configuration = FAINT.replace("control", told_wind_factor=told, told_wind_turn_deg=90.0 * (told != 1))
 
-    def strehl(arm: LoopArm) -> float:
+    def strehl(arm: Arm) -> float:
         return float(
             np.mean([simulate_loop(configuration, [arm], realisation=r).mean_strehl() for r in range(3)])
         )

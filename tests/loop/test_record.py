@@ -10,7 +10,7 @@ from tests.loop.loop_cases import faint, plain
 
 import faintspot as fs
 from faintspot.errors import InputError
-from faintspot.loop import LoopArm, LoopRecord, simulate_loop
+from faintspot.loop import Arm, LoopRecord, simulate_loop
 
 pytest.importorskip("hcipy")
 
@@ -65,4 +65,4 @@ def test_a_place_that_cannot_be_written_is_named(record: LoopRecord, tmp_path: P
 )
 def test_bad_arms_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"arm\."):
-        LoopArm(**{"label": "a", "settings": fs.Settings("brightest"), **values})
+        Arm(**{"label": "a", "settings": fs.Settings("brightest"), **values})

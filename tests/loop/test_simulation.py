@@ -6,7 +6,7 @@ from tests.loop.loop_cases import PLAIN, expected_variance, faint, plain, quiet
 
 import faintspot as fs
 from faintspot.errors import InputError
-from faintspot.loop import LoopArm, LoopRecord, load_loop, simulate_loop
+from faintspot.loop import Arm, LoopRecord, load_loop, simulate_loop
 from faintspot.loop.atmosphere import make_atmosphere
 from faintspot.loop.calibration import make_pipeline
 from faintspot.loop.mirror import BestFit
@@ -55,7 +55,7 @@ def test_runs_repeat_bit_for_bit(record: LoopRecord) -> None:
 
 
 def test_arms_see_the_same_air_and_photons(record: LoopRecord) -> None:
-    both = [plain(), LoopArm("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
+    both = [plain(), Arm("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
     schedule = np.repeat([0, 1], 100)
     mixed = simulate_loop(faint(), both, schedule)
     np.testing.assert_array_equal(mixed.slopes_px[:100], record.slopes_px[:100])
@@ -77,7 +77,7 @@ def test_slopes_follow_the_interaction_matrix() -> None:
     per cent from the mean gradient in partly lit sub-apertures.
     """
     loop = quiet().replace("run", frames=60)
-    record = simulate_loop(loop, [LoopArm("true", PLAIN, true_slopes=True)], seed=4)
+    record = simulate_loop(loop, [Arm("true", PLAIN, true_slopes=True)], seed=4)
     air, sensor = make_atmosphere(loop, 4), prepare(loop).sensor
     frames = np.arange(20, 60)
     expected = np.array([sensor.mean_slopes_px(air.wavefront_nm((k + 0.5) / 250)) for k in frames])
@@ -93,7 +93,7 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     Aliasing adds up to 0.4 of the fitting variance (Rigaut, Veran & Lai 1998, SPIE 3353, 1038).
     """
     loop = quiet()
-    record = simulate_loop(loop, [LoopArm("true", PLAIN, true_slopes=True, gain=0.5)])
+    record = simulate_loop(loop, [Arm("true", PLAIN, true_slopes=True, gain=0.5)])
     optics, air = prepare(loop), make_atmosphere(loop, loop.run.seed)
     fit = BestFit.of(optics.mirror, optics.pupil)
     fitting, lag = [], []
@@ -119,7 +119,7 @@ def test_without_correction_the_strehl_is_that_of_theory() -> None:
     loop = quiet().replace("atmosphere", r0_m=1.2).replace("control", gain=0.0, frame_rate_hz=5.0)
     loop = loop.replace("run", frames=150, settle_frames=0)
     optics = prepare(loop)
-    arm = LoopArm("none", PLAIN, true_slopes=True)
+    arm = Arm("none", PLAIN, true_slopes=True)
     records = [simulate_loop(loop, [arm], realisation=number) for number in range(3)]
     variance = np.mean([record.residual_nm**2 for record in records]) * (2 * np.pi / 500) ** 2
     expected = expected_variance(optics.pupil.amplitude, optics.pupil.spacing_m, 1.2, 25.0)
@@ -132,8 +132,8 @@ def test_open_loop_control() -> None:
     loop = load_loop("open_loop").replace("run", frames=160, settle_frames=40)
     settings = fs.Settings("brightest", keep_brightest=150)
     bright = loop.replace("camera", photons_per_subaperture=2000.0)
-    corrected = simulate_loop(bright, [LoopArm("corrected", settings)])
-    not_corrected = simulate_loop(bright, [LoopArm("not", settings, correct_gain=False)])
+    corrected = simulate_loop(bright, [Arm("corrected", settings)])
+    not_corrected = simulate_loop(bright, [Arm("not", settings, correct_gain=False)])
     assert corrected.mean_strehl() > 0.5
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
     assert not corrected.closed
@@ -146,7 +146,7 @@ def test_centroid_gain_falls_with_noise_and_brightest_pixels() -> None:
     for photons, noise, kept in ((1e5, 0.0, 255), (200.0, 1.0, 80), (200.0, 3.0, 20)):
         camera = {"photons_per_subaperture": photons, "read_noise_e": noise}
         case = loop.replace("camera", **camera)
-        arm = LoopArm("k", fs.Settings("brightest", keep_brightest=kept))
+        arm = Arm("k", fs.Settings("brightest", keep_brightest=kept))
         pipeline = make_pipeline(case, prepare(case).sensor, arm)
         gains.append(measure_gains(case, [pipeline], seed=1)[0])
     assert gains[0] == pytest.approx(0.93, abs=0.06)  # wings beyond the window
@@ -157,7 +157,7 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
     loop = faint().replace("camera", read_noise_e=3.0, photons_per_subaperture=400.0)
     settings = fs.Settings("brightest", keep_brightest=80)
     corrected, not_corrected = (
-        simulate_loop(loop, [LoopArm("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
+        simulate_loop(loop, [Arm("k", settings, gain=0.3, correct_gain=flag)]) for flag in (True, False)
     )
     assert corrected.centroid_gain[0] < 0.8
     assert corrected.mean_strehl() > not_corrected.mean_strehl()
@@ -166,18 +166,18 @@ def test_gain_correction_makes_a_loop_of_low_gain_as_fast() -> None:
 @pytest.mark.parametrize(
     "arm",
     [
-        LoopArm(
+        Arm(
             "ml", fs.Settings(estimator="ml", search_range_px=4, model_error=0.3), weighted_reconstructor=True
         ),
-        LoopArm("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
-        LoopArm("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
-        LoopArm("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
-        LoopArm("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
-        LoopArm("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
+        Arm("map", fs.Settings(estimator="map", prior_std_px=1.0, model_error=0.3), predict_prior=True),
+        Arm("weighted", fs.Settings(estimator="weighted", search_range_px=4)),
+        Arm("smoothed", fs.Settings(estimator="smoothed", keep_brightest=80)),
+        Arm("window", fs.Settings("brightest", keep_brightest=50), window_pixels=10),
+        Arm("auto", fs.Settings(noise_std="auto", keep_brightest="auto")),
     ],
     ids=lambda arm: arm.label,
 )
-def test_every_kind_of_arm_closes_the_loop(arm: LoopArm) -> None:
+def test_every_kind_of_arm_closes_the_loop(arm: Arm) -> None:
     loop = load_loop("diffraction_limit").replace("run", frames=100, settle_frames=40)
     record = simulate_loop(loop.replace("camera", photons_per_subaperture=400.0), [arm])
     assert record.mean_strehl() > 0.3
@@ -185,7 +185,7 @@ def test_every_kind_of_arm_closes_the_loop(arm: LoopArm) -> None:
 
 def test_invalid_sub_apertures_do_no_harm() -> None:
     loop = faint().replace("run", frames=60)
-    arm = LoopArm("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))
+    arm = Arm("nothing", fs.Settings(estimator="thresholded", threshold_e=1e6))
     record = simulate_loop(loop, [arm])
     assert not record.valid.any()
     np.testing.assert_array_equal(record.commands, 0)
@@ -198,10 +198,10 @@ def test_invalid_sub_apertures_do_no_harm() -> None:
         ([plain()], [0, 1], "schedule = 1"),
         ([plain()], [[0]], "schedule"),
         ([plain()] * 2, [0.5], "whole number"),
-        ([LoopArm("wide", PLAIN, window_pixels=20)], [0], "window_pixels = 20"),
+        ([Arm("wide", PLAIN, window_pixels=20)], [0], "window_pixels = 20"),
     ],
 )
-def test_impossible_runs_are_refused(arms: list[LoopArm], schedule: object, message: str) -> None:
+def test_impossible_runs_are_refused(arms: list[Arm], schedule: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         simulate_loop(faint(), arms, schedule)  # type: ignore[arg-type]
 

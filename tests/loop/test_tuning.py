@@ -8,7 +8,7 @@ from tests.loop.experiment_cases import SEARCH, small
 
 from faintspot.errors import InputError
 from faintspot.loop import tuning
-from faintspot.loop.arms import LOOP_GAIN, arm_kind
+from faintspot.loop.arm_kinds import LOOP_GAIN, arm_kind
 from faintspot.loop.tuning import FIRST_TUNING_REALISATION, Search, stored_choice, tune, tuning_unit
 
 BRIGHTEST = arm_kind("brightest")

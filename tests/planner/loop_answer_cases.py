@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, arm_kind
+from faintspot.loop.arm_kinds import LOOP_GAIN, NOISE_SCALE, arm_kind
 from faintspot.loop.configuration import LoopConfiguration, load_loop
 from faintspot.planner.loop_answer import LoopAnswer, LoopArmResult
 from faintspot.planner.loop_question import LoopQuestion

@@ -9,7 +9,7 @@ from tests.loop.experiment_cases import HERE, StopsAfter, assert_same_units, sma
 
 from faintspot.compare.running import Workplace
 from faintspot.errors import InputError
-from faintspot.loop.arms import LOOP_GAIN, arm_kind
+from faintspot.loop.arm_kinds import LOOP_GAIN, arm_kind
 from faintspot.loop.tuning import Search
 from faintspot.planner.loop_answer import LoopAnswer
 from faintspot.planner.loop_question import LoopQuestion

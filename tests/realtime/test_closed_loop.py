@@ -18,7 +18,7 @@ from faintspot import configuration as configuration_file
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import Control
 from faintspot.errors import InputError
-from faintspot.loop import LoopArm, simulate_loop
+from faintspot.loop import Arm, simulate_loop
 from faintspot.loop.observatory import Observatory
 from faintspot.realtime.commands import commands_of, loop_command
 from faintspot.realtime.control import request
@@ -45,7 +45,7 @@ def test_the_loop_is_the_simulated_one(sky: Sky, files: tuple[Path, Control]) ->
     path, control = files
     settings = configuration_file.load_all(path).settings
     run = CONFIGURATION.replace("run", frames=FRAMES, settle_frames=10)
-    record = simulate_loop(run, [LoopArm("-", settings, gain=control.options.gain)])
+    record = simulate_loop(run, [Arm("-", settings, gain=control.options.gain)])
     sky.start(make_engine(sky.name, path, control))
     sky.loop.close()
     strehl = sky.frames(FRAMES)

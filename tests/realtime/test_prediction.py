@@ -13,7 +13,7 @@ import pytest
 import faintspot as fs
 from faintspot import configuration as configuration_file
 from faintspot.control.configuration import Control
-from faintspot.loop import LoopArm, simulate_loop
+from faintspot.loop import Arm, simulate_loop
 from faintspot.loop.control import learnt_control
 from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prior import Prior
@@ -38,7 +38,7 @@ def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path)
     run = run.replace("run", frames=FRAMES, settle_frames=10)
     path, control = configured(tmp_path, SETTINGS, run, "kalman")
     assert (control.prediction, control.options.centroid_gain) == ("controller", 1.0)
-    arm = LoopArm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
+    arm = Arm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
     told, _ = learnt_control(run, arm, run.run.seed)  # the first frame's prior, too, is as wide
     record = simulate_loop(run, [arm])
     sky.start(make_engine(sky.name, path, control, settings=told.settings))

@@ -449,7 +449,7 @@ def test_files_keep_what_else_there_is(tmp_path: Path) -> None:
     assert (len(known.layout), known.calibration.read_noise_e) == (36, 1.0)
     reference = np.load(tmp_path / "reference_slopes.npy")
     assert reference.shape == (72,)
-    arm = faintspot.loop.LoopArm("-", known.settings)
+    arm = faintspot.loop.Arm("-", known.settings)
     sensor = Observatory(CONFIGURATION, 1).optics.sensor
     frame = sensor.frame(sensor.spots(np.zeros((sensor.points,) * 2, np.float32))) * 1e6
     plain_slopes = fs.SlopePipeline(known.layout, known.settings, fs.Calibration(0.0), reference)(frame)

@@ -16,6 +16,7 @@ from faintspot.report import drawing
 from faintspot.study import estimators
 from faintspot.study.efficiency import compares_estimators, enough_photons, findings, markdown
 from faintspot.study.estimator_figures import estimator_figures
+from faintspot.study.page import write_study_report
 from faintspot.study.sweep import Cell
 
 ARMS = ("brightest", "tv", "ml", "map", "weighted")
@@ -44,11 +45,11 @@ def test_full_study_has_the_reference_cases() -> None:
         camera = (given["elong"], given["n"], given["rng_px"], 0.0, 1.0)
         wanted.add(Cell(float(given["flux"]), given["rn"], profile, given["size"], *camera))
     assert len(wanted) == 24
-    assert wanted <= set(estimators.specification().cells())
+    assert wanted <= set(estimators.estimators_study().cells())
 
 
 def test_cost_is_bounded() -> None:
-    full, quick = estimators.specification().cells(), estimators.specification(quick=True).cells()
+    full, quick = estimators.estimators_study().cells(), estimators.estimators_study(quick=True).cells()
     assert len(full) <= 120
     assert sum(cell.d_over_r0 > 0 for cell in full) <= 40
     assert len(quick) <= 15
@@ -119,12 +120,12 @@ def test_other_studies_do_not_compare_estimators() -> None:
 def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
     monkeypatch.setattr(drawing, "svg", lambda figure: b"")  # another drawing, as slow
-    specification = estimators.specification(quick=True)
+    specification = estimators.estimators_study(quick=True)
     quick = [asdict(cell) for cell in specification.cells()]
     few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]
     data = dataset(few, error, arms=ARMS)
     data.attrs["specification"] = specification.to_text()
-    written = estimators.report(data, tmp_path / "study.html")
+    written = write_study_report(data, tmp_path / "study.html")
     assert (tmp_path / "study-figures" / "turbulence-diffraction.csv") in written
     html = written[0].read_text(encoding="utf-8")
     assert "What was found" in html

@@ -31,7 +31,7 @@ def of(specification: StudySpecification, **options: Any) -> Any:
 
 class TestPage:
     def test_is_complete_and_in_order(self) -> None:
-        html = study_report(of(paper.specification(quick=True)))
+        html = study_report(of(paper.paper_study(quick=True)))
         sections = re.findall(r'<section id="([^"]+)"', html)
         assert sections[:4] == ["verdicts", "guidance", "baselines", "gains"]
         assert sections[4:11] == ["fig1", "fig2", "fig3", "fig4", "fig5", "fig6", "fig7"]
@@ -43,14 +43,14 @@ class TestPage:
         parser.close()
 
     def test_needs_nothing_else(self) -> None:
-        html = study_report(of(paper.specification(quick=True, figures=["fig3"])))
+        html = study_report(of(paper.paper_study(quick=True, figures=["fig3"])))
         links = re.findall(r'(?:href|src)="([^"]*)"', html)
         assert links
         assert all(link.startswith(("data:", "#")) for link in links)
         assert "<script" not in html
 
     def test_of_an_unfinished_study_says_so(self) -> None:
-        data = of(paper.specification(quick=True), unfinished=tuple(range(1, 40)))
+        data = of(paper.paper_study(quick=True), unfinished=tuple(range(1, 40)))
         html = study_report(data)
         assert "This study is not finished" in html
         assert "39 cells are still missing" in html
@@ -64,7 +64,7 @@ class TestPage:
         assert "my &lt;study&gt;" in html
 
     def test_of_arms_without_tv_has_no_verdict(self) -> None:
-        data = of(paper.specification(quick=True, figures=["fig3"]))
+        data = of(paper.paper_study(quick=True, figures=["fig3"]))
         html = study_report(data.sel(arm=["brightest", "smoothed"], arm2=["brightest", "smoothed"]))
         assert "No verdicts" in html
 
@@ -72,14 +72,14 @@ class TestPage:
 def test_pictures_are_svg_without_the_time_of_day() -> None:
     from faintspot.study.figures import sweep_figure
 
-    data = of(paper.specification(quick=True, figures=["fig3"]))
+    data = of(paper.paper_study(quick=True, figures=["fig3"]))
     first, second = (svg(sweep_figure(data, [0, 1], "a", "b").figure) for _ in range(2))
     assert first == second
     assert b"<svg" in first
 
 
 def test_study_without_a_finished_cell_is_refused() -> None:
-    data = of(paper.specification(quick=True, figures=["fig3"]))
+    data = of(paper.paper_study(quick=True, figures=["fig3"]))
     data["done"][:] = False
     with pytest.raises(InputError, match="none of its 8 cells is finished"):
         study_report(data)

@@ -11,10 +11,11 @@ from tests.study.study_cases import dataset, power_law
 from faintspot.errors import InputError
 from faintspot.report import drawing
 from faintspot.study import paper
+from faintspot.study.page import write_study_report
 
 
 def test_full_study_has_every_figure_of_the_paper() -> None:
-    specification = paper.specification()
+    specification = paper.paper_study()
     names = {sweep.name.split()[0] for sweep in specification.sweeps}
     assert names == {"fig2", "fig3", "fig4", "fig5", "fig6", "fig7"}
     cells = specification.cells()
@@ -29,14 +30,14 @@ def test_full_study_has_every_figure_of_the_paper() -> None:
 
 def test_cost_is_bounded() -> None:
     """In cells of 16 x 16 px, on which the time of a study depends."""
-    assert sum(cell.pixels**2 / 256 for cell in paper.specification().cells()) <= 350
-    assert len(paper.specification(quick=True).cells()) <= 40
+    assert sum(cell.pixels**2 / 256 for cell in paper.paper_study().cells()) <= 350
+    assert len(paper.paper_study(quick=True).cells()) <= 40
 
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(quick: bool) -> None:
     others = [name for name in paper.FIGURES if name != "fig5"]
-    with_it, without = paper.specification(quick), paper.specification(quick, others)
+    with_it, without = paper.paper_study(quick), paper.paper_study(quick, others)
     extra = set(with_it.cells()) - set(without.cells())
     assert {(cell.flux_e, cell.read_noise_e) for cell in extra} == (set() if quick else {(50, 16)})
 
@@ -44,7 +45,7 @@ def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(q
 @pytest.mark.parametrize("name", paper.FIGURES)
 @pytest.mark.parametrize("quick", [False, True])
 def test_one_figure(name: str, quick: bool) -> None:
-    sweeps = paper.specification(quick, [name]).sweeps
+    sweeps = paper.paper_study(quick, [name]).sweeps
     assert sweeps
     assert all(sweep.name.startswith(name) for sweep in sweeps)
 
@@ -55,18 +56,18 @@ def test_one_figure(name: str, quick: bool) -> None:
 )
 def test_bad_figures_are_refused(figures: list[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        paper.specification(figures=figures)
+        paper.paper_study(figures=figures)
 
 
 def test_report_writes_page_pictures_and_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
-    specification = paper.specification(quick=True, figures=["fig3"])
+    specification = paper.paper_study(quick=True, figures=["fig3"])
     data = dataset([asdict(cell) for cell in specification.cells()], power_law(lambda *_: 1.0))
     data.attrs["specification"] = specification.to_text()
-    written = paper.report(data, tmp_path / "study.html")
+    written = write_study_report(data, tmp_path / "study.html")
     names = [path.relative_to(tmp_path).as_posix() for path in written]
     assert names[0] == "study.html"
     assert {"study-figures/fig1.png", "study-figures/fig3.svg", "study-figures/fig3.csv"} <= set(names)
     assert all(path.stat().st_size > 100 for path in written)
     with pytest.raises(InputError, match="does not exist"):
-        paper.report(data, tmp_path / "nowhere" / "study.html")
+        write_study_report(data, tmp_path / "nowhere" / "study.html")

@@ -21,7 +21,7 @@ Gain = Callable[[Cell, str, str], float]
 
 
 def quick_cells() -> list[Cell]:
-    return [asdict(cell) for cell in paper.specification(quick=True).cells()]
+    return [asdict(cell) for cell in paper.paper_study(quick=True).cells()]
 
 
 def study(gain: Callable[[Cell], float], every: list[Cell] | None = None, **options: Any) -> Any:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import electrons_of
 from faintspot.advice.seen import Seen, without_priors
-from faintspot.loop.arms import LoopArm
+from faintspot.loop.arms import Arm
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.control import prior_std_px
@@ -17,7 +17,7 @@ from faintspot.loop.observatory import Observatory
 from faintspot.loop.record import LoopRecord
 
 
-def seen_in_record(record: LoopRecord, arms: Sequence[LoopArm]) -> Seen:
+def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> Seen:
     """Return what a simulated loop has seen after settling; its slopes divided as the loop does it."""
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
     later, arm = record.delay_frames - 1, record.arm.astype(np.int64)

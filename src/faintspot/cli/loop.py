@@ -249,7 +249,7 @@ def _listed(text: str) -> list[str]:
 
 def _arms(text: str) -> list[str]:
     """Return the arms that are asked for; say of those that could be told a prediction that they are not."""
-    from faintspot.loop.arms import arm_kind
+    from faintspot.loop.arm_kinds import arm_kind
 
     names = _listed(text)
     for name in names:

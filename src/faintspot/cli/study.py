@@ -122,13 +122,14 @@ def paper(
       faintspot study paper -o paper.zarr
       faintspot study paper --figure fig4 --figure fig6
     """
-    from faintspot.study import paper as study_of_paper
+    from faintspot.study.page import write_study_report
+    from faintspot.study.paper import paper_study
 
-    described = study_of_paper.specification(quick, figures or None)
+    described = paper_study(quick, figures or None)
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
     results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = derived(target, ".html")
-    study_of_paper.report(results, page)
+    write_study_report(results, page)
     click.echo(f"{page}: open it in a browser")
 
 
@@ -161,14 +162,15 @@ def estimators(
       faintspot study estimators --quick
       faintspot study estimators -o estimators.zarr --table efficiency.md
     """
-    from faintspot.study import estimators as study_of_estimators
     from faintspot.study.efficiency import markdown
+    from faintspot.study.estimators import estimators_study
+    from faintspot.study.page import write_study_report
 
-    described = study_of_estimators.specification(quick)
+    described = estimators_study(quick)
     target = output or f"estimators{'-quick' if quick else ''}.zarr"
     results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = derived(target, ".html")
-    study_of_estimators.report(results, page)
+    write_study_report(results, page)
     click.echo(f"{page}: open it in a browser")
     if table is not None:
         options = " --quick" if quick else ""

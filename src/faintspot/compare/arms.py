@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
-from faintspot.estimators.base import Estimator, Need, Style
+from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.scene import Scene
+from faintspot.loop.arms import Arm
 from faintspot.options import AUTO
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import Score, TrainedScore
@@ -33,60 +33,6 @@ class Knowledge(IntEnum):
         if estimator.needs & {Need.PSF, Need.SCORE}:
             return cls.SPOT
         return cls.WIDTH if Need.WIDTH in estimator.needs else cls.NOISE
-
-
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """One way to measure slopes, compared with others on the same images.
-
-    Parameters
-    ----------
-    settings : Settings
-        With the estimator and its options.
-    psf, score : PSF, Score, optional
-        What the estimator knows.
-    title : str
-        What tables and figures call it. Default: the estimator's label.
-    """
-
-    settings: Settings
-    psf: PSF | None = None
-    score: Score | None = None
-    title: str = ""
-
-    @property
-    def estimator(self) -> Estimator:
-        """The estimator with its options."""
-        return self.settings.estimator
-
-    @property
-    def name(self) -> str:
-        """The estimator's name."""
-        return self.estimator.name
-
-    @property
-    def label(self) -> str:
-        """What tables and figures call it."""
-        return self.title or self.estimator.label
-
-    @property
-    def style(self) -> Style:
-        """How figures draw it."""
-        return self.estimator.style
-
-    @property
-    def knowledge(self) -> Knowledge:
-        """What it has to know."""
-        return Knowledge.of(self.estimator)
-
-    @property
-    def parts(self) -> dict[str, Any]:
-        """What a pipeline is given beside settings and calibration."""
-        return {"psf": self.psf, "score": self.score}
-
-    def with_options(self, changes: Mapping[str, Any]) -> Arm:
-        """Return the same with some options changed."""
-        return replace(self, settings=self.settings.replace(**changes)) if changes else self
 
 
 def arm_for_scene(
@@ -121,9 +67,10 @@ def arm_for_scene(
         **_rounded(width),
     )
     return Arm(
+        kind.label,
         settings,
-        psf if Need.PSF in kind.needs else None,
-        score if Need.SCORE in kind.needs else None,
+        psf=psf if Need.PSF in kind.needs else None,
+        score=score if Need.SCORE in kind.needs else None,
     )
 
 

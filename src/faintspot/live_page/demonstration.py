@@ -18,7 +18,7 @@ from faintspot.control.learnt import INTEGRATOR, KALMAN
 from faintspot.errors import InputError
 from faintspot.files import output_errors, write_atomically
 from faintspot.live_page.streams import NewestOfStream
-from faintspot.loop.arms import LoopArm
+from faintspot.loop.arms import Arm
 from faintspot.loop.calibration import make_pipeline
 from faintspot.loop.configuration import LoopConfiguration, load_loop
 from faintspot.loop.engine_files import write_engine_files
@@ -99,7 +99,7 @@ class LiveDemonstration:
         observed = self.observed
         width = _WINDOW_WIDTH * observed.scene.seen_fwhm_px
         window = Settings("window", window_fwhm_px=width, centroid_gain=1.0, flux_e=self.photons)
-        pipeline = make_pipeline(observed, prepare(observed).sensor, LoopArm("-", window))
+        pipeline = make_pipeline(observed, prepare(observed).sensor, Arm("-", window))
         gain = float(measure_gains(observed, [pipeline], seed=self.seed)[0])
         return {
             "brightest": f"brightest+{INTEGRATOR}",

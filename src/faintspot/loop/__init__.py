@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.loop.arms import LoopArm as LoopArm
+    from faintspot.loop.arms import Arm as Arm
     from faintspot.loop.budget import run_budget as run_budget
     from faintspot.loop.configuration import LoopConfiguration as LoopConfiguration
     from faintspot.loop.configuration import load_loop as load_loop
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from faintspot.loop.simulation import simulate_loop as simulate_loop
 
 _HOMES = {
-    "LoopArm": "faintspot.loop.arms",
+    "Arm": "faintspot.loop.arms",
     "LoopConfiguration": "faintspot.loop.configuration",
     "LoopRecord": "faintspot.loop.record",
     "load_loop": "faintspot.loop.configuration",

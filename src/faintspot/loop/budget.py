@@ -16,7 +16,7 @@ from faintspot.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.loop.arms import ArmKind, Choice
+from faintspot.loop.arm_kinds import ArmKind, Choice
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.loop.files import BUDGET_FILE, make_folder
 from faintspot.loop.magnitude import checked_arms, quick_run, tuned_choices, unit_store
@@ -91,7 +91,7 @@ def run_budget(
     folder : path
         Where finished units are remembered; made where it is not there.
     arms : sequence of str, optional
-        See `faintspot.loop.arms.arm_kind`. Default: brightest pixels, Gaussian smoothing and TV.
+        See `faintspot.loop.arm_kinds.arm_kind`. Default: brightest pixels, Gaussian smoothing and TV.
     quick, search, place, overwrite
         As for `run_magnitude`.
 

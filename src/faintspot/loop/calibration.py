@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.light import MeanLight
-from faintspot.loop.arms import LoopArm
+from faintspot.loop.arms import Arm
 from faintspot.loop.atmosphere import MovingLayers
 from faintspot.loop.camera import Exposing, camera_calibration
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
@@ -33,7 +33,7 @@ _SMALLEST_GAIN = 0.05  # less is noise, and dividing by it would make the loop u
 Floats = NDArray[np.float64]
 
 
-def arm_layout(layout: Layout, arm: LoopArm) -> Layout:
+def arm_layout(layout: Layout, arm: Arm) -> Layout:
     """Return the windows that an arm uses: the middle of the sensor's.
 
     Raises
@@ -49,7 +49,7 @@ def arm_layout(layout: Layout, arm: LoopArm) -> Layout:
     return Layout(layout.frame_shape, (pixels, pixels), corners, layout.centres, layout.cells)
 
 
-def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: LoopArm) -> SlopePipeline:
+def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm) -> SlopePipeline:
     """Return the pipeline of an arm, with the reference slopes of a flat wavefront."""
     return SlopePipeline(
         arm_layout(sensor.layout, arm),
@@ -63,7 +63,7 @@ def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: 
 
 
 def reference_slopes(
-    configuration: LoopConfiguration, sensor: ShackHartmann, arm: LoopArm
+    configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm
 ) -> NDArray[np.float32]:
     """Return what an arm's estimator measures of a flat wavefront, all x, then all y, (2 n,) px.
 
@@ -82,7 +82,7 @@ def reference_slopes(
     return bright(sensor.frame(flat) * _BRIGHT_E).vector
 
 
-def _psf(configuration: LoopConfiguration, arm: LoopArm) -> PSF:
+def _psf(configuration: LoopConfiguration, arm: Arm) -> PSF:
     if arm.psf is not None:
         return arm.psf
     return flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)

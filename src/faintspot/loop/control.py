@@ -15,7 +15,7 @@ from faintspot.control.integrator import Integrator
 from faintspot.control.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
 from faintspot.control.telemetry import Telemetry, make_telemetry
 from faintspot.errors import InputError
-from faintspot.loop.arms import PRIOR, LoopArm
+from faintspot.loop.arms import PRIOR, Arm
 from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
 from faintspot.loop.record import LoopRecord
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
@@ -35,7 +35,7 @@ _SETTLE_FRAMES = 50
 def make_controller(
     configuration: LoopConfiguration,
     optics: LoopOptics,
-    arm: LoopArm,
+    arm: Arm,
     learnt: Learnt | None,
     line: CommandLine,
 ) -> Controller:
@@ -55,8 +55,8 @@ def make_controller(
 
 
 def learnt_control(
-    configuration: LoopConfiguration, arm: LoopArm, seed: int, learns_on: LoopConfiguration | None = None
-) -> tuple[LoopArm, Learnt | None]:
+    configuration: LoopConfiguration, arm: Arm, seed: int, learns_on: LoopConfiguration | None = None
+) -> tuple[Arm, Learnt | None]:
     """Return what the control of an arm has learnt, None: it need not; and the arm with what follows.
 
     The prior of an estimator that has one becomes as wide as the control is sure.
@@ -64,7 +64,7 @@ def learnt_control(
     Parameters
     ----------
     configuration : LoopConfiguration
-    arm : LoopArm
+    arm : Arm
     seed : int
     learns_on : LoopConfiguration, optional
         Of the loop that telemetry is taken from. Default: the same.
@@ -86,7 +86,7 @@ def learnt_control(
     return arm, learnt
 
 
-def prior_std_px(arm: LoopArm, slopes: int) -> Floats | None:
+def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
     """Return the prior of the arm's estimator around what control predicts, (2 n,), or None."""
     if not _has_prior(arm):
         return None
@@ -114,11 +114,11 @@ def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64])
 class _Known:
     """An arm, equal to others that would leave the same telemetry."""
 
-    arm: LoopArm = field(compare=False)
+    arm: Arm = field(compare=False)
     same: tuple[Any, ...]
 
     @classmethod
-    def of(cls, arm: LoopArm) -> _Known:
+    def of(cls, arm: Arm) -> _Known:
         from faintspot.configuration import to_text
 
         plain = replace(arm, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
@@ -165,7 +165,7 @@ def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int) -> Te
     return telemetry_of(record, known.arm)
 
 
-def telemetry_of(record: LoopRecord, arm: LoopArm) -> Telemetry:
+def telemetry_of(record: LoopRecord, arm: Arm) -> Telemetry:
     """Return what control learns from a run of one arm with the integrator."""
     divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
@@ -183,13 +183,13 @@ def telemetry_of(record: LoopRecord, arm: LoopArm) -> Telemetry:
     return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
 
 
-def _has_prior(arm: LoopArm) -> bool:
+def _has_prior(arm: Arm) -> bool:
     """Whether the slopes are drawn towards what the control predicts."""
     has = arm.predict_prior and PRIOR in arm.settings.declared() and not arm.true_slopes
     return has and getattr(arm.settings, PRIOR) is not None
 
 
-def _with_prior(arm: LoopArm, std_px: float | Floats) -> LoopArm:
+def _with_prior(arm: Arm, std_px: float | Floats) -> Arm:
     changes: dict[str, Any] = {PRIOR: std_px}
     return replace(arm, settings=arm.settings.replace(**changes))
 

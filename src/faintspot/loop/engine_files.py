@@ -12,7 +12,7 @@ from faintspot import configuration as configuration_file
 from faintspot.control import configuration as control_file
 from faintspot.control.learning import INTEGRATOR, KALMAN
 from faintspot.files import output_errors, write_atomically
-from faintspot.loop.arms import PRIOR, LoopArm
+from faintspot.loop.arms import PRIOR, Arm
 from faintspot.loop.calibration import flat_psf, make_pipeline, reference_slopes
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import ARCSEC, LoopConfiguration
@@ -97,13 +97,13 @@ def write_engine_files(
     return path
 
 
-def _arm(settings: Settings, psf: PSF, score: Score | None, control: str) -> LoopArm:
+def _arm(settings: Settings, psf: PSF, score: Score | None, control: str) -> Arm:
     """The arm of the simulated loop that does what the engine will do."""
     predicts = control == KALMAN and settings.estimator.takes_prior
     if predicts and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
         anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of
         settings = settings.replace(**anything)
-    return LoopArm(
+    return Arm(
         "-",
         settings,
         psf=psf,

@@ -14,7 +14,7 @@ from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.loop.analysis import differences_by_flux
-from faintspot.loop.arms import CONTROL_SIGN, VARIANTS
+from faintspot.loop.arm_kinds import CONTROL_SIGN, VARIANTS
 from faintspot.loop.results import BudgetResult, MagnitudeResult
 from faintspot.loop.telescope import PSF_SAMPLING
 from faintspot.report.drawing import GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled

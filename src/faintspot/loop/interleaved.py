@@ -17,7 +17,7 @@ from faintspot.estimate.noise import suggested_strength
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.loop.arms import LoopArm
+from faintspot.loop.arms import Arm
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.files import make_folder
 from faintspot.loop.magnitude import unit_store
@@ -190,13 +190,13 @@ def _with_multiplication(configuration: LoopConfiguration, fraction: float) -> L
     return configuration.replace("camera", em_gain=max(1.0, fraction * configuration.camera.em_gain))
 
 
-def _arm(label: str, strength_e: float, kept: int, gain: float) -> LoopArm:
+def _arm(label: str, strength_e: float, kept: int, gain: float) -> Arm:
     estimator: Estimator = BrightestPixels(keep_brightest=kept)
     if not math.isnan(strength_e):
         estimator = TotalVariation(
             noise_std=strength_e, keep_brightest=kept, max_iterations=_MOST_ITERATIONS, tolerance=_TOLERANCE
         )
-    return LoopArm(label, Settings(estimator), gain)
+    return Arm(label, Settings(estimator), gain)
 
 
 def _kept_pixels(configuration: LoopConfiguration, fraction: float) -> int:

@@ -20,7 +20,7 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.trained import Trained
 from faintspot.estimators.window import Window
-from faintspot.loop.arms import ArmKind, Choice, arm_kind, default_arms
+from faintspot.loop.arm_kinds import ArmKind, Choice, arm_kind, default_arms
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.files import MAGNITUDE_FILE, make_folder
 from faintspot.loop.results import MagnitudeResult
@@ -62,7 +62,7 @@ def run_magnitude(
     folder : path
         Where finished units are remembered; made where it is not there.
     arms : sequence of str, optional
-        See `faintspot.loop.arms.arm_kind`. Default: `default_arms`; with `quick`, five.
+        See `faintspot.loop.arm_kinds.arm_kind`. Default: `default_arms`; with `quick`, five.
     photons : sequence of float, optional
         Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
     quick : bool

@@ -16,7 +16,7 @@ from faintspot.loop.analysis import (
     seeing_of_sets,
     strehl_table,
 )
-from faintspot.loop.arms import LOOP_GAIN
+from faintspot.loop.arm_kinds import LOOP_GAIN
 from faintspot.loop.results import InterleavedResult, MagnitudeResult
 from faintspot.loop.values_with_errors import gain_in_words, in_words, with_error
 from faintspot.report.page import Table

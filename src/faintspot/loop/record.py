@@ -19,9 +19,9 @@ class LoopRecord(Stored):
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
+    >>> from faintspot.loop import Arm, LoopConfiguration, simulate_loop
     >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
-    >>> record = simulate_loop(loop, [LoopArm("brightest", fs.Settings("brightest"))])
+    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
     >>> record.labels, record.frames, 0.0 < record.mean_strehl() < 1.0
     (('brightest',), 40, True)
     """

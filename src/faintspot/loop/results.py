@@ -104,7 +104,7 @@ class MagnitudeResult(Stored):
     FORMAT: ClassVar[int] = 3
 
     names: tuple[str, ...]
-    """(A,): of the arms, see `faintspot.loop.arms.arm_kind`."""
+    """(A,): of the arms, see `faintspot.loop.arm_kinds.arm_kind`."""
     labels: tuple[str, ...]
     """(A,)"""
     photons: Floats
@@ -133,7 +133,7 @@ class BudgetResult(Stored):
     FORMAT: ClassVar[int] = 2
 
     names: tuple[str, ...]
-    """(A,): of the arms, see `faintspot.loop.arms.arm_kind`."""
+    """(A,): of the arms, see `faintspot.loop.arm_kinds.arm_kind`."""
     terms: tuple[str, ...]
     """(T,): what is switched off; the first is nothing."""
     labels: tuple[str, ...]

@@ -16,7 +16,7 @@ from faintspot.control.commands import CommandLine
 from faintspot.control.learning import INTEGRATOR, Learnt
 from faintspot.errors import InputError
 from faintspot.light import MeanLight
-from faintspot.loop.arms import LoopArm
+from faintspot.loop.arms import Arm
 from faintspot.loop.calibration import (
     centroid_gain,
     make_pipeline,
@@ -62,7 +62,7 @@ class Idealised:
         camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
         return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
 
-    def arm(self, arm: LoopArm) -> LoopArm:
+    def arm(self, arm: Arm) -> Arm:
         """Return an arm as it is in such a run."""
         return replace(arm, true_slopes=arm.true_slopes or self.true_slopes)
 
@@ -79,7 +79,7 @@ class Idealised:
 
 def simulate_loop(
     configuration: LoopConfiguration,
-    arms: Sequence[LoopArm],
+    arms: Sequence[Arm],
     schedule: ArrayLike | None = None,
     *,
     seed: int | None = None,
@@ -97,7 +97,7 @@ def simulate_loop(
     Parameters
     ----------
     configuration : LoopConfiguration
-    arms : sequence of LoopArm
+    arms : sequence of Arm
     schedule : (frames,) array of int, optional
         Which arm measures each frame. Default: the configuration's number of frames with the first arm.
     seed : int, optional
@@ -125,9 +125,9 @@ def simulate_loop(
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.loop import LoopArm, LoopConfiguration, simulate_loop
+    >>> from faintspot.loop import Arm, LoopConfiguration, simulate_loop
     >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
-    >>> record = simulate_loop(loop, [LoopArm("brightest", fs.Settings("brightest"))])
+    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
     >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
     ((40,), (40, 72), True)
     """
@@ -171,7 +171,7 @@ class _Loop:
     def __init__(
         self,
         configuration: LoopConfiguration,
-        ready: Sequence[tuple[LoopArm, Learnt | None]],
+        ready: Sequence[tuple[Arm, Learnt | None]],
         which: NDArray[np.int64],
         seed: int,
         realisation: int,
@@ -334,7 +334,7 @@ def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
 
 
 def _checked_schedule(
-    configuration: LoopConfiguration, arms: Sequence[LoopArm], schedule: ArrayLike | None
+    configuration: LoopConfiguration, arms: Sequence[Arm], schedule: ArrayLike | None
 ) -> NDArray[np.int64]:
     if not 1 <= len(arms) <= _MOST_ARMS:
         raise InputError(f"arms: expected 1 to {_MOST_ARMS}, got {len(arms)}")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between
 from faintspot.compare.running import Advance
 from faintspot.control.learning import INTEGRATOR
-from faintspot.loop.arms import ArmKind, Choice, Tunable
+from faintspot.loop.arm_kinds import ArmKind, Choice, Tunable
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.simulation import simulate_loop
 

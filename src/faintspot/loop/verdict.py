@@ -23,7 +23,7 @@ from faintspot.loop.analysis import (
     measurements,
     strehl_table,
 )
-from faintspot.loop.arms import VARIANTS
+from faintspot.loop.arm_kinds import VARIANTS
 from faintspot.loop.files import BUDGET_FILE, INTERLEAVED_FILE, MAGNITUDE_FILE
 from faintspot.loop.results import (
     BudgetResult,

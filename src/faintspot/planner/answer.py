@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot import configuration
-from faintspot.compare.arms import Arm, Knowledge
+from faintspot.compare.arms import Knowledge
 from faintspot.compare.curves import Curve
 from faintspot.compare.statistics import Estimate, SlopeStatistics
 from faintspot.errors import InputError
+from faintspot.loop.arms import Arm
 from faintspot.notebook import table
 from faintspot.planner.promise import Promise
 from faintspot.planner.question import Question
@@ -111,7 +112,7 @@ class Answer:
     @property
     def best_without_psf(self) -> ArmResult:
         """The best arm of those that need not know the spot."""
-        free = [result for result in self.results if result.arm.knowledge < Knowledge.SPOT]
+        free = [result for result in self.results if Knowledge.of(result.arm.estimator) < Knowledge.SPOT]
         if self.best in free:
             return self.best
         return min(free, key=lambda result: _finite(result.statistics.corrected_rms.value))

@@ -69,7 +69,7 @@ def recommendation(answer: Answer) -> list[str]:
     if gain < _LOW_GAIN:
         lines.append(f"its gain is {gain:.2f} at this flux: divide the slopes by it, or raise the loop gain")
     alternative = answer.best_without_psf
-    if best.arm.knowledge == Knowledge.SPOT:
+    if Knowledge.of(best.arm.estimator) == Knowledge.SPOT:
         lines.append(
             f"the best that need not know the spot's shape: {alternative.arm.label} "
             f"({settings_in_words(alternative.settings)}), "

@@ -51,7 +51,7 @@ def tune_figure(answer: Any) -> Figure:
 
 
 def _draw_arm(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) -> None:
-    style = result.arm.style
+    style = result.arm.estimator.style
     best = result is answer.best
     axes.errorbar(
         place,

@@ -18,7 +18,8 @@ from faintspot.control.learning import INTEGRATOR
 from faintspot.errors import InputError
 from faintspot.estimators.base import Need
 from faintspot.files import derived, write_atomically
-from faintspot.loop.arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice, LoopArm
+from faintspot.loop.arm_kinds import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice
+from faintspot.loop.arms import Arm
 from faintspot.loop.camera import camera_calibration
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.magnitude import with_flux
@@ -50,7 +51,7 @@ class LoopArmResult:
 
     @property
     def name(self) -> str:
-        """See `faintspot.loop.arms.arm_kind`."""
+        """See `faintspot.loop.arm_kinds.arm_kind`."""
         return self.kind.name
 
 
@@ -225,7 +226,7 @@ class LoopAnswer:
         """Return the loop with the star of a measured flux."""
         return with_flux(self.question.configuration, float(self.photons[flux]))
 
-    def arm(self, name: str, flux: int) -> LoopArm:
+    def arm(self, name: str, flux: int) -> Arm:
         """Return a candidate with its settings for a measured flux, as `simulate_loop` takes it."""
         result = self[name]
         return result.kind.arm(self.star(flux), result.choices[flux])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.checks import number_between, numbers_between
 from faintspot.control.learning import INTEGRATOR, KALMAN
 from faintspot.errors import InputError
-from faintspot.loop.arms import ArmKind, arm_kind
+from faintspot.loop.arm_kinds import ArmKind, arm_kind
 from faintspot.loop.configuration import CLOSED, LoopConfiguration
 from faintspot.planner.sky import isoplanatic_angle_arcsec
 
@@ -39,9 +39,9 @@ class LoopQuestion:
         First and last magnitude. Default: from the brightest star of the configuration's `run` to one four
         times fainter than the faintest; without any, from four times the star's light to an eighth.
     arms : sequence of str, optional
-        Candidates, see `faintspot.loop.arms.arm_kind`; "window" and "brightest" always take part. Default:
-        those, "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman" as far
-        as the time goes.
+        Names of candidates as for `arm_kind`; "window" and "brightest" always take part. Default: those,
+        "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman" as far as the
+        time goes.
     strehl : float, optional
         Strehl ratio that limiting magnitudes are for. Default: half of what the baseline has with the
         brightest star.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from faintspot.compare.statistics import Estimate
-from faintspot.loop.arms import LOOP_GAIN, Choice
+from faintspot.loop.arm_kinds import LOOP_GAIN, Choice
 from faintspot.planner.answer_text import plain_number
 from faintspot.planner.loop_answer import BASELINE, SECOND, Coverage, LoopAnswer
 from faintspot.planner.loop_question import magnitudes_apart

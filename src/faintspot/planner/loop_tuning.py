@@ -12,7 +12,7 @@ from faintspot.checks import number_between
 from faintspot.compare.running import Workplace
 from faintspot.control.learning import INTEGRATOR
 from faintspot.errors import InputError
-from faintspot.loop.arms import ArmKind, Choice, arm_kind
+from faintspot.loop.arm_kinds import ArmKind, Choice, arm_kind
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.loop.magnitude import run_magnitude, with_flux
 from faintspot.loop.results import MagnitudeResult

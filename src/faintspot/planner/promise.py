@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.compare.arms import Arm
 from faintspot.compare.statistics import Estimate
+from faintspot.loop.arms import Arm
 from faintspot.pipeline import SlopePipeline
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.compare.arms import Arm
+from faintspot.loop.arms import Arm
 from faintspot.pipeline import SlopePipeline
 from faintspot.planner.question import Question
 from faintspot.sensor.calibration import Calibration

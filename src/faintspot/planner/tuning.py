@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.checks import number_between
-from faintspot.compare.arms import Arm, arm_for_scene, score_for_scene, tuned_options
+from faintspot.compare.arms import Knowledge, arm_for_scene, score_for_scene, tuned_options
 from faintspot.compare.choosing import Choice, coordinate_search, corrected_badness
 from faintspot.compare.curves import Curve, limiting_flux, magnitude_gain
 from faintspot.compare.statistics import (
@@ -28,6 +28,7 @@ from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
 from faintspot.estimators.thresholded import Thresholded
+from faintspot.loop.arms import Arm
 from faintspot.planner.answer import Answer, ArmResult
 from faintspot.planner.promise import check_promise
 from faintspot.planner.question import Question
@@ -354,7 +355,7 @@ def _ranked(results: list[ArmResult], blocks: dict[str, Floats]) -> tuple[str, .
             error = float(known.std(ddof=1)) / math.sqrt(len(known))
             if float(known.mean()) <= _TIE_ERRORS * error:
                 equal.append(result)
-    equal.sort(key=lambda result: (result.arm.knowledge, result.arm.estimator.cost))
+    equal.sort(key=lambda result: (Knowledge.of(result.arm.estimator), result.arm.estimator.cost))
     return tuple(result.arm.name for result in equal)
 
 

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import estimators
-from faintspot.compare.arms import Arm, score_for_scene
+from faintspot.compare.arms import score_for_scene
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.scene import Scene
+from faintspot.loop.arms import Arm
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
@@ -98,9 +99,10 @@ class CellArms:
         if Need.WIDTH in estimator.needs:
             told["spot_fwhm_px"], told["spot_fwhm_y_px"] = self._spot_fwhm_px
         return Arm(
+            estimator.label,
             Settings(estimator, search_range_px=self._within_px, flux_e=self.light_e, **told),
-            self._psf if Need.PSF in estimator.needs else None,
-            self._score if Need.SCORE in estimator.needs else None,
+            psf=self._psf if Need.PSF in estimator.needs else None,
+            score=self._score if Need.SCORE in estimator.needs else None,
         )
 
     def _axes(self, kind: Kind) -> dict[str, list[float]]:

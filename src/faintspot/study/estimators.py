@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from faintspot.estimators.matched import Matched
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
@@ -12,18 +11,13 @@ from faintspot.estimators.trained import Trained
 from faintspot.estimators.weighted import Weighted
 from faintspot.estimators.window import Window
 from faintspot.study.arm_names import DEFAULT_ARMS
+from faintspot.study.paper import QUICK_REALISATIONS, REALISATIONS
 from faintspot.study.specification import StudySpecification, Sweep
 
-if TYPE_CHECKING:
-    import xarray
-
-NAME = "estimators"
 ARMS = (
     *DEFAULT_ARMS,
     *(kind.name for kind in (Window, Weighted, Matched, MaximumLikelihood, MaximumAPosteriori, Trained)),
 )
-REALISATIONS = 10_000
-QUICK_REALISATIONS = 2_000
 
 _FLUXES = {
     0.1: (10, 30, 100, 300, 1000),
@@ -61,7 +55,7 @@ _CASES: tuple[dict[str, Any], ...] = (
 """24 cells of very different spots and cameras."""
 
 
-def specification(quick: bool = False) -> StudySpecification:
+def estimators_study(quick: bool = False) -> StudySpecification:
     """Return the specification of the study of the estimators.
 
     Parameters
@@ -70,26 +64,13 @@ def specification(quick: bool = False) -> StudySpecification:
         A few cells of 2,000 realisations instead of 10,000.
     """
     return StudySpecification(
-        name=NAME + (" (quick)" if quick else ""),
+        name="estimators (quick)" if quick else "estimators",
         sweeps=_quick_sweeps() if quick else _full_sweeps(),
         realisations=QUICK_REALISATIONS if quick else REALISATIONS,
         arms=ARMS,
         fixed_k=(),
         corrected=True,
     )
-
-
-def report(dataset: xarray.Dataset, path: str | Path) -> list[Path]:
-    """Write the report of the study: a page, and beside it a folder with each figure and its data.
-
-    Raises
-    ------
-    InputError
-        When no cell is finished or a file cannot be written.
-    """
-    from faintspot.study.page import write_study_report
-
-    return write_study_report(dataset, path)
 
 
 def _full_sweeps() -> list[Sweep]:

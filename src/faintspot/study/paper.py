@@ -7,17 +7,12 @@ others, but for 50 electrons at 16 of read noise. A cell that several figures sh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from faintspot.checks import one_of
 from faintspot.errors import InputError
 from faintspot.study.specification import StudySpecification, Sweep
 
-if TYPE_CHECKING:
-    import xarray
-
-NAME = "paper"
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig6", "fig7")
 REALISATIONS = 10_000
 QUICK_REALISATIONS = 2_000
@@ -32,7 +27,7 @@ _RANGES_PX = (1.0, 4.0)
 _BOTH = ("diffraction", "gaussian")
 
 
-def specification(quick: bool = False, figures: Sequence[str] | None = None) -> StudySpecification:
+def paper_study(quick: bool = False, figures: Sequence[str] | None = None) -> StudySpecification:
     """Return the specification of the paper's study.
 
     Parameters
@@ -63,36 +58,10 @@ def specification(quick: bool = False, figures: Sequence[str] | None = None) -> 
         sweep for sweep in (_quick_sweeps() if quick else _full_sweeps()) if sweep.name.split()[0] in wanted
     ]
     return StudySpecification(
-        name=NAME + (" (quick)" if quick else ""),
+        name="paper (quick)" if quick else "paper",
         sweeps=sweeps,
         realisations=QUICK_REALISATIONS if quick else REALISATIONS,
     )
-
-
-def report(dataset: xarray.Dataset, path: str | Path) -> list[Path]:
-    """Write the report of a study: one HTML page, and beside it a folder with each figure and its data.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        What a run of a study returned; it may be unfinished.
-    path : str or Path
-        The page. PNG, SVG and CSV files go to the folder of that name with "-figures" in place of its
-        ending.
-
-    Returns
-    -------
-    list of Path
-        All files written, the page first.
-
-    Raises
-    ------
-    InputError
-        When no cell is finished or a file cannot be written.
-    """
-    from faintspot.study.page import write_study_report
-
-    return write_study_report(dataset, path)
 
 
 def _full_sweeps() -> list[Sweep]:
