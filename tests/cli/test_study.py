@@ -34,7 +34,7 @@ flux_e = { from = 10, to = 1000, points = 30, spacing = "log" }
 def test_estimators(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     sweep = Sweep("a", flux_e=[50, 200], pixels=8)
     small = StudySpecification("estimators", [sweep], realisations=100, arms=["brightest", "ml"], fixed_k=[])
-    monkeypatch.setattr(estimators, "specification", lambda quick: small)
+    monkeypatch.setattr(estimators, "estimators_study", lambda quick: small)
     out = run.ok("study", "estimators", "--quick", "--table", "t.md", "--workers", 0).out
     assert "estimators-quick.html: open it in a browser" in out
     assert "t.md: tables" in out
@@ -113,12 +113,3 @@ def test_report_of_a_study(folder: Path, run: Commands) -> None:
     assert "small" in page
     assert "2 of 2" in page
     run.refused("report", "my-study.zarr", "my-study.zarr", naming=("my-study.zarr",))
-
-
-def test_device(folder: Path, run: Commands) -> None:
-    Path("my-study.toml").write_text(SMALL)
-    run.refused("study", "run", "my-study.toml", "--device", "tpu", naming=("device = 'tpu'", "'cuda'"))
-    both = ("--device", "cuda", "--scheduler", "tcp://localhost:1")
-    run.refused("study", "run", "my-study.toml", *both, naming=("scheduler", "not on a cluster"))
-    assert not Path("my-study.zarr").exists()
-    run.ok("study", "run", "my-study.toml", "--device", "cpu", "--workers", 0)
