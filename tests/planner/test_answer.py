@@ -69,7 +69,6 @@ def test_magnitudes_are_relative_without_photometry() -> None:
 
 def test_results_by_name() -> None:
     answer = answered()
-    assert answer["plain"] is answer["brightest"]  # as version 0.1 called it
     with pytest.raises(InputError, match="'tvs': expected one that was tried: brightest, tv"):
         answer["tvs"]
 
