@@ -64,13 +64,6 @@ def test_arms_can_be_added(tmp_path: Path, whole: Path) -> None:
     np.testing.assert_array_equal(three.strehl[:2], both.strehl)
 
 
-def test_folders_of_earlier_versions_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "units").mkdir()
-    (tmp_path / "units" / "magnitude.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(InputError, match=r"faintspot 0\.1"):
-        run(tmp_path, HERE)
-
-
 def test_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^arm = 'kog': expected one of 'brightest'"):
         run_magnitude(small(), tmp_path, ("kog",), PHOTONS, place=HERE)

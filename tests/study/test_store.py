@@ -93,18 +93,6 @@ def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
             open_study(wrong)
 
 
-def test_of_version_0_1(tmp_path: Path) -> None:
-    path = tmp_path / "s.zarr"
-    stored_units(SPECIFICATION, path)
-    metadata = json.loads((path / "zarr.json").read_text())
-    for name in ("format", "kind", "units"):
-        del metadata["attributes"][name]
-    (path / "zarr.json").write_text(json.dumps(metadata))
-    for refuse in (lambda: open_study(path), lambda: stored_units(SPECIFICATION, path)):
-        with pytest.raises(InputError, match=r"of faintspot 0\.1"):
-            refuse()
-
-
 def test_of_another_version(tmp_path: Path) -> None:
     path = tmp_path / "s.zarr"
     stored_units(SPECIFICATION, path)
