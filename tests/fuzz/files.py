@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
+import os
 import re
 import shutil
 import tempfile
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
@@ -101,7 +104,7 @@ def _read_aot(path: Path) -> None:
 def _frame_readers() -> dict[str, Callable[[Path], Any]]:
     from tests.io import frame_files
 
-    return {f"frames.{form}": _read_frames for form in frame_files.FORMATS}
+    return {f"frames.{form}": _read_frames for form in (*frame_files.FORMATS, "png", "lzw.tif")}
 
 
 READERS: dict[str, Callable[[Path], Any]] = {
@@ -134,7 +137,10 @@ def _originals() -> Path:
     _kept.append(keep)
     folder = Path(keep.name)
     for name in READERS:
-        if name.startswith("frames."):
+        if name in ("frames.png", "frames.lzw.tif"):
+            options = {"compression": "tiff_lzw"} if name.endswith("tif") else {}
+            Image.fromarray(frame_files.cube(1, 60, 80, "uint16")[0]).save(folder / name, **options)
+        elif name.startswith("frames."):
             frame_files.save(folder / name, frame_files.cube(5))
         elif name.startswith("slopes."):
             slope_files.write(folder / name, slope_files.result(20))
@@ -175,6 +181,9 @@ _kept: list[Any] = []
 
 def _damage(rng: np.random.Generator, path: Path) -> None:
     """Damage a file, or one of a store's; of arrays in a .npz file also what they hold."""
+    if rng.random() < 0.1 and not path.is_dir():
+        _replace(rng, path)
+        return
     if path.is_dir():
         inside = sorted(file for file in path.rglob("*") if file.is_file())
         described = [file for file in inside if file.suffix == ".json" or file.name.startswith(".z")]
@@ -182,6 +191,8 @@ def _damage(rng: np.random.Generator, path: Path) -> None:
         file = chosen[rng.integers(len(chosen))]
         if rng.random() < 0.1:
             file.unlink()
+        elif rng.random() < 0.2:
+            _replace(rng, file)
         else:
             file.write_bytes(_damaged(rng, file.read_bytes()))
         return
@@ -190,9 +201,29 @@ def _damage(rng: np.random.Generator, path: Path) -> None:
             arrays = dict(archive)
         name = str(rng.choice(list(arrays)))
         arrays[name] = _other_array(rng, arrays[name])
-        np.savez(path, **arrays)
+        np.savez_compressed(path, **arrays)
         return
     path.write_bytes(_damaged(rng, path.read_bytes()))
+
+
+def _replace(rng: np.random.Generator, path: Path) -> None:
+    """Replace a file by something without an end, or by compressed zeros that are far more than it held."""
+    kind, start = int(rng.integers(3)), path.read_bytes()[:4]
+    path.unlink()
+    if kind == 0:
+        os.mkfifo(path)
+    elif kind == 1:
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_bytes(_inflating(start.startswith(b"\x28\xb5\x2f\xfd")))
+
+
+@cache
+def _inflating(zstandard: bool) -> bytes:
+    """Return 1.5 GiB of zeros, compressed by Zstandard or gzip."""
+    numcodecs: Any = importlib.import_module("numcodecs")
+    zeros = np.zeros(3 << 29, np.uint8)
+    return bytes((numcodecs.Zstd() if zstandard else numcodecs.GZip()).encode(zeros))
 
 
 def _damaged(rng: np.random.Generator, content: bytes) -> bytes:
@@ -249,6 +280,7 @@ def _other_array(rng: np.random.Generator, array: Any) -> Any:
         lambda: np.empty((0, *array.shape), array.dtype),
         lambda: np.repeat(array[None], 2, 0),
         lambda: np.zeros((1, 1, 1, 2, 1, 1)),
+        lambda: np.zeros((1 << 14, 1 << 15), np.uint8),
         lambda: np.array(b"\xff\x00"),
     ]
     return others[rng.integers(len(others))]()

@@ -205,6 +205,19 @@ def test_gzip_of_nothing_but_zeros(tmp_path: Path) -> None:
     refused(lambda: read_slopes(tmp_path / "slopes.fits.gz"), "slopes.fits.gz")
 
 
+@pytest.mark.parametrize("before", ["", "header", "slopes"])
+def test_gzip_without_an_end(tmp_path: Path, before: str) -> None:
+    """Zeros, or blanks in which a header does not end, of which astropy would read as long as some come."""
+    write(tmp_path / "slopes.fits", result())
+    content = (tmp_path / "slopes.fits").read_bytes()
+    start = {"": b"", "header": content[:80], "slopes": content}[before]
+    path = tmp_path / "a.fits.gz"
+    path.write_bytes(gzip.compress(start + (b" " if before == "header" else b"\0") * (64 * MIB)))
+    refused(lambda: read_slopes(path), "a.fits.gz")
+    if before != "slopes":
+        refused(lambda: open_frames([path]), "a.fits.gz")
+
+
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 @pytest.mark.parametrize("ending", ["npz", "fits", "csv", "npy"])
 def test_what_is_no_regular_file(tmp_path: Path, ending: str, kind: str) -> None:

@@ -80,7 +80,7 @@ def command(
 ) -> None:
     """Turn recorded frames into slopes.
 
-    FRAMES are FITS files (plain, .gz, .fz; images or cubes), TIFF, .npy, .npz or Zarr, in the order given.
+    FRAMES are FITS (plain, .gz, .fz), TIFF, PNG, HDF5, MATLAB, .npy, .npz or Zarr, in the order given.
     They are read block by block, so that their size does not matter. Interrupted and started again, the
     command goes on where it stopped. Of telemetry in the AOT standard the frames of its Shack-Hartmann
     sensor are measured (--key names one of several); where the configuration has no [layout], with the

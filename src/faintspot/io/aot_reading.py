@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from faintspot.checks import finite_array
 from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import check_regular, parse_json
+from faintspot.files import parse_json
+from faintspot.io.fits_files import AOT_VERSION, units_of, whole_units
 from faintspot.io.locations import one_line
-from faintspot.io.optional_packages import load_fits
 from faintspot.sensor.layout import Layout
+from faintspot.sizes import check_bytes, memory_bytes
 
-AOT_VERSION = "AOT-VERS"
-"""Keyword of the primary header."""
 _PIXELS = ("pix", "pixel", "px")
 
 
@@ -76,13 +75,14 @@ class AotSensor:
 
 def is_aot(path: str | Path) -> bool:
     """Tell whether a file is a FITS file of the AOT standard."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            check_regular(path)
-            return AOT_VERSION in load_fits().getheader(path, 0)
-        except Exception:  # another file, or a damaged one, about which its reader says more
-            return False
+    try:
+        return AOT_VERSION in next(units_of(Path(path))).header
+    except (
+        InputError,
+        MissingExtraError,
+        OSError,
+    ):  # another file, or a damaged one, about which its reader says more
+        return False
 
 
 def frames_of_aot(path: Path, sensor: str | None) -> str:
@@ -134,6 +134,8 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
         raise InputError(f"{path}: no such file or directory")
     if not is_aot(path):
         raise InputError(f"{path}: expected an AOT file, whose header has {AOT_VERSION}")
+    total = sum(unit.data_bytes for unit in whole_units(path))
+    check_bytes(path, total, memory_bytes() // 2, "telemetry")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what faintspot does not ask for
         try:

@@ -8,6 +8,7 @@ physical = BZERO + BSCALE * stored, and BLANK marks integers without a value, wh
 from __future__ import annotations
 
 import gzip
+import io
 import math
 import warnings
 import zlib
@@ -20,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.errors import InputError
-from faintspot.io.aot_reading import AOT_VERSION, frames_of_aot
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_fits
@@ -28,7 +28,10 @@ from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gz
 from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, check_stated, most_slopes_bytes
 from faintspot.sizes import check_bytes
 
+AOT_VERSION = "AOT-VERS"
+"""Keyword of the primary header of a file of the Adaptive Optics Telemetry standard."""
 _BLOCK_BYTES = 2880
+_MOST_HEADER_BYTES, _MOST_PADDING_BYTES = 1 << 24, 1 << 20
 _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 
@@ -44,9 +47,11 @@ class Fits(FileFormat):
 
         Of a file of the AOT standard it is the frames of the sensor `key`, or of the only one.
         """
-        if AOT_VERSION in next(_units(path)).header:
-            names = {name for unit in _units(path) for name in (unit.name.upper(), str(unit.index))}
+        if AOT_VERSION in next(units_of(path)).header:
+            names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
             if key is None or key.strip().upper() not in names:
+                from faintspot.io.aot_reading import frames_of_aot
+
                 key = frames_of_aot(path, key)
         return _find_fits(path, key)
 
@@ -64,14 +69,14 @@ class Fits(FileFormat):
         """Read a file of slopes, and verify its checksums."""
         from faintspot.io.slopes_fits import read_fits
 
-        units = {unit.name.lower(): unit for unit in _units(path)}
+        units = {unit.name.lower(): unit for unit in whole_units(path)}
         check_bytes(path, sum(unit.data_bytes for unit in units.values()), most_slopes_bytes(), "slopes")
         check_stated(path, {name: units[name].shape for name in VARIABLES if name in units})
         return read_fits(path)
 
     def has_slopes(self, path: Path) -> bool:
         """Tell by the names of the extensions."""
-        return {name.upper() for name in (*REQUIRED, "attributes")} <= {unit.name for unit in _units(path)}
+        return {name.upper() for name in (*REQUIRED, "attributes")} <= {unit.name for unit in units_of(path)}
 
 
 class FitsGz(Fits):
@@ -229,7 +234,7 @@ def _axes(header: Any, keyword: str) -> tuple[int, ...]:
 def _find_unit(path: Path, key: str | None) -> _Unit:
     """Return the first image, or the unit named `key`."""
     names = []
-    for unit in _units(path):
+    for unit in units_of(path):
         names.append(unit.name)
         if key is None and unit.shape:
             return unit
@@ -241,7 +246,23 @@ def _find_unit(path: Path, key: str | None) -> _Unit:
     raise InputError(f"{path}: expected {wanted}, the file has only: {', '.join(names)}")
 
 
-def _units(path: Path) -> Iterator[_Unit]:
+def whole_units(path: Path) -> list[_Unit]:
+    """Return all units of a file, behind which nothing else may follow, of which astropy would read all.
+
+    Raises
+    ------
+    InputError
+        When something does.
+    """
+    units = list(units_of(path))
+    with open_plain_or_gzip(path) as stream:
+        stream.seek(max((unit.data_start + unit.data_bytes for unit in units), default=0))
+        if len(stream.read(_MOST_PADDING_BYTES)) == _MOST_PADDING_BYTES:
+            raise InputError(f"{path}: expected the end of the file after {units[-1].name}, more follows")
+    return units
+
+
+def units_of(path: Path) -> Iterator[_Unit]:
     """Yield the file's header-and-data units in order, skipping over the data."""
     with open_plain_or_gzip(path) as stream:
         index = 0
@@ -259,16 +280,26 @@ def _units(path: Path) -> Iterator[_Unit]:
             index += 1
 
 
+def _header_blocks(stream: IO[bytes], index: int) -> bytes:
+    """Return the blocks of a header up to that with END; ValueError where there is none."""
+    start = b"SIMPLE" if index == 0 else b"XTENSION"
+    text = bytearray()
+    while len(text) < _MOST_HEADER_BYTES and (block := stream.read(_BLOCK_BYTES)):
+        text += block
+        if not text.startswith(start):
+            raise ValueError(f"it does not start with {start.decode()}")
+        if any(block[place : place + 8] == b"END     " for place in range(0, len(block), 80)):
+            return bytes(text)
+    raise ValueError(f"its header does not end within {len(text)} bytes")
+
+
 def _read_header(path: Path, stream: IO[bytes], index: int) -> Any:
     """Return the header at the stream's position, or None at its end."""
     fits = load_fits()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            header = fits.Header.fromfile(stream)
-            if index == 0 and "SIMPLE" not in header:
-                raise ValueError("it does not start with SIMPLE")
-            return header
+            return fits.Header.fromfile(io.BytesIO(_header_blocks(stream, index)))
     except Exception as error:  # a broken header makes astropy raise many things
         if index > 0:
             return None

@@ -1,4 +1,4 @@
-"""Frames in: one long sequence from FITS, TIFF, NumPy and Zarr files, read in blocks of bounded memory."""
+"""Frames in: one long sequence from files of any format, read in blocks of bounded memory."""
 
 from __future__ import annotations
 
@@ -105,8 +105,8 @@ class FrameSource(Closing):
 def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> FrameSource:
     """Open files of frames, concatenated in the order given.
 
-    FITS (plain, .gz, .fz), TIFF, .npy, .npz and Zarr stores are told apart by content. Each holds a cube
-    (n, height, width) or a single frame (height, width).
+    FITS (plain, .gz, .fz), TIFF, PNG, HDF5, MATLAB, .npy, .npz and Zarr stores are recognised by content.
+    Each holds a cube (n, height, width) or a single frame (height, width).
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
 
 
 def read_array(location: str | Path) -> NDArray[Any]:
-    """Read one array whole (dark, flat, bad-pixel map) from a FITS, TIFF, .npy or .npz file or a Zarr store.
+    """Read one array whole (dark, flat, bad-pixel map) from a file of any format that frames have.
 
     Parameters
     ----------
