@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from tests.planner.planner_cases import QUICK
 from faintspot.compare.statistics import Estimate
 from faintspot.planner import Answer, Promise, question_from_frames, tune
 from faintspot.planner.answer_text import CONTRADICTED, promise_lines
+from faintspot.planner.promise import _with_unshared
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, sensor_frames
 
@@ -75,3 +77,31 @@ def test_errors_decide_what_contradicts() -> None:
     assert promise(0.07, 0.005).contradicted
     assert promise(0.1, 0.01, frame_to_frame=0.08).contradicted
     assert promise(0.13, 0.005).expected_px == pytest.approx(0.091)
+    # Errors that the images compared share are not seen: less than predicted does not lower the promise.
+    assert promise(0.07, 0.005).expected_px == 0.07
+
+
+def test_scatter_between_frames_that_one_method_alone_has_is_its_error() -> None:
+    def checked(scatters: dict[str, float]) -> dict[str, Promise]:
+        alike = Estimate(0.1, 0.001)
+        return _with_unshared(
+            {
+                name: Promise(100.0, alike, alike, Estimate(s, 0.002), 1.0, 0.07)
+                for name, s in scatters.items()
+            }
+        )
+
+    still = checked({"window": 0.11, "smoothed": 0.115, "matched": 0.3})
+    assert still["window"].factor == still["smoothed"].factor == 1.0
+    assert still["matched"].expected_px == pytest.approx(0.07 * 0.296 / 0.1, rel=0.01)
+    moving = checked({"window": 0.5, "matched": 0.6})  # gains that differ would look the same
+    assert moving["matched"].factor == 1.0
+    assert checked({"window": math.nan})["window"].factor == 1.0
+
+
+def test_methods_are_chosen_by_the_recording() -> None:
+    answer = answered(0.0, 0.5)
+    assert set(answer.promises) == {result.arm.name for result in answer.results}
+    assert all(promise.unshared_px == 0 for promise in answer.promises.values())
+    ratios = [promise.ratio.value for promise in answer.promises.values()]
+    np.testing.assert_allclose(ratios, 1.0, atol=0.15)

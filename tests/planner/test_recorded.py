@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from tests.planner.planner_cases import QUICK
@@ -8,6 +10,8 @@ from tests.shared_data import shared_file
 from faintspot.errors import InputError
 from faintspot.io.frames import read_array
 from faintspot.planner import question_from_frames, tune
+from faintspot.planner.answer_text import UNCHECKED, recommendation
+from faintspot.planner.promise import frames_to_check
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, sensor_frames
 
@@ -58,6 +62,43 @@ def test_what_is_given_is_not_measured() -> None:
     )
     assert (question.read_noise_e, question.fwhm_px, question.star_flux_e) == (4.0, 1.8, 50.0)
     assert question.psf is None
+
+
+def test_a_faint_recording_has_the_range_of_its_spots() -> None:
+    rng = np.random.default_rng(3)
+    layout, camera = Layout.grid((6, 6), pixels=16), Detector(read_noise_e=3.0, offset_adu=100.0)
+    frames, _ = sensor_frames(
+        layout.corners,
+        layout.window,
+        layout.frame_shape,
+        30,
+        flux_e=30.0,
+        positions=rng.uniform(-0.5, 0.5, (len(layout), 2)),
+        detector=camera,
+        rng=rng,
+    )
+    known: dict[str, Any] = {"layout": layout, "gain_e_per_adu": 1.0, "read_noise_e": 3.0, "fwhm_px": 1.77}
+    question = question_from_frames(frames, **known)
+    assert question.search_range_px == 1.0  # 7.9 where noise is taken for spots
+    assert question.star_flux_e == pytest.approx(30.0, rel=0.15)
+    dark = question_from_frames(camera.expose(np.zeros(frames.shape), rng), **known, flux_e=30.0)
+    assert dark.search_range_px == 1.0
+    assert any("the flux is too low" in fact for fact in dark.facts)
+
+
+def test_a_single_frame_is_not_checked() -> None:
+    frames, _ = recorded(1)
+    known: dict[str, Any] = {"layout": LAYOUT, "gain_e_per_adu": 0.5, "read_noise_e": 4.0, "fwhm_px": 1.77}
+    answer = tune(question_from_frames(frames, **known), **QUICK)
+    assert answer.promise is None
+    assert any(line.startswith(UNCHECKED) for line in recommendation(answer))
+
+
+def test_only_so_many_frames_are_used_as_are_needed() -> None:
+    layout = Layout.grid((40, 40), pixels=16)
+    assert frames_to_check(layout) == 8
+    assert frames_to_check(Layout.grid((2, 2), pixels=64)) == 256
+    assert frames_to_check(Layout.grid((2, 2), pixels=16)) == 1024
 
 
 def test_a_single_frame_does_not_tell_the_gain() -> None:

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from faintspot.planner.answer import Answer
     from faintspot.planner.question import Question
 
-_MOST_FRAMES = 200
+_MOST_FRAMES, _MOST_PIXELS = 200, 1 << 26
+_MOST_NAMES = 3  # of files that are repeated in the suggested command
 
 # Name, type, metavar and help of every option that is also a key of the camera file.
 _VALUES: tuple[tuple[str, Any, str | None, str], ...] = (
@@ -187,7 +188,8 @@ def answer_table(answer: Answer) -> Table:
     """Return the errors of all arms at the star's flux as a table."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("estimator", ratio=1)  # long names wrap, numbers do not
-    for heading in ("R (px)", "gain", "rms/gain", "outliers", "cost", "mag saved"):
+    recorded = ["recorded"] if answer.promises else []
+    for heading in ("R (px)", "gain", "rms/gain", *recorded, "outliers", "cost", "mag saved"):
         table.add_column(heading, justify="right", no_wrap=True)
     for result in answer.results:
         found, is_reference = result.statistics, result.arm.name == answer_text.BRIGHTEST
@@ -196,16 +198,19 @@ def answer_table(answer: Answer) -> Table:
             f"{found.error.value:.4f}±{found.error.standard_error:.4f}",
             f"{found.gain.value:.2f}",
             f"{found.corrected_rms.value:.4f}",
+            *([f"x {answer.promises[result.arm.name].ratio.value:.2f}"] if recorded else []),
             f"{100 * found.outlier_fraction.value:.1f} %",
             f"{result.arm.estimator.cost:.2f}",
             "" if is_reference else answer_text.short_gain(answer, result.over_brightest),
             style="bold" if result is answer.best else None,
         )
     bound = float(answer.bound_px[answer.at_star])
-    table.add_row("Cramer-Rao bound", f"{bound:.4f}       ", "", "", "", "", "", style="dim")
+    table.add_row("Cramer-Rao bound", f"{bound:.4f}       ", style="dim")
     table.caption = (
-        "R: mean |error| per axis. rms/gain: rms after correcting gain and offset. outliers: error above "
-        "1 px. cost: 1 is TV with 20 iterations. mag saved: against brightest pixels, by R."
+        "R: mean |error| per axis. rms/gain: rms after correcting gain and offset. "
+        f"{'recorded: error measured in the recording over the predicted. ' if recorded else ''}"
+        "outliers: error above 1 px. cost: 1 is TV with 20 iterations. mag saved: against brightest "
+        "pixels, by R."
     )
     table.caption_justify = "left"
     return table
@@ -294,7 +299,9 @@ def _where(text: str) -> str:
 
 def _read(paths: tuple[str, ...], key: str | None) -> NDArray[Any]:
     with open_frames(paths, key=key) as source:
-        return source.block(0, min(_MOST_FRAMES, source.n_frames))
+        rows, columns = source.shape
+        enough = max(2, min(_MOST_FRAMES, _MOST_PIXELS // (rows * columns)))
+        return source.block(0, min(enough, source.n_frames))
 
 
 def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str, ...]) -> None:
@@ -306,7 +313,7 @@ def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str
         pixels = answer.question.pixels
         click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")
     else:
-        names = shlex.join(frames) if frames else "FRAMES"
+        names = shlex.join(frames) if 0 < len(frames) <= _MOST_NAMES else "FRAMES"
         click.echo(
             f"Next: faintspot slopes {names} --config {shlex.quote(str(target))} -o {suggested_slopes()}"
         )

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from faintspot.planner.loop_question import LoopQuestion as LoopQuestion
     from faintspot.planner.loop_tuning import tune_loop as tune_loop
     from faintspot.planner.promise import Promise as Promise
-    from faintspot.planner.promise import check_promise as check_promise
+    from faintspot.planner.promise import check_promises as check_promises
     from faintspot.planner.question import Question as Question
     from faintspot.planner.recorded import question_from_frames as question_from_frames
     from faintspot.planner.tuning import tune as tune
@@ -25,7 +25,7 @@ _HOMES = {
     "Photometry": "faintspot.compare.photometry",
     "Promise": "faintspot.planner.promise",
     "Question": "faintspot.planner.question",
-    "check_promise": "faintspot.planner.promise",
+    "check_promises": "faintspot.planner.promise",
     "question_from_frames": "faintspot.planner.recorded",
     "tune": "faintspot.planner.tuning",
     "tune_loop": "faintspot.planner.loop_tuning",

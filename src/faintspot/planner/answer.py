@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,8 +91,8 @@ class Answer:
     """Spots that were scored at each flux."""
     left_out: dict[str, str]
     """Arms that were not tried, and why."""
-    promise: Promise | None = None
-    """The recommended arm's slope error, checked on the recording, where there is one."""
+    promises: dict[str, Promise] = field(default_factory=dict)
+    """Slope error of every arm, checked on the recording; empty where there is none."""
 
     @property
     def flux_e(self) -> Floats:
@@ -108,6 +108,11 @@ class Answer:
     def best(self) -> ArmResult:
         """The recommended arm."""
         return self[self.equal[0]]
+
+    @property
+    def promise(self) -> Promise | None:
+        """The recommended arm's slope error, checked on the recording."""
+        return self.promises.get(self.best.arm.name)
 
     @property
     def best_without_psf(self) -> ArmResult:

@@ -15,6 +15,9 @@ from faintspot.settings import Settings
 BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
 
 CONTRADICTED = "THE RECORDING CONTRADICTS THE PROMISE"
+UNCHECKED = (
+    "NOTHING WAS CHECKED on the recording: a single frame cannot both teach and check; give two or more"
+)
 _HELPS_ABOVE_MAG = 0.02
 _LOW_GAIN = 0.9
 _SMALLEST_ERROR_MAG = 0.01  # that is shown
@@ -82,7 +85,7 @@ def promise_lines(answer: Answer) -> list[str]:
     """Say what the recording makes of the promised error."""
     promise = answer.promise
     if promise is None:
-        return []
+        return [UNCHECKED] if answer.question.facts else []
     text = (
         f"checked on frames kept for it, thinned to {plain_number(promise.flux_e)} electrons: predicted R "
         f"{_with_error(promise.predicted)}, measured {_with_error(promise.measured)} px; pixels are "
@@ -90,11 +93,24 @@ def promise_lines(answer: Answer) -> list[str]:
     )
     if math.isfinite(promise.frame_to_frame.value):
         text += f"; from frame to frame, movement included, {_with_error(promise.frame_to_frame)} px"
-    if not promise.contradicted:
-        return [text]
-    why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
-    expected = f"expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px"
-    return [text, f"{CONTRADICTED}: {expected}{why}"]
+    lines = [text]
+    simulated = min(answer.results, key=lambda result: _rms(result.statistics.corrected_rms.value))
+    if answer.promises[simulated.arm.name].factor > 1 and simulated is not answer.best:
+        lines.append(
+            f"{simulated.arm.label} would be best by simulation alone, but the recording contradicts it: its "
+            f"error is {answer.promises[simulated.arm.name].factor:.2f} times the predicted"
+        )
+    if promise.contradicted:
+        why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
+        expected = f"expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px"
+        if promise.factor == 1:
+            expected = f"its noise is below the predicted; R {promise.promised_px:.3g} px is not corrected"
+        lines.append(f"{CONTRADICTED}: {expected}{why}")
+    return lines
+
+
+def _rms(value: float) -> float:
+    return value if math.isfinite(value) else math.inf
 
 
 def _with_error(value: Estimate) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from faintspot.training.spot_transfer import variance_over_expected
 
 Floats = NDArray[np.float64]
 
-_SPOTS = 4096
+_SPOTS, _FEWEST_SPOTS = 4096, 1024  # of 16 x 16 px; fewer of larger windows
 _COUNTABLE_E = 0.25  # read noise below which images hold whole electrons, which are dealt out one by one
 _FEWEST_FRAMES = 8
 _LARGEST_SHARE = 0.5  # of the light, for two images of a frame
@@ -62,11 +63,14 @@ class Promise:
     """Standard deviation of lit pixels about fitted spots over the one that was taken."""
     promised_px: float
     """R at the star's light, as promised."""
+    unshared_px: float = 0.0
+    """Error that the two images of a frame share and successive frames do not: scatter from frame to frame
+    beyond noise and the movement that all methods see. Known where spots move less than the noise."""
 
     @property
     def ratio(self) -> Estimate:
-        """Measured over predicted."""
-        value = self.measured.value / self.predicted.value
+        """Measured, with what the two images share, over predicted."""
+        value = math.hypot(self.measured.value, self.unshared_px) / self.predicted.value
         relative = math.hypot(
             self.measured.standard_error / self.measured.value,
             self.predicted.standard_error / self.predicted.value,
@@ -89,9 +93,17 @@ class Promise:
         return abs(math.log(max(self.noise_ratio, 1e-9))) > math.log1p(_NOISE_TOLERANCE)
 
     @property
+    def factor(self) -> float:
+        """Factor by which slope errors are larger than promised; 1 where the recording does not contradict.
+
+        Never below 1: errors that do not differ between the images compared are not seen.
+        """
+        return max(self.ratio.value, 1.0) if self.contradicted and math.isfinite(self.ratio.value) else 1.0
+
+    @property
     def expected_px(self) -> float:
-        """R at the star's light as the recording has it."""
-        return self.promised_px * self.ratio.value
+        """R at the star's flux as the recording has it."""
+        return self.promised_px * self.factor
 
     def to_table(self) -> dict[str, Any]:
         """Return plain numbers, rounded, as written into a configuration."""
@@ -104,6 +116,7 @@ class Promise:
             "noise_ratio": self.noise_ratio,
             "promised_px": self.promised_px,
             "expected_px": self.expected_px,
+            "unshared_px": self.unshared_px,
         }
         if math.isfinite(self.frame_to_frame.value):
             numbers["frame_to_frame_px"] = self.frame_to_frame.value
@@ -113,39 +126,37 @@ class Promise:
         }
 
 
-def check_promise(
-    question: Question, arm: Arm, promised_px: float, *, rng: np.random.Generator | None = None
-) -> Promise:
-    """Predict and measure an arm's slope error on the recording that a question brought along.
+def check_promises(
+    question: Question, arms: Mapping[str, tuple[Arm, float]], *, rng: np.random.Generator | None = None
+) -> dict[str, Promise]:
+    """Predict and measure the slope errors of arms on the recording that a question brought along.
 
     Of every frame two images with the star's light, or half the recording's where that is less, and with the
     camera's own read noise are made: both are the frame, scaled, with noise that is opposite in the two and
     cancels what they have in common, and more noise of their own. What differs in their slopes is error; the
-    spots' movement is the same in both. The same arm measures pairs of simulated
-    spots at the same places.
+    spots' movement is the same in both. The same arms measure pairs of simulated spots at the same places.
 
     Parameters
     ----------
     question : Question
         With `recording`.
-    arm : Arm
-        With the options that are recommended.
-    promised_px : float
-        R at the star's light.
+    arms : dict of str to (Arm, float)
+        Each with the options to check and R at the star's flux as promised.
     rng : numpy.random.Generator, optional
         Default: seed 1.
 
     Returns
     -------
-    Promise
+    dict of str to Promise
 
     Examples
     --------
     >>> import faintspot as fs
-    >>> from faintspot.planner import check_promise, question_from_frames
+    >>> from faintspot.planner import check_promises, question_from_frames
     >>> question = question_from_frames(frames)  # doctest: +SKIP
     >>> best = fs.tune(question).best  # doctest: +SKIP
-    >>> check_promise(question, best.arm, best.statistics.error.value).contradicted  # doctest: +SKIP
+    >>> promised = {"best": (best.arm, best.statistics.error.value)}  # doctest: +SKIP
+    >>> check_promises(question, promised)["best"].contradicted  # doctest: +SKIP
     """
     pair_rng, *exposures = spawn(np.random.default_rng(1) if rng is None else rng, 3)
     images, fitted = _recorded(question)
@@ -159,20 +170,53 @@ def check_promise(
     else:
         spots = np.maximum(fitted.psf.images(fitted.positions, question.shape, fitted.flux_e), 0.0)
         pair = _split(images, excess * spots.reshape(images.shape), dark, ratio, share, pair_rng)
-    first, second = (_measure(question, arm, part) for part in pair)
     mean = _simulated(question, fitted, share * light).reshape(images.shape)
-    camera, alike = question.detector, []
-    for each in exposures:
-        exposed = np.asarray(camera.to_electrons(camera.expose(mean, each)), np.float64)
-        alike.append(_measure(question, arm, exposed - question.background_e))
-    return Promise(
-        share * light,
-        _error_of(alike[0] - alike[1], 2),
-        _error_of(first - second, 2),
-        _frame_to_frame(first),
-        math.sqrt(ratio),
-        promised_px,
-    )
+    camera = question.detector
+    exposed = [np.asarray(camera.to_electrons(camera.expose(mean, each)), np.float64) for each in exposures]
+    alike = [each - question.background_e for each in exposed]
+    promises = {}
+    for name, (arm, promised_px) in arms.items():
+        first, second, *simulated = (_measure(question, arm, part) for part in (*pair, *alike))
+        promises[name] = Promise(
+            share * light,
+            _error_of(simulated[0] - simulated[1], 2),
+            _error_of(first - second, 2),
+            _frame_to_frame(first),
+            math.sqrt(ratio),
+            promised_px,
+        )
+    return _with_unshared(promises)
+
+
+def _with_unshared(promises: dict[str, Promise]) -> dict[str, Promise]:
+    """Add the error that images of one frame share, where the spots stay where they are.
+
+    Movement is the same for all methods; one whose slopes scatter more from frame to frame has errors.
+    """
+    beyond, sure = {}, {}
+    for name, promise in promises.items():
+        scatter, noise = promise.frame_to_frame, promise.measured
+        beyond[name] = scatter.value**2 - noise.value**2
+        sure[name] = 2 * math.hypot(
+            scatter.value * scatter.standard_error, noise.value * noise.standard_error
+        )
+    movement = max(min(beyond.values(), default=0.0), 0.0)
+    least = min((promise.measured.value for promise in promises.values()), default=0.0)
+    if not movement < least**2:  # of a single frame it is not a number
+        return promises
+    return {
+        name: replace(promise, unshared_px=math.sqrt(max(beyond[name] - movement, 0.0)))
+        if beyond[name] - movement > _SURELY * sure[name]
+        else promise
+        for name, promise in promises.items()
+    }
+
+
+def frames_to_check(layout: Layout) -> int:
+    """Return how many frames hold spots enough to check slope errors on."""
+    ny, nx = layout.window
+    spots = max(_FEWEST_SPOTS, min(_SPOTS, _SPOTS * 256 // (ny * nx)))
+    return max(_FEWEST_FRAMES, spots // len(layout))
 
 
 def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
@@ -181,15 +225,16 @@ def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
     assert layout is not None
     assert calibration is not None
     assert question.recording is not None
-    frames = question.recording[: max(_FEWEST_FRAMES, _SPOTS // len(layout))]
+    frames = question.recording[: frames_to_check(layout)]
     dark, electrons_per_adu = layout.images(calibration.maps(layout.frame_shape))
     images: Floats = (layout.images(frames) - dark) * electrons_per_adu
     psf = question.psf
     if psf is None:
         psf = PSF.analytic(question.profile, size=question.size, radius_px=max(question.shape))
     camera = Calibration(read_noise_e=question.read_noise_photoelectrons, background_e=question.background_e)
-    fitted = fit_spots(images.reshape(-1, *question.shape), psf, calibration=camera)
-    return images, fitted
+    search = question.search_range_px + float(np.abs(layout.offsets).max())
+    flat = images.reshape(-1, *question.shape)
+    return images, fit_spots(flat, psf, calibration=camera, search_range_px=search)
 
 
 def _simulated(question: Question, fitted: LearntPSF, flux_e: float) -> Floats:

@@ -57,6 +57,11 @@ def check_not_quad_cells(window: tuple[int, int]) -> None:
         )
 
 
+def default_search_range_px(fwhm_px: float) -> float:
+    """Return the search range of spots of which nothing but their width is known."""
+    return max(_SMALLEST_RANGE_PX, fwhm_px / 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Question:
     """A camera, its spots and a star; everything that is not known may be left out where it is optional.
@@ -346,7 +351,7 @@ class Question:
             )
 
     def _range(self) -> float:
-        default = max(_SMALLEST_RANGE_PX, self.fwhm_px / 2)
+        default = default_search_range_px(self.fwhm_px)
         value = float(default if self.search_range_px is None else self.search_range_px)
         limit = min(self.shape) / 2
         if value > limit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.checks import finite_array
 from faintspot.errors import InputError
 from faintspot.estimate.noise import pixel_noise
-from faintspot.planner.question import Question, check_not_quad_cells
+from faintspot.planner.promise import frames_to_check
+from faintspot.planner.question import Question, check_not_quad_cells, default_search_range_px
+from faintspot.planner.search_range import Images, SpotRange, spot_range
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.photon_transfer import DetectorMeasurement, measure_detector
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
     from faintspot.training.spot_transfer import SpotTransfer
 
 _SPOTS_TO_LEARN_FROM = 2000
-_BEYOND = 0.01  # of the spots, that may be so far out by noise
-_QUANTILE = 2.58  # standard deviations of normal noise within which all but so many are
 _RANGE_MARGIN = 1.15
+_NOISE_AMONG_SPOTS = 0.95  # of the fitted flux, below which fits have taken noise for spots
 _SURELY = 3.0  # standard errors
+_LEAST_VARIANCE = 0.01  # of a pixel, electrons squared
+_DARK_PIXELS = 1 << 24  # that the read noise is measured in
 _FEWEST_FOR_LIGHT = 4  # images of each sub-aperture that tell its light
 
 
@@ -39,7 +41,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
     (`faintspot.measure_detector`; about fitted spots, where these move too much for it). The PSF is learnt
     (`faintspot.learn_psf`) from every second frame, and fitted to its spots together with the background that
     all share: this tells their light, how it differs between sub-apertures, and how far the spots move. The
-    other frames are kept to check on them what is promised (`faintspot.planner.check_promise`).
+    other frames are kept to check on them what is promised (`faintspot.planner.check_promises`).
 
     Parameters
     ----------
@@ -88,6 +90,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
         facts.append(f"{len(layout)} sub-apertures of {ny} x {nx} px found in the frames")
     check_not_quad_cells(layout.window)
     given.pop("pixels", None)
+    stack = stack[: 2 * frames_to_check(layout)]  # every second one; more cost memory and tell nothing
     calibration = _calibration(stack, dark_stack, layout, given, facts)
     given["em_gain"] = calibration.em_gain
     learning, kept = (stack[0::2], stack[1::2]) if len(stack) > 1 else (stack, None)
@@ -101,8 +104,6 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
             f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
         )
     given["relative_light"] = _relative_light(fitted, len(layout), facts)
-    if given.get("search_range_px") is None:
-        given["search_range_px"] = _range(fitted, layout, facts)
     values = {
         "gain_e_per_adu": calibration.gain_e_per_adu,
         "em_gain": calibration.em_gain,
@@ -178,7 +179,7 @@ def _measured(
     stack: NDArray[Any], darks: NDArray[Any] | None, layout: Layout, em_gain: float
 ) -> DetectorMeasurement | None:
     """What the frames tell of the camera; None where they are too few."""
-    usable_darks = None if darks is None or len(darks) < 2 else darks
+    usable_darks = None if darks is None or len(darks) < 2 else darks[: max(2, _DARK_PIXELS // darks[0].size)]
     if len(stack) > 1:
         return measure_detector(stack, usable_darks, layout=layout, em_gain=em_gain)
     if usable_darks is not None:
@@ -220,28 +221,81 @@ def _fitted(
     given: dict[str, Any],
     facts: list[str],
 ) -> tuple[LearntPSF, NDArray[Any]]:
-    """Fit spots and background in some of the frames, returned as well; learn the PSF if need be."""
-    from faintspot.training.psf_learning import fit_spots, learn_psf_from_images
-
+    """Fit spots and background in some of the frames, returned as well; learn PSF and range if need be."""
     used = _some(frames, layout)
     images = _electrons(used, layout, calibration).reshape(-1, *layout.window)
     plain = replace(calibration, dark=0.0, gain_e_per_adu=1.0, em_gain=1.0)
     plain = replace(plain, read_noise_e=calibration.read_noise_photoelectrons)
-    if given.get("psf") is not None:
-        return fit_spots(images, given["psf"], calibration=plain), used
-    if given.get("fwhm_px") is not None:
-        profile = given.get("profile") or "diffraction"
-        size = given["fwhm_px"] / FWHM_OF_SIZE_1_PX[profile]
-        assumed = PSF.analytic(profile, size=size, radius_px=max(layout.window))
-        return fit_spots(images, assumed, calibration=plain), used
+    assumed, reach = _assumed_psf(layout, given), given.get("search_range_px")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fitted = learn_psf_from_images(images, calibration=plain, rng=np.random.default_rng(1))
-    given["psf"] = fitted.psf
-    width = float(fitted.psf.fwhm_px.mean())
-    facts.append(f"PSF learnt from {len(images)} spots: {width:.2f} px wide, pixel included")
-    facts += [str(warning.message) for warning in caught]
+        fitted = _fit(images, plain, assumed, layout, reach)
+        if reach is None:
+            measured = _range(images, plain, fitted, layout)
+            reach = given["search_range_px"] = _range_to_use(measured, fitted.psf, layout, facts)
+            if measured.flux_scale < _NOISE_AMONG_SPOTS:
+                del caught[:]
+                fitted = _fit(images, plain, assumed, layout, reach)
+    if given.get("fwhm_px") is None and given.get("psf") is None:
+        given["psf"] = fitted.psf
+        width = float(fitted.psf.fwhm_px.mean())
+        facts.append(f"PSF learnt from {len(images)} spots: {width:.2f} px wide, pixel included")
+        facts += [str(warning.message) for warning in caught]
     return fitted, used
+
+
+def _assumed_psf(layout: Layout, given: dict[str, Any]) -> PSF | None:
+    """Return the PSF where it is given or its width is."""
+    if given.get("psf") is not None or given.get("fwhm_px") is None:
+        psf: PSF | None = given.get("psf")
+        return psf
+    profile = given.get("profile") or "diffraction"
+    size = given["fwhm_px"] / FWHM_OF_SIZE_1_PX[profile]
+    return PSF.analytic(profile, size=size, radius_px=max(layout.window))
+
+
+def _fit(
+    images: NDArray[Any], calibration: Calibration, psf: PSF | None, layout: Layout, reach: float | None
+) -> LearntPSF:
+    """Fit spots and background within a range of the references; learn the PSF where there is none."""
+    from faintspot.training.psf_learning import fit_spots, learn_psf_from_images
+
+    search = None if reach is None else reach + float(np.abs(layout.offsets).max())
+    if psf is not None:
+        return fit_spots(images, psf, calibration=calibration, search_range_px=search)
+    rng = np.random.default_rng(1)
+    return learn_psf_from_images(images, calibration=calibration, search_range_px=search, rng=rng)
+
+
+def _range(images: NDArray[Any], calibration: Calibration, fitted: LearntPSF, layout: Layout) -> SpotRange:
+    """Measure how far spots are from their references."""
+    n, background = len(layout), float(fitted.background_e[0])
+    each = fitted.flux_e.reshape(-1, n)
+    light = _relative_light(fitted, n, [])
+    flux = each.mean() * (np.ones(n) if light is None else light)
+    noise = calibration.read_noise_photoelectrons
+    assert noise is not None
+    excess = calibration.excess_noise
+    dark = noise**2 + excess * max(background, calibration.background_e, 0.0)
+    repeated = np.tile(layout.offsets, (len(each), 1)), np.tile(flux, len(each))
+    return spot_range(Images(images - background, *repeated, max(dark, _LEAST_VARIANCE), excess), fitted.psf)
+
+
+def _range_to_use(measured: SpotRange, psf: PSF, layout: Layout, facts: list[str]) -> float:
+    """Return the measured range with a margin, or the default where the flux does not tell it."""
+    limit = min(layout.window) / 2
+    if measured.told:
+        facts.append(
+            f"search range: 99 % of the spots are within {measured.quantile_px:.2f} px of the reference on "
+            "each axis, noise accounted for"
+        )
+        return min(max(1.0, float(f"{_RANGE_MARGIN * measured.quantile_px:.3g}")), limit)
+    default = min(float(f"{default_search_range_px(float(psf.fwhm_px.mean())):.3g}"), limit)
+    facts.append(
+        "search range: the flux is too low to measure how far spots are from their references; the default, "
+        f"±{default:g} px, is assumed (--search-range-px gives another)"
+    )
+    return default
 
 
 def _without_background(
@@ -276,26 +330,3 @@ def _relative_light(fitted: LearntPSF, n: int, facts: list[str]) -> NDArray[np.f
     facts.append(f"light of the sub-apertures: {low:.2f} to {high:.2f} times the mean in nine of ten")
     light /= light.mean()
     return light
-
-
-def _range(fitted: LearntPSF, layout: Layout, facts: list[str]) -> float:
-    """How far spots are from their reference: quantiles of the measured, less noise, and a margin."""
-    n = len(layout)
-    positions = fitted.positions.reshape(-1, n, 2) - layout.offsets
-    error = fitted.standard_error_px.reshape(positions.shape)
-    farthest = 0.0
-    for axis in range(2):
-        place, noise = positions[..., axis].ravel(), error[..., axis].ravel()
-        good = noise < np.quantile(noise, 0.9)  # the faintest tell more of noise than of movement
-        middle = float(np.median(place[good]))
-        sides = np.abs(np.quantile(place[good], [_BEYOND / 2, 1 - _BEYOND / 2]) - middle)
-        quantile = _QUANTILE * float(np.sqrt(np.mean(noise[good] ** 2)))
-        reach = math.sqrt(max(float(sides.max()) ** 2 - quantile**2, 0.0))
-        farthest = max(farthest, abs(middle) + reach)
-    limit = min(layout.window) / 2
-    found = min(max(1.0, float(f"{_RANGE_MARGIN * farthest:.3g}")), limit)
-    facts.append(
-        f"search range: 99 % of the spots are within {farthest:.2f} px of the reference on each axis, noise "
-        "taken off"
-    )
-    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -30,7 +30,7 @@ from faintspot.estimators.registry import estimators
 from faintspot.estimators.thresholded import Thresholded
 from faintspot.loop.arms import Arm
 from faintspot.planner.answer import Answer, ArmResult
-from faintspot.planner.promise import check_promise
+from faintspot.planner.promise import Promise, check_promises
 from faintspot.planner.question import Question
 from faintspot.planner.simulated import Sample, SimulatedSpots
 from faintspot.sensor.psf import PSF
@@ -70,10 +70,10 @@ def tune(
     sample each arm's free parameters are chosen for the smallest gain-corrected rms error, along one axis at
     a time from the automatic rules' values; on another sample, the same for all arms, they are scored.
 
-    Recommended is the arm of the smallest gain-corrected rms error at the star's flux. R alone flatters
-    estimators that fall back to the reference position. Of arms within two standard errors (of the
-    difference, on the same spots) of the best, the one that has to know least is taken, and of these the
-    cheapest.
+    Recommended is the arm of the smallest gain-corrected rms error at the star's flux, times the factor by
+    which the recording, if any, contradicts it (`Answer.promises`). R alone flatters estimators that fall
+    back to the reference position. Of arms within two standard errors (of the difference, on the same spots)
+    of the best, the one that has to know least is taken, and of these the cheapest.
 
     Parameters
     ----------
@@ -120,10 +120,7 @@ def tune(
     while question.budget_px is not None and (further := _further(answer, trial.steps)):
         trial.add(further)
         answer = trial.answer(resampling_rng)
-    if question.recording is None:
-        return answer
-    best = answer.best
-    return replace(answer, promise=check_promise(question, best.arm, best.statistics.error.value))
+    return answer
 
 
 def _further(answer: Answer, steps: Sequence[int]) -> list[int]:
@@ -259,9 +256,18 @@ class _Trial:
             )
             for name in self._kinds
         ]
-        ranked = _ranked(results, {name: scored.blocks for name, scored in at_star.items()})
+        factors = {name: promise.factor for name, promise in self._promises.items()}
+        ranked = _ranked(results, {name: scored.blocks for name, scored in at_star.items()}, factors)
         bound, count = _bound(question, flux), errors[BrightestPixels.name].shape[1]
-        return Answer(question, curve, tuple(results), ranked, bound, count, self._left_out)
+        return Answer(question, curve, tuple(results), ranked, bound, count, self._left_out, self._promises)
+
+    @cached_property
+    def _promises(self) -> dict[str, Promise]:
+        """The arms at the star's flux, checked on the recording."""
+        if self._question.recording is None:
+            return {}
+        arms = {name: (each.arm, each.statistics.error.value) for name, each in self._scored[0].items()}
+        return check_promises(self._question, arms)
 
 
 def _default_realisations(question: Question) -> int:
@@ -343,13 +349,24 @@ def _by_blocks(slopes: Slopes, truth: Floats) -> Floats:
     return logarithms
 
 
-def _ranked(results: list[ArmResult], blocks: dict[str, Floats]) -> tuple[str, ...]:
-    """Return the names of the arms that are as good as the best one, the recommended one first."""
-    best = min(results, key=lambda result: _corrected(result.statistics.corrected_rms))
+def _ranked(
+    results: list[ArmResult], blocks: Mapping[str, Floats], factors: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Return the names of the arms that are as good as the best one, the recommended one first.
+
+    `factors` are those by which a recording has larger errors than the simulated spots.
+    """
+
+    def corrected(result: ArmResult) -> float:
+        rms = result.statistics.corrected_rms.value * factors.get(result.arm.name, 1.0)
+        return rms if math.isfinite(rms) else math.inf
+
+    best = min(results, key=corrected)
     equal = [best]
     for result in results:
         with np.errstate(invalid="ignore"):
             difference = blocks[result.arm.name] - blocks[best.arm.name]
+            difference += math.log(factors.get(result.arm.name, 1.0) / factors.get(best.arm.name, 1.0))
         known = difference[np.isfinite(difference)]
         if result is not best and len(known) == len(difference) > 1:
             error = float(known.std(ddof=1)) / math.sqrt(len(known))
@@ -357,10 +374,6 @@ def _ranked(results: list[ArmResult], blocks: dict[str, Floats]) -> tuple[str, .
                 equal.append(result)
     equal.sort(key=lambda result: (Knowledge.of(result.arm.estimator), result.arm.estimator.cost))
     return tuple(result.arm.name for result in equal)
-
-
-def _corrected(rms: Estimate) -> float:
-    return rms.value if math.isfinite(rms.value) else math.inf
 
 
 def _bound(question: Question, flux: Floats) -> Floats:

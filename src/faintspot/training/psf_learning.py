@@ -153,6 +153,7 @@ def learn_psf_from_images(
     start: PSF | float | None = None,
     oversampling: int = 4,
     radius_px: int | None = None,
+    search_range_px: float | None = None,
     rounds: int = 8,
     rng: np.random.Generator | None = None,
     progress: Callable[[float], object] | None = None,
@@ -166,6 +167,8 @@ def learn_psf_from_images(
         Its maps, if any, have the images' shape. Default: images are in electrons.
     index : (n,) array of int, optional
         Which PSF each spot has, from 0. Default: all have one.
+    search_range_px : float, optional
+        Largest distance of a spot from the image's centre along an axis. Default: half the image.
     start, oversampling, radius_px, rounds, rng, progress
         As in `learn_psf`.
 
@@ -198,12 +201,25 @@ def learn_psf_from_images(
         if numbers.shape != (n,):
             raise InputError(f"index: expected one number for each of {n} images, got shape {numbers.shape}")
     shape = (stack.images.shape[1], stack.images.shape[2])
-    return _learn(
-        stack, numbers, start, checked_options(shape, oversampling, radius_px, rounds), rng, progress
-    )
+    options = checked_options(shape, oversampling, radius_px, rounds)
+    return _learn(stack, numbers, start, _within(options, search_range_px), rng, progress)
 
 
-def fit_spots(images: ArrayLike, psf: PSF, *, calibration: Calibration | None = None) -> LearntPSF:
+def _within(options: Options, search_range_px: float | None) -> Options:
+    """Limit how far from the image's centre spots are sought."""
+    if search_range_px is None:
+        return options
+    search = number_between("search_range_px", search_range_px, 0.0, low_open=True)
+    return replace(options, search_px=min(search, options.search_px))
+
+
+def fit_spots(
+    images: ArrayLike,
+    psf: PSF,
+    *,
+    calibration: Calibration | None = None,
+    search_range_px: float | None = None,
+) -> LearntPSF:
     """Measure single spots whose PSF is known, with a constant background that all of them share.
 
     Parameters
@@ -211,7 +227,7 @@ def fit_spots(images: ArrayLike, psf: PSF, *, calibration: Calibration | None = 
     images : (n, ny, nx) array
     psf : PSF
         The first is that of all spots.
-    calibration : Calibration, optional
+    calibration, search_range_px
         As in `learn_psf_from_images`.
 
     Returns
@@ -223,7 +239,7 @@ def fit_spots(images: ArrayLike, psf: PSF, *, calibration: Calibration | None = 
     n, shape = len(stack.images), (stack.images.shape[1], stack.images.shape[2])
     index = np.zeros(n, np.int64)
     known = PSF(psf.samples[:1], psf.oversampling)
-    options = Options(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2)
+    options = _within(Options(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2), search_range_px)
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1] = False
     state, wings = State(known, np.zeros(1)), np.zeros((n, *shape))
