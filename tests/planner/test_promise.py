@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.planner.planner_cases import QUICK
 
 from faintspot.compare.statistics import Estimate
-from faintspot.planner import Answer, Promise, question_from_frames, tune
+from faintspot.planner import Answer, Promise, Question, question_from_frames, tune
 from faintspot.planner.answer_text import CONTRADICTED, promise_lines
-from faintspot.planner.promise import _with_unshared
+from faintspot.planner.promise import _simulated, _with_unshared
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.psf import PSF
 from faintspot.simulate import Detector, sensor_frames
+from faintspot.training.psf_learning import LearntPSF
 
 LAYOUT = Layout.grid((6, 6), pixels=12)
 
@@ -105,3 +108,16 @@ def test_methods_are_chosen_by_the_recording() -> None:
     assert all(promise.unshared_px == 0 for promise in answer.promises.values())
     ratios = [promise.ratio.value for promise in answer.promises.values()]
     np.testing.assert_allclose(ratios, 1.0, atol=0.15)
+
+
+def test_spots_are_predicted_without_the_noise_of_their_positions() -> None:
+    known: dict[str, Any] = {"layout": LAYOUT, "fwhm_px": 1.77, "search_range_px": 2.0}
+    question = Question(read_noise_e=3.0, flux_e=100.0, **known)
+    positions = np.random.default_rng(5).normal(0.0, 0.5, (360, 2))
+
+    def scatter(error_px: float) -> float:
+        error, psf = np.full((360, 2), error_px), PSF.analytic(radius_px=8)
+        fitted = LearntPSF(psf, np.zeros(1), positions, np.full(360, 100.0), error, ())
+        return float(_simulated(question, fitted, 100.0).std(axis=0).max())
+
+    assert scatter(0.5) < 0.5 * scatter(0.01)

@@ -238,11 +238,17 @@ def _recorded(question: Question) -> tuple[Floats, LearntPSF]:
 
 
 def _simulated(question: Question, fitted: LearntPSF, flux_e: float) -> Floats:
-    """Mean images (n, ny, nx) of simulated spots where those of the recording are, electrons."""
+    """Mean images (n, ny, nx) of simulated spots, electrons.
+
+    They are where those of the recording are, and vary as these do without the noise of their positions.
+    """
     assert question.layout is not None
     n_frames, reach = len(fitted.positions) // len(question.layout), question.search_range_px
     middle = np.tile(question.layout.offsets, (n_frames, 1))
-    places = middle + np.clip(fitted.positions - middle, -reach, reach)
+    away = np.clip(fitted.positions - middle, -reach, reach)
+    mean, noise = away.mean(axis=0), np.mean(np.square(fitted.standard_error_px), axis=0)
+    share = np.sqrt(np.maximum(1 - noise / np.maximum(away.var(axis=0), 1e-12), 0.0))
+    places = middle + mean + share * (away - mean)
     light = np.ones(len(question.layout)) if question.relative_light is None else question.relative_light
     flux = flux_e * np.tile(light, n_frames)
     return np.maximum(fitted.psf.images(places, question.shape, flux), 0.0)
