@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
+import sys
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
 import pytest
 from rich.console import Console
+from tests.patience import LIMIT_S
 from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
@@ -129,6 +132,50 @@ def test_numbers_are_skipped_and_begin_anew(bench: Bench) -> None:
     assert np.array_equal(bench.slopes[1], expected[2])
     counters = bench.engine.counters
     assert (counters.processed, counters.skipped, counters.repeated, counters.dropped) == (4, 1, 1, 0)
+
+
+NOTHING_IS_COMPILED_LATER = """
+import gc, sys
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from faintspot.control.configuration import Control
+from tests.realtime.bench import Bench, simulated
+
+def compiled():
+    return {id(each): len(each.overloads) for each in gc.get_objects() if isinstance(each, Dispatcher)}
+
+bench = Bench(control=Control(np.random.default_rng(1).standard_normal((32, 5))))
+bench.engine.loop.close()
+before = compiled()
+for dtype in (np.uint16, np.float32):
+    with bench.ring(dtype) as ring:
+        for number, frame in enumerate(simulated(3).astype(dtype)):
+            bench.send(ring, number, frame)
+    bench.detached()
+assert bench.engine.counters.processed == 6
+bench.close()
+sys.exit(compiled() != before)
+"""
+
+
+def test_it_is_ready_before_it_waits() -> None:
+    """All that measures frames, of both types, and makes commands is compiled before the first frame."""
+    ended = subprocess.run(
+        [sys.executable, "-c", NOTHING_IS_COMPILED_LATER], check=False, timeout=5 * LIMIT_S
+    )
+    assert ended.returncode == 0
+
+
+def test_frames_that_came_before_the_engine_was_there_count(bench: Bench) -> None:
+    """It waited for them: those that are overwritten meanwhile are lost, the others are measured."""
+    data = simulated(10)
+    with bench.ring() as ring:
+        for number, frame in enumerate(data):
+            ring.publish(frame, number)
+        bench.until(lambda: bench.engine.counters.frames_in == 10)
+    counters = bench.engine.counters
+    assert (counters.processed + counters.dropped, counters.skipped) == (10, 0)
+    assert 9 in bench.slopes
 
 
 def test_a_living_publisher_is_not_replaced(bench: Bench) -> None:

@@ -60,6 +60,20 @@ def test_many_numbers_are_left_out(bench: Bench) -> None:
     assert (counters.processed, counters.skipped, counters.dropped, counters.torn) == (2, 1000, 0, 0)
 
 
+@pytest.mark.parametrize("number", [2**62, 2**63 - 1])
+def test_a_frame_number_that_jumps(bench: Bench, number: int) -> None:
+    """Nothing is lost when a camera numbers its frames anew, ahead or from 0."""
+    data = simulated(2)
+    with bench.ring() as ring:
+        bench.attached()
+        for each in (5, number, 0, 1):
+            bench.send(ring, each, data[each % 2])
+    counters = bench.engine.counters
+    assert (counters.processed, counters.skipped, counters.dropped) == (4, 0, 0)
+    assert (counters.source_restarts, counters.repeated) == (1, 1)
+    assert bench.records["frame"].tolist() == [5, number, 0, 1]
+
+
 def test_overtaken_frames_are_dropped_never_mixed(bench: Bench) -> None:
     """A camera that does not wait: what is published belongs to one frame, the rest is counted."""
     data = simulated(8)

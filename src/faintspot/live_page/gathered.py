@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.io.frame_numbers import all_left_out
 from faintspot.live_page.batch import Batch, Floats
 from faintspot.realtime.interleaving import arms_after
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
@@ -202,8 +203,7 @@ class Gathered:
         frames = records["frame"]
         if self.newest is not None:
             frames = np.concatenate([[self.newest["frame"]], frames])
-        steps = np.diff(frames) - 1
-        return int(steps[steps > 0].sum())
+        return int(np.maximum(all_left_out(frames), 0).sum())
 
     def _strip_row(self, rows: Floats, lost: int, batch: Batch) -> tuple[float, ...]:
         latency, rms, flux = (rows[:, _FRAME.index(name)] for name in ("latency_us", "rms_px", "flux_e"))

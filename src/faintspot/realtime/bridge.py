@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from faintspot.checks import number_between
+from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.replay import ring_type
@@ -49,7 +50,7 @@ class BridgeCounters:
     stalls: int = 0
     """How often nothing came for `STALL_S`."""
     restarts: int = 0
-    """How often the stream was made anew."""
+    """How often the stream was made anew, or its count of publications jumped."""
 
 
 class StreamBridge:
@@ -170,7 +171,9 @@ class StreamBridge:
             ring.begin(number)[...] = slot.copy()
         ring.end()
         counters.frames += 1
-        counters.missed += max(0, publication.total - self._seen - 1)
+        missed = left_out(self._seen, publication.total)
+        counters.missed += max(missed, 0)
+        counters.restarts += missed < 0 and publication.total > self._seen
         counters.not_ahead += number <= self._last_number
         if self._silent and self._last_number >= 0:
             self._follower.say("goes on")

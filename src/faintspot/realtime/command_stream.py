@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.stream import Follower
 
 LARGEST_NM = 1e6
@@ -96,7 +97,7 @@ class CommandStream:
         if publication is None:
             counters.incomplete += 1
             return False
-        counters.overtaken += max(0, publication.total - self._seen - 1)
+        counters.overtaken += max(left_out(self._seen, publication.total), 0)
         self._seen = publication.total
         values = publication.values.astype(np.float64)
         if not np.all(np.abs(values) <= LARGEST_NM):

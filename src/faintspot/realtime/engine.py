@@ -12,6 +12,7 @@ import numpy as np
 from faintspot.configuration import to_text
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.errors import InputError
+from faintspot.io.frame_numbers import left_out
 from faintspot.pipeline import SlopePipeline
 from faintspot.realtime.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.realtime.engine_estimators import EngineEstimators
@@ -224,16 +225,22 @@ class Engine:
         watcher.start()
         if self._light is not None:
             self._light.start()
+        waited = False
         try:
             with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time, and nobody reads it
                 while not self._done(n_frames):
                     ring = self._attached()
                     if ring is None:
                         self._await_ring()
-                        continue
-                    self.preparer.ring = ring
-                    self._follow(ring, n_frames)
-                    self.preparer.ring = None
+                    else:
+                        # All frames of a ring that was waited for count; else those from now on.
+                        self._arrival, self._number = (
+                            (0, -1) if waited else (ring.arrivals, ring.progress()[0])
+                        )
+                        self.preparer.ring = ring
+                        self._follow(ring, n_frames)
+                        self.preparer.ring = None
+                    waited = True
         finally:
             self._stopping.set()
             watcher.join()
@@ -282,7 +289,6 @@ class Engine:
         self._take(ring)  # made before the first frame is waited for
         if self._workers is not None:
             self._workers.wake()
-        self._arrival, self._number = ring.arrivals, ring.progress()[0]
         while not self._done(n_frames):
             # What is in the ring already comes first: else every later frame would wait for its successor.
             behind = ring.arrivals > self._arrival
@@ -371,8 +377,10 @@ class Engine:
         counters.late += latency > self._deadline_ns
         counters.estimator_failures += path.failed
         if self._arrival and number != self._number + 1:
-            counters.skipped += max(number - self._number - 1, 0)
+            skipped = left_out(self._number, number)
+            counters.skipped += max(skipped, 0)
             counters.repeated += number <= self._number
+            counters.source_restarts += skipped < 0 and number > self._number
         self._measured[arm] = self._measured.get(arm, 0) + 1
         self._arrival, self._number = arrival, number
 

@@ -177,6 +177,8 @@ class FramePath:
         cells = np.zeros_like(progress.cells)  # of the same kind, so that nothing is compiled for it alone
         cells.flat[progress.frame_cell] = 1
         there = Progress(cells, progress.frame_cell, progress.rows_cell)
+        if self._prior is not None:
+            wait_for_rows(cells, progress.frame_cell, progress.rows_cell, 0, 1, self._control, STOP_CELL)
         for share in range(self._shares):
             self._work(share, (0, 0), there, self._explaining)
 

@@ -71,15 +71,24 @@ class PreparedSettings:
         if ring is not self._ring:
             if self.fallback is not None:
                 self.fallback.paths(ring)
-            self._paths = tuple(self._new_path(pipeline, ring) for pipeline in self.pipelines)
+            cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
+            columns = ring.cells.shape[1]
+            # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
+            progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
+            self._paths = tuple(self._new_path(pipeline, pixels, progress) for pipeline in self.pipelines)
             self._ring = ring
         return self._paths
 
-    def _new_path(self, pipeline: SlopePipeline, ring: PixelRing) -> FramePath:
-        cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
-        columns = ring.cells.shape[1]
-        # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
-        progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
+    def warm_up(self) -> None:
+        """Compile all that measures frames, while it is not known yet of which type they will be."""
+        if self.fallback is not None:
+            self.fallback.warm_up()
+        progress = Progress(np.zeros((2, 1), np.int64), 0, 1)
+        for dtype in (np.uint16, np.float32):
+            for pipeline in self.pipelines:
+                self._new_path(pipeline, np.zeros((1, *self.layout.frame_shape), dtype), progress)
+
+    def _new_path(self, pipeline: SlopePipeline, pixels: NDArray[Any], progress: Progress) -> FramePath:
         made_for = pipeline, pixels, progress
         path = (
             PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
@@ -122,7 +131,7 @@ class SettingsPreparer:
         self._built_in: Estimator = estimator_named("brightest")()
 
     def prepare(self, settings: Settings) -> PreparedSettings:
-        """Prepare settings; where there is a ring, for its frames.
+        """Prepare settings: for a ring's frames or, where there is no ring yet, for frames of any type.
 
         Raises
         ------
@@ -137,7 +146,9 @@ class SettingsPreparer:
         prepared = self._prepared(
             pipelines, settings, self.interleaving, None if own else self._fallback(settings)
         )
-        if self.ring is not None:
+        if self.ring is None:
+            prepared.warm_up()
+        else:
             prepared.paths(self.ring)
         if is_built_in(settings.estimator):
             self._built_in = settings.estimator

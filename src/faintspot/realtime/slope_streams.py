@@ -19,7 +19,7 @@ from faintspot.realtime.shared_streams import (
     lock_file,
     pyshmem_module,
 )
-from faintspot.slopes import Slopes
+from faintspot.slopes import RESULT_TYPES, Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""
@@ -76,6 +76,9 @@ class SlopeStreams:
         self._n, self._closed = n, False
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
+        self._fill_details(
+            Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), np.zeros((len(DETAILS), n), np.float32)
+        )
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -134,17 +137,14 @@ class SlopeStreams:
             iterations all took together.
         """
         with self._details.write_view_locked(frame_id=frame) as table:
-            self._fill(
-                slopes.flux,
-                slopes.flags,
-                slopes.iterations,
-                slopes.standard_error_x,
-                slopes.standard_error_y,
-                self._counts,
-                table,
-            )
+            self._fill_details(slopes, table)
         invalid, limited, iterations = self._counts.tolist()
         return invalid, limited, iterations
+
+    def _fill_details(self, slopes: Slopes, table: NDArray[np.float32]) -> None:
+        """Write the rows of `DETAILS`, and count."""
+        errors = slopes.standard_error_x, slopes.standard_error_y
+        self._fill(slopes.flux, slopes.flags, slopes.iterations, *errors, self._counts, table)
 
     def publish_marks(self, marks: tuple[int, ...]) -> None:
         """Publish with what and when a frame was measured; by the thread that holds the streams."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from faintspot.errors import InputError
+from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.image_stream import ImageStreamWriter
 from faintspot.realtime.stream import Follower, split_name
@@ -86,7 +87,7 @@ class StreamOut:
             return False
         assert self._writer is not None
         self._writer.publish(publication.values, publication.number)
-        self.missed += max(0, publication.total - self._seen - 1) if self._seen else 0
+        self.missed += max(left_out(self._seen, publication.total), 0) if self._seen else 0
         self._seen = publication.total
         self.published += 1
         return True

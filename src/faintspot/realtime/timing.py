@@ -173,7 +173,7 @@ class Counters:
     settings_refused: int = 0
     """Changes that were refused."""
     source_restarts: int = 0
-    """How often the source went away and came back."""
+    """How often the source went away and came back, or its frame numbers jumped too far ahead."""
     commands_renewed: int = 0
     """How often NAME_commands was removed and made anew."""
     estimator_failures: int = 0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.compare.statistics import Estimate, mean_by_blocks
+from faintspot.io.frame_numbers import all_left_out
 from faintspot.io.telemetry import Telemetry
 
 Floats = NDArray[np.float64]
@@ -59,9 +60,14 @@ def timing(telemetry: Telemetry) -> Timing:
 
 
 def gaps(telemetry: Telemetry) -> list[Gap]:
-    """Return where frame numbers are missing; a camera that began anew (smaller numbers) lost none there."""
-    step = np.diff(telemetry.frame)
-    return [Gap(int(telemetry.frame[i]), int(step[i]) - 1) for i in np.flatnonzero(step > 1)]
+    """Return where frame numbers are missing; none are where the camera began anew."""
+    lost = all_left_out(telemetry.frame)
+    return [Gap(int(telemetry.frame[i]), int(lost[i])) for i in np.flatnonzero(lost > 0)]
+
+
+def restarts(telemetry: Telemetry) -> int:
+    """Return how often the camera's frame numbers began anew."""
+    return int(np.count_nonzero(all_left_out(telemetry.frame) < 0))
 
 
 def arm_names(telemetry: Telemetry) -> list[str]:

@@ -20,6 +20,7 @@ from faintspot.recorded.telemetry_numbers import (
     change_rows,
     gaps,
     quantities,
+    restarts,
     timing,
 )
 from faintspot.recorded.wavefront_section import wavefront_sections
@@ -121,6 +122,7 @@ def _lost(telemetry: Telemetry) -> Section:
         ["of them overwritten before the recorder read them", str(dropped["records"])],
         ["gaps", str(len(found))],
         ["longest gap, frames", str(max((gap.lost for gap in found), default=0))],
+        ["times that frame numbers began anew", str(restarts(telemetry))],
         ["images lost to the record", str(dropped["images"])],
         ["changes of settings lost to the record", str(dropped["changes"])],
     ]
