@@ -33,7 +33,14 @@ def test_arrows_are_cut_where_a_few_are_wild() -> None:
 def test_arrows_that_are_cut_are_said_to_be() -> None:
     layout = Layout.grid((10, 10), pixels=8)
     for wild, said in ((0.0, False), (50.0, True)):
-        html = slopes_report([slopes(wild)], layout=layout, stages=None, title="", facts={}, configuration="")
+        html = slopes_report(
+            [slopes(wild)],
+            layout=layout,
+            stages=None,
+            title="",
+            facts={},
+            configurations={"Configuration": ""},
+        )
         assert ("Arrows longer than 0.15 px" in html) == said
 
 

@@ -27,7 +27,7 @@ def page_of(of: Layout, frames: Any, true: Any = None, **changes: Any) -> Page:
         "truth": true,
         "title": "A <test> & more",
         "facts": {"Sources": "frames.fits"},
-        "configuration": "[settings]\nnoise_std = 0.3 # <b>",
+        "configurations": {"Configuration": "[settings]\nnoise_std = 0.3 # <b>"},
     }
     return Page(slopes_report(arms, **(arguments | changes)))
 
@@ -107,7 +107,9 @@ def test_one_arm_and_hexagonal_layout() -> None:
     layout = Layout((20, 22), (8, 8), corners, geometry="hexagonal", pitch_px=10.0)
     frames, _ = simulated(layout, 3)
     arm = MeasuredSlopes.of("no TV", SlopePipeline(layout, SETTINGS.replace(denoise=False))(frames))
-    html = slopes_report([arm], layout=layout, stages=None, title="t", facts={}, configuration="")
+    html = slopes_report(
+        [arm], layout=layout, stages=None, title="t", facts={}, configurations={"Configuration": ""}
+    )
     text = Page(html).text
     assert "hexagonal" in text
     assert "iterations" not in Page(html).ids
@@ -131,7 +133,9 @@ def test_warnings_say_what_to_do_next() -> None:
     flags[:, 1] = 8  # SATURATED
     flags[:, 2] = 32  # NOT_CONVERGED
     arm = MeasuredSlopes("TV", x, x, x + 5, flags, x.astype(int) + 7)
-    html = slopes_report([arm], layout=None, stages=None, title="t", facts={}, configuration="")
+    html = slopes_report(
+        [arm], layout=None, stages=None, title="t", facts={}, configurations={"Configuration": ""}
+    )
     text = Page(html).text
     assert "20.0 % of the measurements had no light. Next: check that the windows lie on the spots" in text
     assert "20.0 % of the measurements were saturated" in text
@@ -155,7 +159,9 @@ def test_parts_that_do_not_fit_are_refused_in_one_line() -> None:
     arms = two_arms(layout, frames)[0]
     for wrong in ([], [arms[0], arms[0]], [arms[0], two_arms(layout, frames[:1])[0][1]]):
         with pytest.raises(InputError, match="arms: expected"):
-            slopes_report(wrong, layout=layout, stages=None, title="t", facts={}, configuration="")
+            slopes_report(
+                wrong, layout=layout, stages=None, title="t", facts={}, configurations={"Configuration": ""}
+            )
 
 
 @pytest.mark.usefixtures("undrawn_pictures")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from tests.recorded.recorded_cases import Page
 from faintspot.errors import InputError
 from faintspot.io.telemetry import Telemetry, TelemetryStore, read_telemetry
 from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
+from faintspot.recorded.telemetry_figures import latency_figure
 from faintspot.recorded.telemetry_numbers import arms_in_turn, change_rows, gaps, quantities, timing
 from faintspot.recorded.telemetry_page import report_of_telemetry
 from faintspot.sensor.layout import Layout
@@ -97,6 +99,25 @@ def test_page(path: Path) -> None:
         "bench",
     ):
         assert words in page.text
+
+
+def test_key_numbers_are_those_of_each_method(path: Path) -> None:
+    """The arms have 0.20 and 0.16 px of noise; together they would have 0.18."""
+    text = Page(report_of_telemetry(path)).text
+    numbers = text[text.index("method noise (px)") :]
+    noise = [float(numbers.split(f" {name} ", 1)[1].split()[0]) for name in ("none", "tv")]
+    assert noise == pytest.approx([RMS_PX[0], RMS_PX[1]], rel=0.05)
+
+
+@pytest.mark.parametrize("n_frames", [1, 7, 99])
+def test_latencies_of_a_short_record_are_drawn(path: Path, n_frames: int) -> None:
+    night = read_telemetry(path)
+    arrays = {f.name: getattr(night, f.name) for f in fields(night)}
+    short = {name: value[:n_frames] if np.shape(value)[:1] == (len(night.frame),) else value
+             for name, value in arrays.items()}  # fmt: skip
+    axes = latency_figure(Telemetry(**short)).figure.axes[1]
+    assert all(np.size(line.get_xdata()) >= min(n_frames, 20) for line in axes.lines)
+    assert all(line.get_marker() == "o" for line in axes.lines)
 
 
 def test_without_frames(tmp_path: Path) -> None:

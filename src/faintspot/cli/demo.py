@@ -174,6 +174,6 @@ def write_page(folder: Path, arms: list[Arm], **shown: Any) -> None:
         **shown,
         title="faintspot demonstration",
         facts=facts,
-        configuration=(folder / "tv.toml").read_text(encoding="utf-8"),
+        configurations={"Configuration": (folder / "tv.toml").read_text(encoding="utf-8")},
     )
     write_report(folder / "report.html", html)

@@ -29,7 +29,7 @@ def slopes_report(
     truth: ArrayLike | None = None,
     title: str,
     facts: Mapping[str, str],
-    configuration: str,
+    configurations: Mapping[str, str],
     example_frame: int = 0,
     warnings: Sequence[str] = (),
     why_no_stages: str = "Not drawn: no frame was given.",
@@ -52,8 +52,8 @@ def slopes_report(
     title : str
     facts : mapping of str
         What was run, for the top of the page, as sources and settings in words.
-    configuration : str
-        TOML text; "" when not known.
+    configurations : mapping of str
+        TOML text by the name of what it is of; "" when not known.
     example_frame : int
     warnings : sequence of str
         Shown before those found in the slopes.
@@ -85,9 +85,9 @@ def slopes_report(
             sections=[
                 *all_sections(run),
                 *wavefront_sections(wavefronts or {}, layout),
-                configuration_section(configuration),
+                *(configuration_section(text, name) for name, text in configurations.items()),
             ],
-            warnings=[*warnings, *warnings_in_words(run.arms, run.summaries)],
+            warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run.arms, run.summaries)],
             remark=POSITIONS,
         )
     )

@@ -64,13 +64,26 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         stages=stages,
         title=f"Slopes of {' and '.join(store.path.name for store in stores)}",
         facts=_facts(stores, arms),
-        configuration="\n\n".join(dict.fromkeys(store.text for store in stores)),
+        configurations=_configurations(stores, arms),
         example_frame=example_frame,
         steps=(first.estimator or TotalVariation).steps_shown,
-        warnings=list(dict.fromkeys([note for store in stores for note in store.notes] + notes)),
+        warnings=list(dict.fromkeys([*_labelled_notes(stores, arms), *notes])),
         why_no_stages=reason,
         wavefronts=_wavefronts(stores, arms),
     )
+
+
+def _configurations(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> dict[str, str]:
+    """Return the configurations by what they are of: one where all are the same."""
+    if len({store.text for store in stores}) == 1:
+        return {"Configuration": stores[0].text}
+    return {f"Configuration of {arm.name}": store.text for store, arm in zip(stores, arms, strict=True)}
+
+
+def _labelled_notes(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> list[str]:
+    """Return the notes of all runs, with the name of their method where there are several."""
+    labels = [f"{arm.name}: " if len(arms) > 1 else "" for arm in arms]
+    return [label + note for label, store in zip(labels, stores, strict=True) for note in store.notes]
 
 
 def _check_same_sensor(first: StoredRun, other: StoredRun) -> None:
@@ -107,7 +120,8 @@ def _arms(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]
         arrays = [variables[of][: min(counts)] for of in ARRAYS]
         # Iterations of other estimators are their own steps.
         denoised = None if store.estimator is None or store.estimator.denoises else False
-        arms.append(MeasuredSlopes(name, *arrays, denoised=denoised))
+        stated = _median_standard_error(store)
+        arms.append(MeasuredSlopes(name, *arrays, denoised=denoised, standard_error_px=stated))
     return arms, notes
 
 
@@ -219,9 +233,6 @@ def _facts(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> dict[
             words = store.estimator.in_words(len(store.layout), store.layout.pixels) + _range_in_words(store)
         of = f" of {arm.name!r}" if len(arms) > 1 else ""
         facts[f"Settings{of}"] = words
-        error_px = _median_standard_error(store)
-        if np.isfinite(error_px):
-            facts[f"Median standard error{of}"] = f"{error_px:.3g} px per axis"
     if any("reference" in store.stored.attributes for store in stores):
         facts["Reference"] = "slopes are relative to stored reference positions; crosses in pictures are not"
     return {**facts, "Measured with": f"faintspot {', '.join(versions)}"}

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.flags import SubapertureFlag
 from faintspot.recorded import frame_pictures, maps
 from faintspot.recorded.advice import FLAG_MEANINGS, FLAGS_OF_DENOISING, percentage
+from faintspot.recorded.key_numbers import Comparison, key_numbers, number_text
 from faintspot.recorded.statistics import (
     Floats,
     Jitter,
     MeasuredSlopes,
     SlopesSummary,
-    error_ratio,
-    flux_gain,
     jitter,
     median,
     rms,
-    slope_error,
     summarise,
     valid_in_all,
 )
@@ -51,8 +47,9 @@ class Run:
     steps: Sequence[Step]
     summaries: Sequence[SlopesSummary]
     jitters: Sequence[Jitter]
-    valid: NDArray[np.bool_]
-    """Measurements that are valid in every arm."""
+    valid: Sequence[NDArray[np.bool_]]
+    """Which measurements of each arm are compared: those that are valid in every arm of the same frames."""
+    comparison: Comparison
 
 
 def make_run(
@@ -64,8 +61,9 @@ def make_run(
     why_no_stages: str,
     steps: Sequence[Step],
 ) -> Run:
-    """Compute the numbers of a run."""
-    valid = valid_in_all(arms)
+    """Compute the numbers of a run; arms with frames of their own are each taken by themselves."""
+    same = all(np.array_equal(arm.number, arms[0].number) for arm in arms)
+    valid = [valid_in_all(arms)] * len(arms) if same else [arm.valid for arm in arms]
     return Run(
         arms,
         layout,
@@ -75,8 +73,9 @@ def make_run(
         why_no_stages,
         steps,
         [summarise(arm) for arm in arms],
-        [jitter(arm.x, arm.y, valid) for arm in arms],
+        [jitter(arm.x, arm.y, used) for arm, used in zip(arms, valid, strict=True)],
         valid,
+        Comparison.of(arms, valid),
     )
 
 
@@ -98,107 +97,7 @@ def all_sections(run: Run) -> list[Section]:
 
 def _key_numbers(run: Run) -> Section:
     scale = None if run.layout is None else run.layout.pixel_scale_arcsec
-    columns = [_arm_numbers(*arm, scale) for arm in zip(run.arms, run.summaries, run.jitters, strict=True)]
-    notes = []
-    if run.truth is not None:
-        errors, note = _truth_numbers(run, run.truth)
-        columns = [column | more for column, more in zip(columns, errors, strict=True)]
-        notes.append(note)
-    names = dict.fromkeys(chain(*sorted(columns, key=lambda column: -len(column))))
-    rows = [[name, *(column.get(name, "–") for column in columns)] for name in names]
-    table = Table(["", *(arm.name for arm in run.arms)], rows, caption=_about_the_numbers(run))
-    return Section("numbers", "Key numbers", tables=[table], text=notes)
-
-
-def _about_the_numbers(run: Run) -> str:
-    n_frames, n = run.arms[0].x.shape
-    text = f"One measurement is one sub-aperture in one frame: {n_frames} × {n} = {n_frames * n}. "
-    text += (
-        "Flux, iterations and the fraction at the limit are of the valid ones."
-        if any(arm.is_denoised for arm in run.arms)
-        else "Flux is that of the valid ones."
-    )
-    if n_frames == 1:
-        return text
-    frames = run.jitters[0].n_frames[run.jitters[0].measured]
-    span = f" ({frames.min()} to {frames.max()} frames each)" if frames.size else ""
-    valid = ", over the frames that are valid in every arm" if len(run.arms) > 1 else ""
-    return (
-        f"{text} Jitter is the standard deviation over the frames of the position in a sub-aperture{valid}, "
-        f"from {len(frames)} of {n} sub-apertures{span}; it includes real motion of the spot."
-    )
-
-
-def _arm_numbers(
-    arm: MeasuredSlopes, summary: SlopesSummary, scatter: Jitter, scale: float | None
-) -> dict[str, str]:
-    numbers = {
-        "valid measurements": percentage(summary.valid_fraction),
-        "median flux": _number(summary.median_flux_e, "e-", 3),
-    }
-    if arm.is_denoised:
-        some = np.isfinite(summary.median_iterations)
-        numbers |= {
-            "median iterations": f"{summary.median_iterations:.0f}" if some else "–",
-            "hit the iteration limit": percentage(summary.limit_fraction),
-            "strength lowered, too strong for the image": percentage(_infeasible(arm)),
-        }
-    if arm.n_frames == 1:
-        return numbers
-    if scale is not None:
-        numbers["slope jitter, median, in arcsec"] = _number(median(scatter.px) * scale, "arcsec", 3)
-    return numbers | {
-        "slope jitter, rms of all sub-apertures": _number(rms(scatter.px), "px", 3),
-        "slope jitter, median": _number(median(scatter.px), "px", 3),
-        "slope jitter, median, x | y": f"{_number(median(scatter.x_px), '', 3)} | "
-        + _number(median(scatter.y_px), "px", 3),
-        "slope jitter, median, from absolute deviations": _number(median(scatter.robust_px), "px", 3),
-    }
-
-
-def _infeasible(arm: MeasuredSlopes) -> float:
-    return arm.flag_count(SubapertureFlag.INFEASIBLE_STRENGTH) / arm.flags.size
-
-
-def _truth_numbers(run: Run, truth: Floats) -> tuple[list[dict[str, str]], str]:
-    """Return the rows that need the truth, by arm, and what to say about them."""
-    columns = []
-    last = run.arms[-1]
-    for arm in run.arms:
-        error = slope_error(arm, truth, run.valid)
-        column = {
-            "slope error R": f"{_number(error.mean_px, '', 4)} ± {_number(error.standard_error_px, 'px', 2)}",
-            "centroid gain": _number(error.gain, "", 3),
-        }
-        if len(run.arms) > 1:
-            column |= _against(arm, last, truth, run.valid)
-        columns.append(column)
-    shared = "valid" if len(run.arms) == 1 else "valid in every arm"
-    note = (
-        f"The true positions are known; they lie between {truth.min():.2f} and {truth.max():.2f} px. R is "
-        f"the mean of (|dx| + |dy|) / 2 over the {np.count_nonzero(run.valid)} measurements that are "
-        f"{shared}, ± its standard error. The centroid gain is the slope of the measured on the true "
-        "position: below 1 an estimator shrinks all motion."
-    )
-    if len(run.arms) > 1:
-        note += (
-            f" The flux gain says how many times less light gives the same R as {last.name!r}; it is a "
-            "range, as R falls as 1 / flux where read noise rules (lower end when the arm is better) and as "
-            "1 / √flux where photon noise does. It is worked out from R at this one flux, not measured by "
-            "dimming the light."
-        )
-    return columns, note
-
-
-def _against(
-    arm: MeasuredSlopes, last: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
-) -> dict[str, str]:
-    ratio, error = error_ratio(arm, last, truth, valid)
-    names = f"R of {last.name!r} / R", f"flux gain against {last.name!r}"
-    if arm is last or not np.isfinite(ratio):
-        return dict.fromkeys(names, "–")
-    low, high = flux_gain(ratio)
-    return {names[0]: f"{ratio:.3f} ± {_number(error, '', 2)}", names[1]: f"{low:.2f} to {high:.2f}"}
+    return key_numbers(run.comparison, run.summaries, run.jitters, run.valid[-1], run.truth, scale)
 
 
 def _frame(run: Run) -> Section:
@@ -289,13 +188,14 @@ def _slopes(run: Run) -> Section:
     if run.layout is None:
         return Section("slopes", "Mean slopes", missing=NO_LAYOUT)
     tilts = "; ".join(
-        f"{arm.name}: x {_number(_mean(summary.x_px), '', 3)}, y {_number(_mean(summary.y_px), 'px', 3)}"
+        f"{arm.name}: x {number_text(_mean(summary.x_px), '', 3)}, "
+        f"y {number_text(_mean(summary.y_px), 'px', 3)}"
         for arm, summary in zip(run.arms, run.summaries, strict=True)
     )
     noise = ""
     if run.jitters[0].measured.any():
         errors = "; ".join(
-            f"{arm.name}: {_number(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
+            f"{arm.name}: {number_text(median(item.px / np.sqrt(np.maximum(item.n_frames, 1))), 'px', 2)}"
             for arm, item in zip(run.arms, run.jitters, strict=True)
         )
         noise = (
@@ -307,8 +207,8 @@ def _slopes(run: Run) -> Section:
     cut = ""
     if number:
         cut = (
-            f" Arrows longer than {_number(longest, 'px', 2)} (1.5 times the {maps.ARROWS_WHOLE_PERCENT}th "
-            f"percentile) are drawn black, at that length: {number}."
+            f" Arrows longer than {number_text(longest, 'px', 2)} (1.5 times the "
+            f"{maps.ARROWS_WHOLE_PERCENT}th percentile) are drawn black, at that length: {number}."
         )
     caption = (
         f"{what}, all panels at one scale (key below each).{cut} Sub-apertures without an arrow but a grey "
@@ -328,9 +228,11 @@ def _iterations(run: Run) -> Section:
         return Section("iterations", "Iterations", missing=NO_LAYOUT)
     if not any(arm.valid.any() for arm, _ in denoised):
         return Section("iterations", "Iterations", missing="Not drawn: no measurement is valid.")
+    medians = "; ".join(f"{arm.name}: {number.median_iterations:.0f}" for arm, number in denoised)
     caption = (
-        "Left: mean iterations of the denoiser. Right: how often each number occurred, over valid "
-        "measurements. A pile at the right end is the iteration limit; faint sub-apertures take longest."
+        f"Median iterations: {medians}. Left: mean iterations of the denoiser. Right: how often each "
+        "number occurred, over valid measurements. A pile at the right end is the iteration "
+        "limit; faint sub-apertures take longest."
     )
     arms, summaries = zip(*denoised, strict=True)
     figure = maps.iteration_counts(arms, summaries, run.layout)
@@ -348,7 +250,7 @@ def _jitter(run: Run) -> Section:
         "1 shrinks noise and motion alike."
     ]
     if run.truth is not None:
-        moved = jitter(run.truth[..., 0], run.truth[..., 1], run.valid)
+        moved = jitter(run.truth[..., 0], run.truth[..., 1], run.valid[-1])
         text.append(f"The true motion in these frames is {rms(moved.px):.3f} px rms.")
     caption = (
         "Dots: standard deviation over the frames. Line: the same from the median absolute deviation, which "
@@ -370,13 +272,3 @@ def _jitter(run: Run) -> Section:
 def _mean(values: Floats) -> float:
     kept = values[np.isfinite(values)]
     return float(kept.mean()) if kept.size else np.nan
-
-
-def _number(value: float, unit: str, digits: int) -> str:
-    """Return a number with that many significant digits; a dash where there is none."""
-    if not np.isfinite(value):
-        return "–"
-    text = f"{value:#.{digits}g}".rstrip(".")
-    if "e" in text:
-        text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.1e}"
-    return f"{text} {unit}".rstrip()

@@ -44,6 +44,10 @@ class MeasuredSlopes:
     denoised : bool, optional
         Whether the iterations are those of a denoiser, rather than an estimator's own steps. Default: where
         there are any.
+    frames : (n_frames,) array of int, optional
+        Frame numbers; frames follow each other where these do. Default: counted from 0.
+    standard_error_px : float
+        Median standard error that the estimator states, per axis; NaN where it is not known.
 
     Raises
     ------
@@ -58,6 +62,8 @@ class MeasuredSlopes:
     flags: NDArray[Any]
     iterations: NDArray[Any]
     denoised: bool | None = field(default=None, kw_only=True)
+    frames: NDArray[np.int64] | None = field(default=None, kw_only=True)
+    standard_error_px: float = field(default=np.nan, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -70,9 +76,14 @@ class MeasuredSlopes:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def of(cls, name: str, slopes: Any) -> MeasuredSlopes:
+    def of(cls, name: str, slopes: Any, **more: Any) -> MeasuredSlopes:
         """Make one of the `Slopes` of one frame or several."""
-        return cls(name, *(np.atleast_2d(getattr(slopes, of)) for of in ARRAYS))
+        return cls(name, *(np.atleast_2d(getattr(slopes, of)) for of in ARRAYS), **more)
+
+    @property
+    def number(self) -> NDArray[np.int64]:
+        """Number of each frame."""
+        return np.arange(len(self.x)) if self.frames is None else self.frames
 
     @property
     def n_frames(self) -> int:
@@ -202,6 +213,51 @@ def jitter(x: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> Jitter
         robust = [robust_std_over_valid(axis[:, block], kept) for axis in (x, y)]
         columns.append((*stds, np.sqrt((robust[0] ** 2 + robust[1] ** 2) / 2)))
     return Jitter(valid.sum(axis=0), *(np.concatenate(part) for part in zip(*columns, strict=True)))
+
+
+def frame_to_frame_noise(arm: MeasuredSlopes, valid: NDArray[np.bool_]) -> Floats:
+    """Return the noise per axis of each sub-aperture, px, from successive frames; NaN without any."""
+    columns = []
+    for block in column_blocks(arm.n_frames, arm.n_subapertures):
+        both = _successive(arm, valid[:, block])
+        squares = sum(np.diff(axis[:, block].astype(np.float64), axis=0) ** 2 for axis in (arm.x, arm.y))
+        columns.append(np.sqrt(mean_over_valid(np.asarray(squares) / 4, both)))
+    return np.concatenate(columns)
+
+
+def relative_gain(
+    arm: MeasuredSlopes, reference: MeasuredSlopes, valid: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Return the centroid gain of an arm over that of another one, and its standard error.
+
+    Both are regressed on the slopes of the frames before and after, whose noise is independent: only motion
+    and aberrations that last for two frames count. NaN where there are none.
+    """
+    if arm is reference:
+        return 1.0, 0.0
+    own, other = np.zeros(arm.n_subapertures), np.zeros(arm.n_subapertures)
+    kept = np.maximum(np.count_nonzero(valid), 1)
+    for axis in ("x", "y"):
+        pair = [getattr(each, axis) for each in (arm, reference)]
+        means = [float(np.sum(values, where=valid, dtype=np.float64)) / kept for values in pair]
+        for block in column_blocks(arm.n_frames, arm.n_subapertures):
+            both = _successive(arm, valid[:, block])
+            a, b = (values[:, block] - mean for values, mean in zip(pair, means, strict=True))
+            common = a + b
+            for sums, values in ((own, a), (other, b)):
+                lagged = values[1:] * common[:-1] + values[:-1] * common[1:]
+                sums[block] += np.sum(lagged, axis=0, where=both, dtype=np.float64)
+    if other.sum() <= 0:
+        return np.nan, np.nan
+    ratio = float(own.sum() / other.sum())
+    n = max(len(own) - 1, 1)
+    return ratio, float(np.sqrt(np.sum((own - ratio * other) ** 2) * len(own) / n) / other.sum())
+
+
+def _successive(arm: MeasuredSlopes, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where a measurement and that of the next frame are valid, (n_frames - 1, n)."""
+    both: NDArray[np.bool_] = valid[1:] & valid[:-1] & (np.diff(arm.number) == 1)[:, None]
+    return both
 
 
 def rms(values: Floats) -> float:

@@ -12,7 +12,8 @@ from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, style
 from faintspot.report.figure_data import FigureWithData
 
 _BINS = 80
-_MOST_TIMES, _FEWEST_TOGETHER = 400, 50  # points of the course in time, frames in each
+# Points of the course in time, frames in each, and so many points that they are drawn as dots.
+_MOST_TIMES, _FEWEST_TOGETHER, _FEW_TIMES = 400, 50, 20
 
 
 @styled
@@ -33,17 +34,23 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
     left.set(xscale="log", yscale="log", xlabel="latency (µs)", ylabel="frames", ylim=(0.7, None))
     if len(np.unique(telemetry.arm)) > 1:
         left.legend(frameon=False)
-    stretches = min(_MOST_TIMES, max(1, len(latency) // _FEWEST_TOGETHER))
+    stretches = min(_MOST_TIMES, max(min(_FEW_TIMES, len(latency)), len(latency) // _FEWEST_TOGETHER))
+    marker = "o" if stretches <= _FEW_TIMES else ""
     parts = np.array_split(np.arange(len(latency)), stretches)
     time = (telemetry.last_row_time_ns - telemetry.last_row_time_ns[0]) / 1e9
     middle = [float(time[part].mean()) for part in parts]
-    right.plot(middle, [latency[part].max() for part in parts], color=GREY, lw=1, label="longest")
-    right.plot(middle, [np.median(latency[part]) for part in parts], color="black", lw=1.3, label="median")
+    right.plot(
+        middle, [latency[part].max() for part in parts], color=GREY, marker=marker, lw=1, label="longest"
+    )
+    medians = [np.median(latency[part]) for part in parts]
+    right.plot(middle, medians, color="black", marker=marker, ms=3, lw=1.3, label="median")
     right.set(yscale="log", xlabel="time since the first frame (s)", ylabel="latency (µs)")
     right.legend(frameon=False)
+    together = len(parts[0])
+    course = f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
     caption = (
-        "Left: how often each latency occurred. Right: median and longest of stretches of "
-        f"{len(parts[0])} frames. Look for a second hump and for spikes at regular times: another program "
+        f"Left: how often each latency occurred. Right: {course}. Look for a second hump and for spikes at "
+        "regular times: another program "
         "that takes the processor."
     )
     return FigureWithData("latency", "Latency", caption, figure, ("arm", "from_us", "to_us", "frames"), rows)

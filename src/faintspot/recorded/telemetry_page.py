@@ -11,7 +11,7 @@ from faintspot.errors import InputError
 from faintspot.io.telemetry import Telemetry, read_telemetry
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
-from faintspot.recorded.statistics import MeasuredSlopes
+from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.telemetry_figures import arms_figure, latency_figure
 from faintspot.recorded.telemetry_numbers import (
     PERCENTILES,
@@ -46,8 +46,7 @@ def report_of_telemetry(path: str | Path) -> str:
     if len(telemetry.frame) == 0:
         raise InputError(f"{path}: expected telemetry, no frame is recorded yet")
     layout = Layout(**telemetry.attributes["layout"])
-    arms = [MeasuredSlopes.of("all frames", telemetry)]
-    run = make_run(arms, layout, {}, None, 0, "", ())
+    run = make_run(_measured(telemetry), layout, {}, None, 0, "", ())
     sections = [_timing(telemetry), _lost(telemetry)]
     if len(arm_names(telemetry)) > 1:
         sections.append(_arms(telemetry))
@@ -58,10 +57,28 @@ def report_of_telemetry(path: str | Path) -> str:
             title=f"Telemetry of {Path(path).name}",
             facts=_facts(telemetry, Path(path)),
             sections=[*sections, configuration_section(settings)],
-            warnings=[*_warnings(telemetry), *warnings_in_words(run.arms, run.summaries)],
+            warnings=[
+                *_warnings(telemetry),
+                *run.comparison.warnings(),
+                *warnings_in_words(run.arms, run.summaries),
+            ],
             remark=POSITIONS,
         )
     )
+
+
+def _measured(telemetry: Telemetry) -> list[MeasuredSlopes]:
+    """Return the slopes of every arm, each with the frames that it measured."""
+    errors = np.hypot(telemetry.standard_error_x, telemetry.standard_error_y) / np.sqrt(2)
+    measured = []
+    for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
+        rows = telemetry.arm == arm
+        arrays = [getattr(telemetry, of)[rows] for of in ARRAYS]
+        known = errors[rows][np.isfinite(errors[rows])]
+        stated = float(np.median(known)) if known.size else np.nan
+        frames = telemetry.frame[rows].astype(np.int64)
+        measured.append(MeasuredSlopes(name, *arrays, frames=frames, standard_error_px=stated))
+    return measured
 
 
 def _facts(telemetry: Telemetry, path: Path) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -199,7 +200,8 @@ def data_uri(ending: str, content: bytes) -> str:
 def configuration_section(text: str, name: str = "Configuration") -> Section:
     """Return the section that shows a configuration or a specification; "" when it is not known."""
     missing = "" if text.strip() else f"The {name.lower()} of this run is not known."
-    return Section(name.lower(), name, code=text.strip(), missing=missing)
+    identifier = "-".join(re.findall(r"\w+", name.lower()))
+    return Section(identifier, name, code=text.strip(), missing=missing)
 
 
 def style() -> str:
