@@ -78,8 +78,8 @@ CONFIGURATION = f"""
 shape = [{SIDE}, {SIDE}]
 pixels = {PIXELS}
 
-[settings]
-estimator = "thresholded"
+[estimator]
+name = "thresholded"
 threshold_e = 0.0
 
 [calibration]

@@ -23,7 +23,8 @@ pixels = {pixels}
 outer_radius = {outer_radius}
 inner_radius = {inner_radius}
 
-[settings]
+[estimator]
+name = "tv"
 noise_std = {noise_std}
 keep_brightest = 12
 tolerance = {tolerance}

@@ -35,7 +35,8 @@ pixels = 16
 outer_radius = 3.5
 inner_radius = 0.5
 
-[settings]
+[estimator]
+name = "tv"
 noise_std = 2.0
 keep_brightest = 12
 

@@ -17,8 +17,6 @@ from faintspot.options import PerSubaperture
 
 LAYOUT = "[layout.grid]\nshape = [2, 3]\npixels = 4\n"
 SETTINGS = '[estimator]\nname = "tv"\nnoise_std = 0.5\n'
-FORMER = "[settings]\nnoise_std = 0.5\n"
-"""As version 0.1 wrote it."""
 
 
 def written(folder: Path, text: str) -> Path:
@@ -263,50 +261,9 @@ def test_some_subapertures(tmp_path: Path) -> None:
 
 
 def test_no_calibration_means_electrons(tmp_path: Path) -> None:
-    path = written(tmp_path, LAYOUT + FORMER)
+    path = written(tmp_path, LAYOUT + SETTINGS)
     assert fs.Calibration.load(path) == fs.Calibration()
     assert configuration.load_all(path)[2] == fs.Calibration()
-
-
-# Settings of version 0.1 -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("former", "now"),
-    [
-        ("noise_std = 0.5", fs.Settings("tv", noise_std=0.5)),
-        ('estimator = "cog"\nnoise_std = 0.5\ndenoise = true', fs.Settings("tv", noise_std=0.5)),
-        ("denoise = false\nkeep_brightest = 7\nnoise_std = 2", fs.Settings("brightest", keep_brightest=7)),
-        (
-            "noise_std = 2.0\ndenoise = { default = true, 3 = false }",
-            fs.Settings("tv", noise_std=PerSubaperture(2.0, {3: 0.0})),
-        ),
-        ("noise_std = 2.0\ndenoise = [true, false]", fs.Settings("tv", noise_std=[2.0, 0.0])),
-        (
-            'estimator = "ml"\nmodel_error = 0.2\nnoise_std = 1.0\nkeep_brightest = 7\ndenoise = false\n'
-            "flux_floor = 0.1\nsearch_range_px = 3.0",
-            fs.Settings("ml", model_error=0.2, search_range_px=3.0),
-        ),
-        (
-            'estimator = "thresholded"\nthreshold_e = 4\nsmoothing_px = 1\nprior_std_px = 1\nflux_e = 9',
-            fs.Settings("thresholded", threshold_e=4.0, flux_e=9.0),
-        ),
-        ('estimator = "smoothed"\nkeep_brightest = 7\nsteps = 3', fs.Settings("smoothed", keep_brightest=7)),
-    ],
-)
-def test_former_settings(former: str, now: fs.Settings, tmp_path: Path) -> None:
-    """Options that say nothing to the estimator are left out; saving writes today's form."""
-    path = written(tmp_path, f"# mine\n{LAYOUT}\n[settings]\n{former}\n")
-    settings = fs.Settings.load(path)
-    assert settings == now
-    assert configuration.has(path, "settings")
-    settings.save(path)
-    text = path.read_text()
-    assert f'[estimator]\nname = "{now.estimator.name}"' in text
-    assert text.startswith("# mine\n[layout.grid]")
-    assert "denoise" not in text
-    assert fs.Settings.load(path) == now
-    assert len(configuration.load_all(path).layout) == 6
 
 
 def test_an_estimator_alone_is_enough(tmp_path: Path) -> None:
@@ -325,14 +282,14 @@ def estimator(text: str) -> str:
     [
         ("setings: unknown table; did you mean settings?", "[setings]\n"),
         ("colours: unknown table; known: layout, calibration, estimator, settings", "[colours]\n"),
-        ("expected a table [settings], found layout", LAYOUT),
-        ("expected a table [settings], found none", ""),
+        ("expected a table [estimator], found layout", LAYOUT),
+        ("expected a table [estimator], found none", ""),
+        ("expected a table [estimator], found settings", "[settings]\nflux_e = 1"),
         ("settings: expected a table, got 3", "settings = 3"),
         ("estimator: expected a table, got 'ml'", "estimator = 'ml'"),
         ("estimator.name: expected one of brightest, tv", "[estimator]\nnoise_std = 1"),
         ("estimator = 'newton': expected one of", "[estimator]\nname = 'newton'"),
         ("estimator = 3: expected one of", "[estimator]\nname = 3"),
-        ("'gaussian' is now 'smoothed'", "[estimator]\nname = 'gaussian'"),
         (
             "estimator.noise_sdt: unknown option of 'tv'; did you mean noise_std?",
             estimator("noise_sdt = 1"),
@@ -360,13 +317,6 @@ def estimator(text: str) -> str:
             "settings: expected arrays of one length",
             estimator("noise_std = [1, 2]\n[settings]\nflux_e = [1, 2, 3]"),
         ),
-        # As version 0.1 wrote them.
-        ("settings.noise_sdt: unknown", "[settings]\nnoise_sdt = 1"),
-        ("settings.noise_std: expected a number (electrons)", "[settings]\n"),
-        ("settings.noise_std = -1: expected a number of at least 0", "[settings]\nnoise_std = -1"),
-        ("settings.noise_std.first", "[settings]\nnoise_std = { default = 1.0, first = 2.0 }"),
-        ("settings.denoise = 'on'", "[settings]\nnoise_std = 1\ndenoise = 'on'"),
-        ("estimator = 'newton'", "[settings]\nestimator = 'newton'"),
         ("not a TOML file", "[settings\nnoise_std = 1"),
         ("not a TOML file", "[settings]\nnoise_std = 1\nnoise_std = 2"),
         ("not a TOML file", "SIMPLE  =                    T"),

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.registry import estimator_named, estimators
-from faintspot.former_settings import current_options, without_foreign
 from faintspot.options import Option, Options, check_lengths, option
 from faintspot.tables import errors_of_table, per_subaperture, read_tables, save_tables, table_of
 from faintspot.toml_files import check_known
@@ -64,7 +63,7 @@ class Settings:
     ----------
     estimator : str or Estimator
         How a position is found: a name of `faintspot.estimators.estimators`, with its own options among
-        `options`, or such an object. Default: "tv", or "brightest" with `denoise=False`.
+        `options`, or such an object. Default: "tv".
     **options
         Options of the estimator, and those that all share: `search_range_px`, `max_bad_fraction`,
         `error_scale`, `flux_e`, `spot_fwhm_px`, `spot_fwhm_y_px`. docs/configuration.md describes each. Most
@@ -90,7 +89,7 @@ class Settings:
     """How a position is found."""
     _shared: SharedOptions
 
-    def __init__(self, estimator: str | Estimator | None = None, **options: Any) -> None:
+    def __init__(self, estimator: str | Estimator = "tv", **options: Any) -> None:
         if isinstance(estimator, Estimator):
             foreign = [name for name in options if name not in self.SHARED]
             if foreign:
@@ -99,8 +98,7 @@ class Settings:
                 )
             made = estimator
         else:
-            name, options = current_options(estimator, options)
-            kind = estimator_named(name)
+            kind = estimator_named(estimator)
             own = {key: value for key, value in options.items() if key not in self.SHARED}
             for key in own:
                 check_option(key, kind)
@@ -158,19 +156,12 @@ class Settings:
     def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Settings:
         """Make settings from the tables of a configuration file.
 
-        A file of version 0.1 has all options in [settings]; those that say nothing to its estimator are left
-        out.
-
         Raises
         ------
         InputError
             For an unknown key, one of another estimator, a bad value.
         """
-        if "estimator" not in document:
-            former = table_of(path, document, "settings")
-            with errors_of_table(path, "settings"):
-                return cls(**without_foreign(_plain_values("settings", former)))
-        own, shared = dict(document["estimator"]), document.get("settings", {})
+        own, shared = dict(table_of(path, document, "estimator")), document.get("settings", {})
         with errors_of_table(path, "estimator"):
             name = own.pop("name", None)
             if name is None:
@@ -214,28 +205,23 @@ class Settings:
         InputError
             For an unknown name, a bad value, an index out of range.
         """
-        if where is None and changes.keys() & {"estimator", "denoise"}:
-            return self._with_estimator(changes)
+        if where is None and "estimator" in changes:
+            return self._with_estimator(**changes)
         shared = {name: value for name, value in changes.items() if name in self.SHARED}
         own = {name: value for name, value in changes.items() if name not in self.SHARED}
         for name in own:
             check_option(name, type(self.estimator))
         return self._of(self.estimator.replaced(own, where), self._shared.replaced(shared, where))
 
-    def _with_estimator(self, changes: Mapping[str, Any]) -> Settings:
-        wanted = changes.get("estimator", self.estimator.name)
-        given = {name: value for name, value in changes.items() if name != "estimator"}
-        if isinstance(wanted, Estimator):
-            return self._of(wanted, self._shared.replaced(given))
-        if "denoise" in given and wanted == self.estimator.name and "noise_std" in self.estimator.declared():
-            given.setdefault("noise_std", self.noise_std)  # which becomes 0 where it is false
-        name, options = current_options(wanted, given)
+    def _with_estimator(self, estimator: str | Estimator, **given: Any) -> Settings:
+        if isinstance(estimator, Estimator):
+            return self._of(estimator, self._shared.replaced(given))
         kept = {
             key: getattr(self.estimator, key)
-            for key in estimator_named(name).declared()
+            for key in estimator_named(estimator).declared()
             if key in self.estimator.declared()
         }
-        return Settings(name, **{**vars(self._shared), **kept, **options})
+        return Settings(estimator, **{**vars(self._shared), **kept, **given})
 
     @classmethod
     def _of(cls, estimator: Estimator, shared: SharedOptions) -> Settings:

@@ -26,7 +26,8 @@ CONFIGURATION = """
 shape = [4, 4]
 pixels = 8
 
-[settings]
+[estimator]
+name = "tv"
 noise_std = 2.0
 keep_brightest = 10
 """

@@ -82,24 +82,24 @@ def test_bad_frames(
 
 CONFIGURATIONS: list[tuple[str, tuple[str, ...]]] = [
     ("not toml at all", ("not a TOML file", "line 1")),
-    ("[settings]\nnoise_std = 2.0", ("[layout]", "settings")),
-    ("[layout.grid]\nshape = [4, 4]\npixels = 8", ("[settings]", "layout")),
+    ("[estimator]\nname = 'tv'\nnoise_std = 2.0", ("[layout]", "estimator")),
+    ("[layout.grid]\nshape = [4, 4]\npixels = 8", ("[estimator]", "layout")),
     (
         CONFIGURATION.replace("keep_brightest", "keep_brigthest"),
         ("keep_brigthest", "did you mean keep_bright"),
     ),
     (
-        CONFIGURATION.replace("[settings]", "[setings]"),
-        ("setings", "unknown table", "did you mean settings?"),
+        CONFIGURATION.replace("[estimator]", "[estimater]"),
+        ("estimater", "unknown table", "did you mean estimator?"),
     ),
     (CONFIGURATION + "[telescope]\nd = 1", ("telescope", "unknown table", "known: layout")),
-    (CONFIGURATION.replace("2.0", "-2.0"), ("settings.noise_std", "-2", "at least 0")),
-    (CONFIGURATION.replace("2.0", "nan"), ("settings.noise_std", "finite", "NaN")),
-    (CONFIGURATION.replace("2.0", "inf"), ("settings.noise_std", "finite", "infinite")),
-    (CONFIGURATION.replace("2.0", '"loud"'), ("settings.noise_std", "number")),
+    (CONFIGURATION.replace("2.0", "-2.0"), ("estimator.noise_std", "-2", "at least 0")),
+    (CONFIGURATION.replace("2.0", "nan"), ("estimator.noise_std", "finite", "NaN")),
+    (CONFIGURATION.replace("2.0", "inf"), ("estimator.noise_std", "finite", "infinite")),
+    (CONFIGURATION.replace("2.0", '"loud"'), ("estimator.noise_std", "number")),
     (CONFIGURATION.replace("2.0", "[1.0, 2.0]"), ("noise_std", "16", "2")),
     (CONFIGURATION.replace("= 10", "= 64"), ("keep_brightest", "64", "63")),
-    (CONFIGURATION.replace("= 10", "= 2.5"), ("settings.keep_brightest", "2.5", "whole number")),
+    (CONFIGURATION.replace("= 10", "= 2.5"), ("estimator.keep_brightest", "2.5", "whole number")),
     (CONFIGURATION.replace("pixels = 8", "pixels = 1"), ("layout.grid", "pixels", "1", "from 2 to 64")),
     (CONFIGURATION.replace("[4, 4]", '"4x4"'), ("layout.grid", "shape")),
     (
@@ -116,12 +116,12 @@ CONFIGURATIONS: list[tuple[str, tuple[str, ...]]] = [
     ),
     (CONFIGURATION.replace("pixels = 8", "pixels = 8\npitch = 6"), ("layout", "overlap")),
     (
-        "[layout]\nframe_shape = [32, 32]\nwindow = [8, 8]\ncorners = []\n[settings]\nnoise_std = 2.0",
+        "[layout]\nframe_shape = [32, 32]\nwindow = [8, 8]\ncorners = []\n[estimator]\nname = 'tv'",
         ("layout.corners", "empty"),
     ),
     (CONFIGURATION + "[calibration]\ngain_e_per_adu = 0.0", ("calibration.gain_e_per_adu", "from 1e-09")),
     (CONFIGURATION + '[calibration]\ndark = "dark.fits"', ("calibration.dark", "dark.fits", "no such file")),
-    ("settings = 3\n[layout.grid]\nshape = [4, 4]\npixels = 8", ("settings", "expected a table")),
+    ("estimator = 3\n[layout.grid]\nshape = [4, 4]\npixels = 8", ("estimator", "expected a table")),
 ]
 
 

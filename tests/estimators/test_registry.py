@@ -96,14 +96,6 @@ def test_unknown_names(name: Any) -> None:
         estimator_named(name)
 
 
-@pytest.mark.parametrize(
-    ("former", "now"), [("plain", "brightest"), ("gaussian", "smoothed"), ("cog", "centroid")]
-)
-def test_former_names_of_studies(former: str, now: str) -> None:
-    with refused(f"estimator = {former!r}: expected one of", f"{former!r} is now {now!r}"):
-        estimator_named(former)
-
-
 class TestRegister:
     def test_is_known_everywhere(self) -> None:
         kind = register(middle("middle"))

@@ -104,8 +104,6 @@ def test_first_values_are_among_all(name: str) -> None:
 def test_unknown_arms_and_missing_values() -> None:
     with pytest.raises(InputError, match=r"^arm = 'kog': expected one of 'brightest'"):
         arm_kind("kog")
-    with pytest.raises(InputError, match="'cog' is now 'centroid'"):
-        arm_kind("cog_uncorrected")
     with pytest.raises(InputError, match="arm = 'tv_predicted': expected an estimator that takes a prior"):
         arm_kind("tv_predicted")
     with pytest.raises(InputError, match="expected a value for 'keep_brightest' of the arm 'brightest'"):

@@ -12,7 +12,7 @@ from faintspot.sensor.layout import Layout
 from faintspot.slopes import RESULT_TYPES, Slopes
 
 LAYOUT = Layout.grid((3, 3), pixels=8, inner_radius=0.5)
-SETTINGS = '[settings]\nestimator = "cog"\nnoise_std = 1.5\n'
+SETTINGS = '[estimator]\nname = "tv"\nnoise_std = 1.5\n'
 N = len(LAYOUT)
 NUMBERS = np.arange(N)
 FIELDS = ("x", "y", "flux", "flags", "iterations", "bad_pixels", "standard_error_x", "standard_error_y")

@@ -27,7 +27,8 @@ CONFIGURATION = """
 shape = [4, 4]
 pixels = 8
 
-[settings]
+[estimator]
+name = "tv"
 noise_std = 1.0
 keep_brightest = 9
 

@@ -27,7 +27,7 @@ from faintspot.simulate import Detector
 from faintspot.training import train_estimator
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
-PLAIN = SETTINGS.replace(denoise=False)
+PLAIN = SETTINGS.replace(estimator="brightest")
 
 
 def store(
@@ -137,7 +137,7 @@ def test_csv_without_attributes_still_gives_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["not [ toml", "[settings]\nnoise_std = -1\n", "[layout]\nwindow = [8, 8]\n"]
+    "text", ["not [ toml", '[estimator]\nname = "tv"\nnoise_std = -1\n', "[layout]\nwindow = [8, 8]\n"]
 )
 def test_configuration_that_cannot_be_used_is_said(tmp_path: Path, text: str) -> None:
     page = Page(report_of_stored([store(tmp_path / "s.npz", sensor(), configuration=text)]))

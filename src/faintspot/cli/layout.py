@@ -375,7 +375,7 @@ def _first_settings(
     layout: Layout, calibration: Calibration, frames: NDArray[Any]
 ) -> tuple[Settings, float, float]:
     """Settings to begin with, and the noise (e-) and flux (e-) that they rest on."""
-    plain = SlopePipeline(layout, Settings(denoise=False), calibration)
+    plain = SlopePipeline(layout, Settings("brightest"), calibration)
     stages = plain.explain(frames)
     noise = pixel_noise(stages.calibrated)
     flux = float(np.median(stages.slopes.flux))

@@ -106,16 +106,8 @@ def estimator_named(name: str) -> type[Estimator]:
     """
     _load()
     if not isinstance(name, str) or name not in _kinds:
-        former = FORMER_NAMES.get(name) if isinstance(name, str) else None
-        hint = f"; {name!r} is now {former!r}" if former else ""
-        raise InputError(
-            f"estimator = {name!r}: expected one of {', '.join(repr(known) for known in _kinds)}{hint}"
-        )
+        raise InputError(f"estimator = {name!r}: expected one of {', '.join(map(repr, _kinds))}")
     return _kinds[name]
-
-
-FORMER_NAMES = {"plain": "brightest", "gaussian": "smoothed", "cog": "centroid"}
-"""What some were called in studies and closed loops of version 0.1."""
 
 
 @cache

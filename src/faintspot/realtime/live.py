@@ -300,9 +300,8 @@ def check_names(names: Sequence[str] | None) -> None:
     """
     if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
         raise InputError(f"names = {names!r}: expected a list of settings' names")
-    known = [*option_names(), "denoise"]
     for name in names or ():
-        check_known("settings.", str(name), known, "option")
+        check_known("settings.", str(name), option_names(), "option")
 
 
 def check_shared_or_own(name: str, settings: Settings) -> None:

@@ -351,7 +351,7 @@ def _images_and_reference(
     raw = real_array("frames", frames)
     if raw.ndim != 3:
         raise InputError(f"frames: expected shape (n, h, w), got {raw.shape}")
-    images = SlopePipeline(layout, Settings(denoise=False), calibration).explain(raw).calibrated
+    images = SlopePipeline(layout, Settings("brightest"), calibration).explain(raw).calibrated
     home = finite_array("reference", reference).astype(np.float64)
     if home.shape not in ((), (2,), (len(layout), 2)):
         raise InputError(f"reference: expected shape ({len(layout)}, 2), got {home.shape}")
