@@ -193,7 +193,7 @@ class TestEstimators:
         ("words", "estimator", "options"),
         [
             ("noise_std: an option of 'tv', not of 'ml'", "ml", {"noise_std": 1.0}),
-            ("threshold_e: an option of 'thresholded', not of 'tv'", None, {"threshold_e": 1.0}),
+            ("threshold_e: an option of 'thresholded', not of 'tv'", "tv", {"threshold_e": 1.0}),
             ("model_error: an option of 'ml' and 'map', not of 'matched'", "matched", {"model_error": 0.1}),
             ("modle_error: unknown option of 'ml'; did you mean model_error?", "ml", {"modle_error": 0.1}),
             ("estimator = 'gaussian': expected one of", "gaussian", {}),
