@@ -68,7 +68,7 @@ def test_windows_follow_spots_that_coma_moves(geometry: str, coma: float, seed: 
     assert len(found.outside) == 0
     # Half the pitch is left for a window where coma brings neighbours together.
     assert np.count_nonzero(found.clipped | found.unlike) <= 2
-    slopes = fs.SlopePipeline(found.layout, fs.Settings(denoise=False, keep_brightest=20))(truth.frame)
+    slopes = fs.SlopePipeline(found.layout, fs.Settings("brightest", keep_brightest=20))(truth.frame)
     measured = centres + (np.column_stack([slopes.x, slopes.y]) @ [1, 1j])[held.argmax(axis=1)]
     assert np.abs(measured - truth.spots).max() < 0.5
 
