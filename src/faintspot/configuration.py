@@ -5,8 +5,10 @@ Maps of a calibration, PSF and score are kept beside it, in NAME.calibration.npz
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from faintspot.errors import InputError
@@ -19,6 +21,7 @@ from faintspot.settings import Settings
 from faintspot.tables import errors_of_table, read_tables, save_tables, tables_as_text
 from faintspot.toml_files import check_keys
 
+_PACKED, _MOST_PACKED_BYTES = "faintspot.toml", 1 << 20
 _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
 
 Item = Layout | Calibration | Settings | PSF | Score
@@ -98,6 +101,37 @@ def save(path: str | Path, item: Item) -> None:
     store = derived(path, f".{table}.npz")
     item.save(store)
     save_tables(path, {table: {"file": store.name}})
+
+
+def packed(calibration: Calibration, psf: PSF | None, score: Score | None) -> dict[str, str] | None:
+    """Return the files that `save` writes, as base64 text by name; None where they exceed 1 MiB."""
+    with TemporaryDirectory() as folder:
+        for item in (calibration, psf, score):
+            if item is not None:
+                save(Path(folder) / _PACKED, item)
+        files = list(Path(folder).iterdir())
+        if sum(file.stat().st_size for file in files) > _MOST_PACKED_BYTES:
+            return None
+        return {file.name: base64.b64encode(file.read_bytes()).decode() for file in files}
+
+
+def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score | None]:
+    """Return what `packed` was given.
+
+    Raises
+    ------
+    InputError
+        When they are no such files.
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / _PACKED
+        try:
+            for name, text in files.items():
+                (Path(folder) / Path(name).name).write_bytes(base64.b64decode(text, validate=True))
+        except (OSError, ValueError, TypeError, AttributeError):
+            raise InputError("configuration: expected files in base64") from None
+        document = read_tables(path)
+        return Calibration.from_tables(path, document), psf_of(path, document), score_of(path, document)
 
 
 def to_text(*items: Layout | Calibration | Settings) -> str:

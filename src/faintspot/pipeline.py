@@ -150,6 +150,11 @@ class SlopePipeline:
         other.on_device = None if self.on_device is None else other._device_pipeline()
         return other
 
+    @property
+    def spot(self) -> tuple[PSF | None, Score | None]:
+        """PSF and score that it was given."""
+        return self._parts[:2]
+
     def with_settings(self, settings: Settings) -> SlopePipeline:
         """Return the same pipeline with other settings.
 

@@ -94,6 +94,29 @@ def test_ours_is_measured_as_it_was(tmp_path: Path, run: Commands, monkeypatch: 
     assert np.array_equal(read_slopes(tmp_path / "centroids.npz").variables["x"], centroids.x)
 
 
+def test_ours_with_calibration_and_psf(
+    tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An estimator that needs the read noise and the spot: slopes are those of the recording, bit for bit."""
+    images = images_of(10, 20)
+    images["raw"], _ = fs.simulate.sensor_frames(
+        LAYOUT.corners, LAYOUT.window, LAYOUT.frame_shape, 2, flux_e=300.0, rng=np.random.default_rng(2)
+    )
+    settings = fs.Settings("ml")
+    dark = np.random.default_rng(3).normal(0, 0.1, LAYOUT.frame_shape)
+    parts = fs.Calibration(dark, read_noise_e=1.5), fs.PSF.analytic(size=1.2, radius_px=5)
+    packed = configuration.packed(*parts, None)
+    own(tmp_path, images, settings=configuration.to_text(settings), parts=packed)
+    monkeypatch.chdir(tmp_path)
+    run.ok("slopes", "night.fits", "-o", "slopes.npz")
+    expected = fs.SlopePipeline(LAYOUT, settings, parts[0], psf=parts[1])(images["raw"])
+    stored = read_slopes(tmp_path / "slopes.npz")
+    assert np.array_equal(stored.variables["x"], expected.x)
+    assert np.array_equal(stored.variables["y"], expected.y)
+    large = fs.Calibration(np.random.default_rng(3).normal(size=(400, 400)))
+    assert configuration.packed(large, None, None) is None
+
+
 def example(path: Path, change: Callable[[Any], None] = lambda system: None) -> Path:
     """Write the system that aotpy's own documentation has as an example, and changes of it."""
     system = aotpy.AOSystem(ao_mode="GLAO", main_telescope=aotpy.MainTelescope("Example telescope"))

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 from tests.patience import LIMIT_S
-from tests.realtime.bench import SETTINGS, Bench, make, simulated
+from tests.realtime.bench import CALIBRATION, SETTINGS, Bench, make, simulated
 
 import faintspot as fs
 from faintspot.cli import realtime_control
+from faintspot.configuration import unpacked
 from faintspot.io import open_frames
 from faintspot.realtime.bridge import StreamBridge
 from faintspot.realtime.engine import Engine
@@ -60,6 +61,10 @@ def test_what_is_published(bench: Bench) -> None:
     assert 0 < published_ns - last_row_ns < 60e9
     for stream in streams.values():
         stream.close()
+
+
+def test_telemetry_says_with_which_calibration_and_spot(bench: Bench) -> None:
+    assert unpacked(bench.telemetry.description["parts"]) == (CALIBRATION, None, None)
 
 
 def test_arms_take_turns() -> None:

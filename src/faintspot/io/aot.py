@@ -130,6 +130,7 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
         reference = reference + np.reshape(taken_off, reference.shape)
     exact = [
         aotpy.Metadatum("LAYOUT", json.dumps(layout), "as faintspot has it"),
+        aotpy.Metadatum("PARTS", json.dumps(attributes.get("parts")), "calibration, PSF, score"),
         aotpy.Metadatum("SUBTRACT", json.dumps(taken_off), "slopes that were subtracted, px"),
     ]
     sensor = aotpy.ShackHartmann(

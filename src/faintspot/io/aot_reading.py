@@ -45,6 +45,8 @@ class AotSensor:
     layout: Layout | None
     tables: Mapping[str, Any]
     """[estimator] and [settings] of a faintspot.toml, in files that faintspot has written."""
+    parts: Mapping[str, str] | None
+    """Calibration, PSF and score in such files, for `faintspot.configuration.unpacked`."""
     reference: NDArray[np.float64] | None
     """(2 n,): slopes that are or were to be subtracted, px from the layout's centres, all x, then all y."""
     pixels: str | None
@@ -203,6 +205,7 @@ def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
         n,
         layout,
         _tables(system),
+        own.get("PARTS"),
         reference,
         name,
         _time_of(pixels)[0],
@@ -280,7 +283,7 @@ def _own(image: Any) -> dict[str, Any]:
     if image is None:
         return {}
     values = {item.key: item.value for item in image.metadata}
-    return {name: parse_json(values[name]) for name in ("LAYOUT", "SUBTRACT") if name in values}
+    return {name: parse_json(values[name]) for name in ("LAYOUT", "SUBTRACT", "PARTS") if name in values}
 
 
 def _tables(system: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from faintspot.configuration import to_text
+from faintspot.configuration import packed, to_text
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.errors import InputError
 from faintspot.io.frame_numbers import left_out
@@ -140,6 +140,7 @@ class Engine:
                 if control.prediction == STREAM and prior is not None:
                     self._prediction = PredictionStream(name, prior)
             self._make_ready(interleaving)
+            first = self.live.running.pipelines[0]
             self._telemetry = TelemetryRing.create(
                 name,
                 layout,
@@ -147,6 +148,7 @@ class Engine:
                 arms=interleaving.labels,
                 commands=commands,
                 reference=None if control is None else control.reference,
+                parts=packed(first.calibration, *first.spot),
             )
         except InputError:
             self._streams.close()

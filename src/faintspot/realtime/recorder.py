@@ -133,6 +133,7 @@ class Recorder:
             "layout": reader.description["layout"],
             "settings": reader.settings,
             "reference": reader.description.get("reference"),
+            "parts": reader.description.get("parts"),
             **self._waiting.attributes(reader),
         }
         self._store = TelemetryStore(path, reader.record_type, reader.image_type, attributes)

@@ -96,6 +96,7 @@ class TelemetryRing(Closing):
         arms: Sequence[str] = (),
         commands: int = 0,
         reference: ArrayLike | None = None,
+        parts: Mapping[str, str] | None = None,
         records: int | None = None,
         image_slots: int | None = None,
     ) -> TelemetryRing:
@@ -114,6 +115,8 @@ class TelemetryRing(Closing):
             Number of the mirror's commands; 0: the engine makes none.
         reference : (2 n,) array, optional
             Reference slopes that are subtracted, px, for readers.
+        parts : mapping, optional
+            Calibration, PSF and score, for readers (`faintspot.configuration.packed`).
         records : int, optional
             Places for records of about 60 + 25 n bytes: a reader may lag behind by one frame less. Default:
             as many as fit into 32 MiB, up to 4096.
@@ -138,6 +141,7 @@ class TelemetryRing(Closing):
             "arms": list(arms),
             "commands": commands,
             "reference": None if reference is None else np.asarray(reference).tolist(),
+            "parts": parts,
             "records": int(number_between("records", records, 2, 1 << 24, integer=True)),
             "image_slots": int(number_between("image_slots", image_slots, 2, 1 << 16, integer=True)),
             "change_slots": CHANGE_SLOTS,

@@ -217,13 +217,17 @@ def _given(
     else:
         words.append("settings")
     where = Path(path)
-    parts = configuration.Configuration(
-        sensor.layout,
-        Settings.from_tables(where, document),
-        Calibration.from_tables(where, document),
-        configuration.psf_of(where, document),
-        configuration.score_of(where, document),
-    )
+    settings = Settings.from_tables(where, document)
+    if "settings" in words and sensor.parts is not None:
+        parts = configuration.Configuration(sensor.layout, settings, *configuration.unpacked(sensor.parts))
+    else:
+        parts = configuration.Configuration(
+            sensor.layout,
+            settings,
+            Calibration.from_tables(where, document),
+            configuration.psf_of(where, document),
+            configuration.score_of(where, document),
+        )
     listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
     return parts, f"{listed} of {first}", sensor.reference
 
