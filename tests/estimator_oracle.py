@@ -153,7 +153,10 @@ def by_fit(case: Case, s: int, g: Floats, task: Task) -> Estimate:
 
 
 def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
-    """The posterior's mean where it is broader than half the grid, else the fit that begins there."""
+    """The posterior's mean where it is broader than half the grid, else the fit that begins there.
+
+    It begins at the smoothed image's peak where the posterior is narrow and the peak within a step of the grid.
+    """
     assert case.psf is not None
     ny, nx = g.shape
     g = np.rint(g) if task.whole_electrons else g
@@ -171,8 +174,13 @@ def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
         x=oracle.clamp(broad.x, *task.limits((ny, nx))[0]),
         y=oracle.clamp(broad.y, *task.limits((ny, nx))[1]),
     )
-    fitted = oracle.fisher(g, task, "map", replace(broad, flux=flux))
-    margin = fitted.margin
+    peak = begin(case, s, g, task)
+    away = max(abs(peak.x - broad.x), abs(peak.y - broad.y)) / spacing
+    spread = max(broad.error_x, broad.error_y) / task.error_scale / (0.5 * spacing)
+    at_peak = spread <= 1 and away <= 1
+    first = Estimate(peak.x, peak.y, peak.flux) if at_peak else replace(broad, flux=flux)
+    fitted = oracle.fisher(g, task, "map", first)
+    margin = min(fitted.margin, abs(away - 1), peak.margin if at_peak else math.inf)
     for axis in "xy":
         spread = getattr(broad, f"error_{axis}") / task.error_scale / (0.5 * spacing)
         margin = min(margin, abs(spread - 1))

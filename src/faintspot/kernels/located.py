@@ -71,7 +71,7 @@ class PosteriorTables(NamedTuple):
     """What the kernel reads that begins at the posterior's mean."""
 
     fit: Any
-    """ModelTables; without taps."""
+    """ModelTables."""
     logarithms: Any
     """As `constants`, `grid` and `spacing`: see `posterior_of_group`."""
     constants: Any
@@ -160,12 +160,23 @@ def locate_fitted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     """Fit the spots of a group from the posterior's mean, which stays where the posterior is broad."""
     own = scratch.own
+    lanes, pixels = group.lanes, group.ny * group.nx
+    width = width_of(lanes)
     _round(group, tables.fit.round_electrons, scratch.image)
     _begin(group, scratch)
+    if tables.fit.background:
+        subtract_background(lanes, scratch.image, pixels, splat(lanes, 0.0))
+    _begin_at_peak(group, tables.fit.taps, scratch)
+    for peak, found in (
+        (spot_rows.PEAK_X, spot_rows.X),
+        (spot_rows.PEAK_Y, spot_rows.Y),
+        (spot_rows.PEAK_FLUX, spot_rows.FLUX),
+    ):
+        store(own.lane_values, peak * width, load(lanes, own.lane_values, found * width))
     _expect_light(group, own.lane_values)
     if tables.fit.background:
-        light = load(group.lanes, own.lane_values, spot_rows.FLUX * width_of(group.lanes))
-        subtract_background(group.lanes, scratch.image, group.ny * group.nx, light)
+        light = load(lanes, own.lane_values, spot_rows.FLUX * width)
+        subtract_background(lanes, scratch.image, pixels, light)
     posterior_of_group(
         group.lanes,
         scratch.image,
@@ -181,10 +192,7 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
         own.rows,
         own.logarithms,
     )
-    width = width_of(group.lanes)
-    for axis in range(2):
-        mean = load(group.lanes, own.lane_values, (spot_rows.MEAN_X + axis) * width)
-        store(own.lane_values, (spot_rows.X + axis) * width, mean)
+    _begin_at_mean_or_peak(width, own.lane_values)
     _fit(group, tables.fit, scratch)
     _keep_broad_posteriors(width, own.lane_values)
     _finish(group, tables.fit.steps, True, scratch)
@@ -352,6 +360,29 @@ def _sum_light(group: Any, image: Any, lane_values: Any) -> None:
             ny * nx * variance + excess * max(seen, 0.0)
         )
         lane_values[spot_rows.FLUX * width + lane] = seen
+
+
+@compiled
+def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
+    """Begin at the posterior's mean, or at the peak where the grid is too coarse for a narrow posterior.
+
+    The likelihood of a PSF that is slightly wrong has several maxima in bright light. The peak beside the mean
+    leads to the one that a fit without a prior finds.
+    """
+    for lane in range(width):
+        spacing = lane_values[spot_rows.SPACING * width + lane]
+        at_peak = True
+        for axis in range(2):
+            mean = lane_values[(spot_rows.MEAN_X + axis) * width + lane]
+            away = abs(lane_values[(spot_rows.PEAK_X + axis) * width + lane] - mean)
+            spread = lane_values[(spot_rows.SPREAD_X + axis) * width + lane]
+            at_peak = at_peak and spread <= _BROAD * spacing and away <= spacing
+        for axis in range(2):
+            row = spot_rows.PEAK_X if at_peak else spot_rows.MEAN_X
+            lane_values[(spot_rows.X + axis) * width + lane] = lane_values[(row + axis) * width + lane]
+        if at_peak:
+            light = lane_values[spot_rows.PEAK_FLUX * width + lane]
+            lane_values[spot_rows.FLUX * width + lane] = light
 
 
 @compiled

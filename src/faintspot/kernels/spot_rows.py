@@ -21,4 +21,6 @@ ERROR_X, ERROR_Y, SEEN, SEEN_ERROR = range(32, 36)
 START_LIGHT, GAIN_X, GAIN_Y = range(36, 39)
 # Of the posterior on a grid of positions: mean, standard deviation, px, and the grid's spacing.
 MEAN_X, MEAN_Y, SPREAD_X, SPREAD_Y, SPACING = range(39, 44)
-LANE_ROWS = 44
+# Where the smoothed image peaks, and the light that it shows there.
+PEAK_X, PEAK_Y, PEAK_FLUX = range(44, 47)
+LANE_ROWS = 47
