@@ -155,7 +155,7 @@ def by_fit(case: Case, s: int, g: Floats, task: Task) -> Estimate:
 def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     """The posterior's mean where it is broader than half the grid, else the fit that begins there.
 
-    It begins at the smoothed image's peak where the posterior is narrow and the peak within a step of the grid.
+    It begins at the smoothed image's peak where the posterior is narrow, the peak within a step of the grid.
     """
     assert case.psf is not None
     ny, nx = g.shape

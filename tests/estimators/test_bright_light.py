@@ -74,12 +74,11 @@ def test_without_a_prior_map_is_ml(local_background: str) -> None:
     x, y = rng.uniform(-2.0, 2.0, (2, 60, 1, 1))
     spots = np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 5.0**2) * np.maximum(1 + 0.5 * structure, 0.05)
     images = 4e5 * spots / spots.sum(axis=(1, 2), keepdims=True)
-    known = {
-        "psf": fs.PSF.analytic("gaussian", size=5.9, radius_px=20),
-        "calibration": fs.Calibration(read_noise_e=5.0),
-    }
+    psf, camera = fs.PSF.analytic("gaussian", size=5.9, radius_px=20), fs.Calibration(read_noise_e=5.0)
     ml, with_prior = (
-        fs.estimators.measure(images, Settings(name, local_background=local_background), **known)
+        fs.estimators.measure(
+            images, Settings(name, local_background=local_background), calibration=camera, psf=psf
+        )
         for name in ("ml", "map")
     )
     np.testing.assert_allclose(with_prior.vector, ml.vector, atol=1e-4)

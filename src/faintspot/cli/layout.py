@@ -16,10 +16,9 @@ from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
 from faintspot.errors import InputError
-from faintspot.estimate.noise import pixel_noise, suggested_strength
 from faintspot.files import derived
 from faintspot.io.frames import FrameSource, open_frames
-from faintspot.pipeline import SlopePipeline
+from faintspot.planner.first_settings import FirstSettings, first_settings
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.sensor.hot_pixels import find_hot_pixels
@@ -162,8 +161,9 @@ def command(
     which are lit.
 
     A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
-    Else the settings written beside the layout are a start: the strength noise_std is taken from the frame's
-    background noise and flux, which must be typical of the frames to come.
+    Else the settings written beside the layout are a start: Gaussian smoothing and brightest pixels, chosen
+    by the noise, flux and spot width of the first 20 frames, which must be typical of the frames to come.
+    `faintspot tune` finds better ones.
 
     \b
     Examples:
@@ -203,9 +203,9 @@ def command(
         layout = replace(found.layout[kept], **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
-    settings, noise, flux = _first_settings(layout, calibration, first)
+    seen = first_settings(layout, calibration, first)
+    settings = configuration.load(target, "settings") if keeps_settings else seen.settings
     if keeps_settings:
-        settings = configuration.load(target, "settings")
         notes.append(f"  the settings that {output} has are kept")
     marks = {}
     if isinstance(found, FoundLayout):
@@ -216,14 +216,15 @@ def command(
     # The layout last: it may be long, and whatever is saved after it reads it again.
     for item in (settings, calibration, layout):
         configuration.save(target, item)
+    unit = "ADU" if gain is None and calibration.gain_e_per_adu == 1.0 else "e-"
     if isinstance(found, KnownGrid):
-        lines = layout_grid.describe(output, found, layout, flux, calibration)
+        lines = layout_grid.describe(output, found, layout, calibration)
     else:
-        lines = _describe(output, found[kept], layout, settings, noise, flux)
-    for line in [*lines, *notes]:
+        lines = _describe(output, found[kept], layout)
+    for line in [*lines, *_describe_settings(settings, layout, seen, unit), *notes]:
         click.echo(line)
-    if calibration.gain_e_per_adu == 1.0:
-        click.echo("  one electron per ADU assumed; give --gain if your camera has another")
+    if unit == "ADU":
+        click.echo("  gain unknown: these settings do not depend on it, standard errors do; --gain gives it")
     if drawn:
         click.echo(f"  {drawn}")
     arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", suggested_slopes()]
@@ -244,18 +245,29 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
         raise InputError(f"{description}: {text}") from None
 
 
-def _describe(
-    output: str, found: FoundLayout, layout: Layout, settings: Settings, noise: float, flux: float
-) -> list[str]:
+def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, unit: str) -> list[str]:
+    """Say how noisy and bright the spots are, and what is done about it."""
+    estimator, reach = settings.estimator, settings.search_range_px
+    within = "" if reach is None else f", slopes within {np.max(reach):g} px"
+    lines = [
+        f"  background noise {plain(seen.noise)} {unit}, flux of a spot {plain(seen.flux)} {unit}",
+        f"  {estimator.name}: {estimator.in_words(len(layout), layout.pixels)}{within}",
+    ]
+    if seen.lost:
+        lines.append(
+            "  the spots of single frames are lost in the noise: expect slope errors as large as the slopes; "
+            "`faintspot tune --frames` says what is possible"
+        )
+    return lines
+
+
+def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
     """Say in a few lines what was found, and what was left out."""
-    strength = getattr(settings, "noise_std", None)  # kept settings may be those of another estimator
-    noise_std = "" if strength is None else f": noise_std {plain(strength)}"
     rows, columns = np.ptp(layout.cells, axis=0) + 1
     height, width = layout.window
     lines = [
         f"{output}: {len(layout)} sub-apertures lit of a {layout.geometry} array of {rows} x {columns}, "
-        f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px",
-        f"  background noise {plain(noise)} e-, median flux {plain(flux)} e-{noise_std}",
+        f"pitch {layout.pitch_px:.2f} px, angle {layout.angle_deg:.2f} deg, windows of {height} x {width} px"
     ]
     lines += layout_options.largest_window_note(layout)
     if found.lenslets.doubt:
@@ -356,7 +368,7 @@ def _completed(
     level = float(np.nanmedian(edges)) * calibration.em_gain / calibration.gain_e_per_adu
     spread = float(np.nanmedian(np.abs(edges - np.nanmedian(edges))))
     if calibration.dark is None and level > spread > 0:
-        calibration = replace(calibration, dark=float(f"{level:.4g}"), rough_dark=True)
+        calibration = replace(calibration, dark=float(f"{level:.7g}"), rough_dark=True)
         notes.append(
             f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
         )
@@ -369,17 +381,3 @@ def _completed(
         calibration = replace(calibration, bad_pixels=np.unique(np.concatenate([known, hot]), axis=0))
         notes.append(f"  {len(hot)} hot pixels masked")
     return calibration, notes
-
-
-def _first_settings(
-    layout: Layout, calibration: Calibration, frames: NDArray[Any]
-) -> tuple[Settings, float, float]:
-    """Settings to begin with, and the noise (e-) and flux (e-) that they rest on."""
-    plain = SlopePipeline(layout, Settings("brightest"), calibration)
-    stages = plain.explain(frames)
-    noise = pixel_noise(stages.calibrated)
-    flux = float(np.median(stages.slopes.flux))
-    if layout_grid.is_quad_cell(layout):
-        return Settings("centroid"), noise, flux
-    strength = float(suggested_strength(noise, max(flux, 0.0), layout.pixels))
-    return Settings(noise_std=float(f"{strength:.3g}")), noise, flux

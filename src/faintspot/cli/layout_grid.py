@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.cli import layout_options
-from faintspot.cli.layout_options import plain
 from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.known_grid import KnownGrid, find_illuminated
@@ -38,14 +37,12 @@ def is_quad_cell(layout: Layout) -> bool:
     return min(layout.window) == _QUAD_CELL
 
 
-def describe(
-    output: str, found: KnownGrid, layout: Layout, flux: float, calibration: Calibration
-) -> list[str]:
+def describe(output: str, found: KnownGrid, layout: Layout, calibration: Calibration) -> list[str]:
     """Say in a few lines which sub-apertures are illuminated."""
     height, width = layout.window
     lines = [
         f"{output}: {len(layout)} sub-apertures illuminated of {len(found.layout) + len(found.unlit)}, "
-        f"pitch {layout.pitch_px:.4g} px, windows of {height} x {width} px, median flux {plain(flux)} e-"
+        f"pitch {layout.pitch_px:.4g} px, windows of {height} x {width} px"
     ]
     lines += layout_options.largest_window_note(layout)
     if found.doubt:

@@ -28,7 +28,7 @@ _WIDTHS_OF_SPECKLES = (2.0, 1.0, 1.25, 1.6, 2.8, 4.0)
 _LEAST_WEIGHT = 1e-4  # of the window's middle: what is less counts nothing, and need not be read
 _STEP_PX = 0.25  # by which the spot is moved to find the gain
 _SMALLEST_GAIN = 0.02
-_LEAST_LIGHT_E = 1e-3
+_LEAST_LIGHT = 1e-6  # of the brightest spot's
 MEAN, FRAME, NONE = "mean", "frame", "none"
 
 
@@ -274,7 +274,7 @@ class _Prepared(Prepared):
             table[window.DIVISOR] = 0.0
         else:
             # A spot that is known to have no light is none; where nothing is known, the frame says it.
-            lit = np.where(flux_e > _LEAST_LIGHT_E, flux_e, -1.0)
+            lit = np.where(flux_e > _LEAST_LIGHT * np.nan_to_num(flux_e).max(), flux_e, -1.0)
             table[window.DIVISOR] = np.where(np.isnan(flux_e), 0.0, lit)
         table[window.OFFSET_X], table[window.OFFSET_Y] = offsets
 

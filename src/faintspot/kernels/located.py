@@ -366,8 +366,8 @@ def _sum_light(group: Any, image: Any, lane_values: Any) -> None:
 def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
     """Begin at the posterior's mean, or at the peak where the grid is too coarse for a narrow posterior.
 
-    The likelihood of a PSF that is slightly wrong has several maxima in bright light. The peak beside the mean
-    leads to the one that a fit without a prior finds.
+    The likelihood of a PSF that is slightly wrong has several maxima in bright light. The peak beside the
+    mean leads to the one that a fit without a prior finds.
     """
     for lane in range(width):
         spacing = lane_values[spot_rows.SPACING * width + lane]

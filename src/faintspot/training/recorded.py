@@ -115,7 +115,7 @@ def train_from_frames(
     *,
     reference: ArrayLike = 0.0,
     search_range_px: float | None = None,
-    start: str = "reference",
+    start: str = "peak",
     smoothing_px: float = 1.3,
     symmetry: str = "round",
     node_spacing_px: float = 0.5,
@@ -153,7 +153,7 @@ def train_from_frames(
     search_range_px : float, optional
         Estimates stay within plus and minus this around the reference. Default: half the longer side.
     start : {"reference", "peak"}
-        Where the first pass starts.
+        Where the first pass starts: at the reference, or at the peak of the smoothed image.
     smoothing_px : float
         Standard deviation of the smoothing for start "peak".
     symmetry : {"round", "aligned", "point"}
