@@ -105,3 +105,41 @@ def test_spots_at_their_window_s_edge_and_unlike_their_neighbours_are_doubtful()
     narrow = find_layout(frame, pixels=11)
     assert narrow.clipped[moved]
     assert not narrow[np.arange(len(narrow.layout)) != moved].unlike.any()
+
+
+def structured(kind: str, geometry: str, seed: int) -> tuple[NDArray[np.float64], int]:
+    """Return a frame of lenslets 25.6 px apart, each with the same several peaks, and their number."""
+    rng = np.random.default_rng(seed)
+    size, pitch_px = 380, 25.6
+    count = np.arange(-30, 31)
+    turn = np.exp(1j * rng.uniform(-0.07, 0.07))
+    nodes = (1 + 1j) * size / 2 + pitch_px * turn * (count + count[:, None] * RATIOS[geometry]).ravel()
+    nodes = nodes[np.abs(nodes - (1 + 1j) * size / 2) < 0.42 * size]
+    # 3 x 3 peaks on the lattice that has 13 nodes a cell, or peaks anywhere.
+    grid = (np.arange(-1, 2) + 1j * np.arange(-1, 2)[:, None]).ravel() * pitch_px / (3 + 2j) * turn
+    radius, angle = np.sqrt(rng.uniform(0, 0.1, 6)), rng.uniform(0, 2 * np.pi, 6)
+    peaks = grid if kind == "grid" else pitch_px * radius * np.exp(1j * angle)
+    moved = nodes + 0.03 * pitch_px * (rng.standard_normal(len(nodes)) + 1j * rng.standard_normal(len(nodes)))
+    at = (moved[:, None] + peaks - peaks.mean()).ravel()
+    return spot_frame(at, (size, size), flux_e=900.0, width_px=1.0, background_e=30.0, seed=seed), len(nodes)
+
+
+@pytest.mark.parametrize("geometry", ["square", "hexagonal"])
+@pytest.mark.parametrize("kind", ["grid", "anywhere"])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_lattice_is_not_that_of_the_structure_in_the_spots(kind: str, geometry: str, seed: int) -> None:
+    frame, count = structured(kind, geometry, seed)
+    grid = find_layout(frame).lenslets
+    assert grid.geometry == geometry
+    assert grid.pitch_px == pytest.approx(25.6, rel=0.02)
+    assert abs(len(grid.cells) - count) <= 0.15 * count or grid.doubt
+
+
+def test_a_lattice_that_explains_only_a_part_of_the_flux_is_doubtful() -> None:
+    """Two of five cells have a second spot."""
+    truth = comatic(0.0, seed=5)
+    second = truth.nodes[::5] + (10 + 10j), truth.nodes[2::5] + (10 + 10j)
+    for more, doubtful in (([], False), (second, True)):
+        at = np.concatenate([truth.spots, *more])
+        found = find_layout(spot_frame(at, truth.frame.shape, flux_e=4000.0, width_px=1.4))
+        assert bool(found.lenslets.doubt) == doubtful

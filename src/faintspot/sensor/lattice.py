@@ -23,6 +23,8 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
+# The lines of a hexagonal lattice are sqrt(3) / 2 of its pitch apart and its steps lie 30 degrees off.
+_STEPS = {"square": 1 + 0j, "hexagonal": complex(2 / np.sqrt(3) * np.exp(1j * np.pi / 6))}
 SMALLEST_PITCH_PX = 5.0
 # Spot widths that are looked for: a spot up to twice as wide or narrow as one of these is seen by it.
 _SCALES_PX = (1.0, 2.0, 4.0)
@@ -72,6 +74,11 @@ class Lattice:
     def angle_deg(self) -> float:
         """Angle of the step from +x towards +y."""
         return float(np.degrees(np.angle(self.step)))
+
+    @property
+    def wave(self) -> complex:
+        """Wave vector of the first of the strongest peaks in the power spectrum, cycles per px."""
+        return complex(1 / np.conj(self.step / _STEPS[self.geometry]))
 
     def positions(self, cells: NDArray[np.int64]) -> NDArray[np.complex128]:
         """Return where the nodes of the given (n, 2) rows and columns lie."""
@@ -136,8 +143,8 @@ class Lattice:
 
 def find_lattice(
     image: NDArray[np.float64], geometries: tuple[str, ...], pitch_range_px: tuple[float, float]
-) -> Lattice | None:
-    """Return the lattice that the spots of a frame lie on, or None when there is none.
+) -> tuple[Lattice, NDArray[np.float64]] | None:
+    """Return the lattice that the spots of a frame lie on and the map of them, or None when there is none.
 
     Parameters
     ----------
@@ -148,7 +155,7 @@ def find_lattice(
     pitch_range_px : tuple of float
         The smallest and the largest pitch to try.
     """
-    best: tuple[float, Lattice | None] = (_COMB_SCORE, None)
+    highest, best = _COMB_SCORE, None
     for spots in _spot_maps(image):
         found = _candidates(spots, geometries, pitch_range_px)
         if not found:
@@ -159,11 +166,11 @@ def find_lattice(
         scatter = float(smooth.std())
         for lattice in found:
             score = _comb_score(smooth, lattice) / scatter
-            if score > best[0]:
-                best = (score, lattice)
-        if best[0] > _CLEAR_SCORE:
+            if score > highest:
+                highest, best = score, (lattice, spots)
+        if highest > _CLEAR_SCORE:
             break
-    return best[1]
+    return best
 
 
 def _spot_maps(image: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
@@ -210,7 +217,7 @@ def _candidates(
             for kin in (1.0, 1 + RATIOS[geometry], 2.0, 2 * (1 + RATIOS[geometry])):
                 pitch = abs(kin / wave) / RATIOS[geometry].imag
                 if pitch_range_px[0] <= pitch <= pitch_range_px[1]:
-                    found.append(_with_origin(centred, geometry, wave / kin))
+                    found.append(with_origin(centred, geometry, wave / kin))
     return found
 
 
@@ -326,17 +333,14 @@ def _amplitude(centred: NDArray[np.float64], vector: complex) -> complex:
     return complex(np.sum(columns * np.exp(-1j * x * vector.real)))
 
 
-def _with_origin(centred: NDArray[np.float64], geometry: str, vector: complex) -> Lattice:
+def with_origin(centred: NDArray[np.float64], geometry: str, vector: complex) -> Lattice:
     """Return the lattice of a wave vector, with the origin that the phases of the first two peaks give."""
     waves = vector * _turns(geometry)[:2]
     phases = [-np.angle(_amplitude(centred, complex(wave))) / (2 * np.pi) for wave in waves]
     # At a node, wave . position is the phase (in turns) of either peak.
     position = np.linalg.solve(np.column_stack([waves.real, waves.imag]), phases)
     middle = complex((centred.shape[1] - 1) / 2, (centred.shape[0] - 1) / 2)
-    # The lines of a hexagonal lattice are sqrt(3) / 2 of its pitch apart and its steps lie 30 degrees off.
-    step = 1 / np.conj(vector)
-    if geometry == "hexagonal":
-        step = step * 2 / np.sqrt(3) * np.exp(1j * np.pi / 6)
+    step = _STEPS[geometry] / np.conj(vector)
     return Lattice(geometry, middle + complex(*position), complex(step)).canonical(centred.shape)
 
 

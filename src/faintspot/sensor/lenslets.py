@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from faintspot.checks import finite_array, number_between, one_of, real_array
 from faintspot.errors import InputError
 from faintspot.sensor.following import follow
+from faintspot.sensor.kin import best_kin
 from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std
 from faintspot.sensor.lit import Lit, find_lit
 from faintspot.sensor.nodes import (
@@ -30,8 +31,12 @@ _FIT_PASSES = 4
 # A spot of this signal-to-noise ratio that is as bright as lit ones and this far (pitches) from all of them
 # belongs to another lenslet: a smooth aberration brings two spots no closer.
 _CLEAR, _ELSEWHERE = 6.0, 0.5
-# Displacements are followed when that reaches so many of these spots, or half of them: one may be a ghost's.
-_REACHED = 4
+# Displacements are followed when that reaches so many of these spots, or half of them (one may be a ghost's),
+# and the spots lie this near (pitches, median) to where they are then expected, unlike peaks within spots.
+_REACHED, _FOLLOWED = 4, 0.15
+# More of them than this share of the lit lenslets make the lattice doubtful; the rows that the frame's edge
+# cuts off a small array are fewer.
+_PART_ELSEWHERE = 0.25
 # Its shape is like that of the lit ones: it explains at least this part of what it explains of theirs.
 _LIKE = 0.6
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
@@ -148,10 +153,11 @@ def find_lenslets(
     image = _clean_image(frames[part.slices], bad[part.slices])
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
     pitch_range_px = _pitch_range(pitch_px, image.shape)
-    lattice = find_lattice(image, geometries, pitch_range_px) if np.ptp(image) > 0 else None
-    if lattice is None:
+    found = find_lattice(image, geometries, pitch_range_px) if np.ptp(image) > 0 else None
+    if found is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
-    fit = _fitted(image, lattice, lit_fraction, circle)
+    lattice, map_of_spots = found
+    fit = _fitted(image, best_kin(map_of_spots, lattice, pitch_range_px), lit_fraction, circle)
     lattice, spots, lit = fit.lattice, fit.spots, fit.lit
     cells = spots.cells[lit.nodes]
     if len(cells) < 4 or np.any(np.ptp(cells, axis=0) < 1):
@@ -327,20 +333,32 @@ def _fitted(
     everywhere = find_spots(image, lattice, width_px)
     fit = _lit_of(image, lattice, width_px, lit_fraction, everywhere)
     for _ in range(_FIT_PASSES):
-        if len(fit.elsewhere) == 0:
+        if not 0 < len(fit.elsewhere) <= np.count_nonzero(fit.lit.nodes):
             break
         followed = follow(fit.bright, fit.lattice, image.shape)
         if followed is None:
             break
         better = _lit_of(image, followed[0], width_px, lit_fraction, everywhere, followed[1])
         reached = len(fit.elsewhere) - len(better.elsewhere)
-        if reached < max(1.0, min(_REACHED, 0.5 * len(fit.elsewhere))):
+        near = np.median(np.abs(better.spots.shifts[better.lit.nodes])) < _FOLLOWED
+        if not near or reached < max(1.0, min(_REACHED, 0.5 * len(fit.elsewhere))):
             break
         fit = better
     if pupil is not None:
         held = pupil.holds(fit.lattice.positions(fit.spots.cells))
-        fit = replace(fit, lit=replace(fit.lit, nodes=held, doubt=""))
-    return fit
+        return replace(fit, lit=replace(fit.lit, nodes=held, doubt=""))
+    return replace(fit, lit=replace(fit.lit, doubt=_too_many(fit) or fit.lit.doubt))
+
+
+def _too_many(fit: _Fit) -> str:
+    """Say in one line when the lattice explains only a part of the flux."""
+    count, lit = len(fit.elsewhere), int(np.count_nonzero(fit.lit.nodes))
+    if count <= _PART_ELSEWHERE * lit:
+        return ""
+    return (
+        f"{count} spots as bright as those of the {lit} lit lenslets belong to none of them, so the lattice "
+        "explains only a part of the flux; its pitch or geometry may be wrong, give pitch_px or geometry"
+    )
 
 
 def _lit_of(

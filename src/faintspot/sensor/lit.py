@@ -50,6 +50,8 @@ _SHARE = 0.1
 # Fluxes within this factor of the dividing one may fall either way; more than this share of the lit lenslets
 # with such a flux, or this few standard deviations, are worth a word.
 _CLOSE, _DOUBTFUL, _FAINT = 1.25, 0.05, 5.0
+# Peaks anywhere in the search area have a median distance from its middle of 0.25 pitch; spots have less.
+_SCATTERED = 0.2
 # More dim ones among the lit lenslets than this may be a second, dimmer set of spots.
 _DIM = 0.3
 _PASSES = 4
@@ -232,6 +234,12 @@ def _doubt(
     ratio = float(np.median(spots.signal_to_noise[lit]))
     if ratio < _FAINT:
         return f"the spots stand only {ratio:.1f} standard deviations out of the noise; average more frames"
+    scattered = float(np.median(np.abs(spots.shifts[lit] - np.median(spots.shifts[lit]))))
+    if scattered > _SCATTERED:
+        return (
+            f"the spots lie {scattered:.2f} of the pitch from the lattice (median), as peaks anywhere would: "
+            "its pitch or geometry may be wrong; give pitch_px"
+        )
     close = (detected > 0) & (spots.flux < dividing_flux * _CLOSE) & (spots.flux > dividing_flux / _CLOSE)
     if np.count_nonzero(close) > max(1, _DOUBTFUL * count):
         return (
