@@ -272,7 +272,7 @@ def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
     lines += layout_options.largest_window_note(layout)
     if found.lenslets.doubt:
         lines.append(
-            f"  doubtful: {found.lenslets.doubt} (see the picture; --pitch, --lit-fraction or --pupil decides)"
+            f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch, --lit-fraction, --pupil)"
         )
     if len(found.cut):
         lines.append(
