@@ -18,7 +18,6 @@ from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Ne
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
-from faintspot.kernels.groups import Task
 from faintspot.options import is_auto, option
 
 Floats = NDArray[np.float64]
@@ -152,17 +151,6 @@ class GravityPrepared(Prepared):
     def own_scratch(self) -> Any:
         """See `Prepared`."""
         return gravity.gravity_scratch
-
-    def part(self, task: Task, *, denoise: bool, background: bool) -> tuple[Any, Task]:
-        """Return the kernel and its task for some of the stages: others before and after do the rest."""
-        if background and (denoise or self.before == gravity.NOTHING):
-            return self.kernel, task
-        tables = self.first_step if denoise else gravity.GravityTables()
-        settings = task.settings
-        if not background:
-            settings = settings.copy()
-            keep_all(settings.swapaxes(0, 1))
-        return gravity.gravity_of_groups, task._replace(settings=settings, tables=tables)
 
     # Settings ---------------------------------------------------------------------------------------
 
