@@ -17,7 +17,7 @@ from benchmarks.measuring import Row, Table
 from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gain
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
 from faintspot.advice.simulated import frames_of_record, seen_in_record
-from faintspot.compare.statistics import paired_mean
+from faintspot.experiments.statistics import paired_mean
 from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.calibration import flat_psf, reference_slopes
 from faintspot.loop.camera import camera_calibration

@@ -22,10 +22,10 @@ from benchmarks.measuring import Row, Table, best, interleaved, pinned, ratio
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.study.cell import Block, measure_cell, realisations
-from faintspot.study.specification import StudySpecification
-from faintspot.study.sweep import Sweep
-from faintspot.study.tables import error_sums
+from faintspot.experiments.cell import Block, measure_cell, realisations
+from faintspot.experiments.cell_arms import error_sums
+from faintspot.experiments.specification import StudySpecification
+from faintspot.experiments.sweep import Sweep
 
 STRENGTHS = (0.3, 0.5, 0.7, 0.85, 1.0)
 SPECIFICATION = StudySpecification("benchmark", [Sweep("a", flux_e=60, read_noise_e=1)], realisations=2000)

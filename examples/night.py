@@ -32,8 +32,8 @@ from faintspot.advice.residual import wavefront_modes
 from faintspot.advice.seen import Seen
 from faintspot.advice.simulated import frames_of_record, seen_in_record
 from faintspot.advice.trial import compared
-from faintspot.compare.statistics import mean_by_blocks
 from faintspot.control.learnt import Plant
+from faintspot.experiments.statistics import mean_by_blocks
 from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.loop.calibration import flat_psf, reference_slopes
 from faintspot.loop.camera import camera_calibration

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.compare.statistics import absolute_errors
 from faintspot.estimate.noise import suggested_strength
+from faintspot.experiments.statistics import absolute_errors
 from faintspot.io import open_frames
 
 KEPT = (6, 8, 10, 12, 16, 20, 25, 30, 40, 50, 60, 80)

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
 from faintspot.control.kalman import SlopePredictor
+from faintspot.experiments.loop_arms import arm_kind
 from faintspot.loop import LoopConfiguration, load_loop
-from faintspot.loop.arm_kinds import arm_kind
 from faintspot.loop.control import learnt_control
 from faintspot.loop.observatory import LoopOptics, Observatory, prepare
 from faintspot.loop.simulation import Idealised, _Loop

@@ -11,13 +11,13 @@ import pytest
 
 import faintspot as fs
 from faintspot.estimators import spot_tables
+from faintspot.experiments.specification import StudySpecification, Sweep
 from faintspot.io import open_frames
 from faintspot.io.frames import read_array
 from faintspot.loop.configuration import LoopConfiguration
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
 from faintspot.sizes import MOST_NUMBERS, check_size
-from faintspot.study.specification import StudySpecification, Sweep
 
 GRID = "[layout.grid]\nshape = [3, 3]\npixels = 8\n"
 SETTINGS = '[estimator]\nname = "centroid"\n'

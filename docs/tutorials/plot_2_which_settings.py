@@ -13,7 +13,7 @@ that score. The same from Python.
 import numpy as np
 
 import faintspot as fs
-from faintspot.planner import Question
+from faintspot.experiments import Question
 
 question = Question(
     read_noise_e=3.0,
@@ -41,7 +41,7 @@ figure = answer.figure()
 # How much of the sky has a star that is bright enough, near enough? From star counts (Bahcall and Soneira
 # 1980; good to about 25 %).
 
-from faintspot.planner.sky import PLACES, sky_coverage
+from faintspot.experiments.loop_question import PLACES, sky_coverage
 
 for magnitude in (12.0, 14.0, 16.0):
     found = {place: sky_coverage(magnitude, 30.0, latitude, "R") for place, latitude in PLACES.items()}

@@ -8,8 +8,8 @@ from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot import estimators as estimators
+    from faintspot import experiments as experiments
     from faintspot import simulate as simulate
-    from faintspot import study as study
     from faintspot.errors import InputError as InputError
     from faintspot.errors import MissingExtraError as MissingExtraError
     from faintspot.estimate.bounds import cramer_rao as cramer_rao
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from faintspot.estimate.centroid import centre_of_gravity as centre_of_gravity
     from faintspot.estimate.total_variation import Denoised as Denoised
     from faintspot.estimate.total_variation import tv_denoise as tv_denoise
+    from faintspot.experiments import tune as tune
     from faintspot.flags import SubapertureFlag as SubapertureFlag
     from faintspot.light import MeanLight as MeanLight
     from faintspot.pipeline import SlopePipeline as SlopePipeline
-    from faintspot.planner import tune as tune
     from faintspot.sensor.calibration import Calibration as Calibration
     from faintspot.sensor.fixed_weights import FixedWeights as FixedWeights
     from faintspot.sensor.layout import Layout as Layout
@@ -61,14 +61,14 @@ _HOMES = {
     "centre_of_gravity": "faintspot.estimate.centroid",
     "cramer_rao": "faintspot.estimate.bounds",
     "estimators": "faintspot.estimators",
+    "experiments": "faintspot.experiments",
     "fit_wavefront": "faintspot.wavefront",
     "learn_psf": "faintspot.training",
     "measure_detector": "faintspot.sensor.photon_transfer",
     "photon_efficiency": "faintspot.estimate.bounds",
     "simulate": "faintspot.simulate",
-    "study": "faintspot.study",
     "train_estimator": "faintspot.training",
-    "tune": "faintspot.planner",
+    "tune": "faintspot.experiments",
     "tv_denoise": "faintspot.estimate.total_variation",
 }
 

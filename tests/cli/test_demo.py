@@ -10,9 +10,9 @@ from tests.cli.cli_cases import Commands
 
 from faintspot import SlopePipeline
 from faintspot.cli.demo import comparison_table
+from faintspot.experiments.demonstration import FLUXES_E, Comparison, Scored
 from faintspot.io import read_slopes
 from faintspot.settings import Settings
-from faintspot.study.demonstration import FLUXES_E, Comparison, Scored
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 from tests.cli.cli_cases import Commands
-from tests.loop.experiment_cases import PLAN, SEARCH, small
+from tests.experiments.experiment_cases import PLAN, SEARCH, small
 
 import faintspot.cli
 from faintspot import configuration
 from faintspot.control.configuration import load_control
-from faintspot.loop import budget, interleaved, magnitude
+from faintspot.experiments import budget, interleaved, magnitude
 from faintspot.loop.configuration import LoopConfiguration, load_loop, shipped_loops
 
 pytest.importorskip("hcipy")

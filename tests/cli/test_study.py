@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.cli.cli_cases import Commands, command_line
 
-from faintspot.study import StudySpecification, Sweep, estimators, open_study, run
+from faintspot.experiments import StudySpecification, Sweep, estimators, open_study, run
 
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 from tests.cli.cli_cases import LAYOUT, Commands, simulated
-from tests.planner.loop_answer_cases import made_up
+from tests.experiments.loop_answer_cases import made_up
 
 from faintspot import Calibration, SlopePipeline
-from faintspot.planner import loop_tuning, tuning
-from faintspot.planner.loop_answer import LoopAnswer
-from faintspot.planner.loop_question import LoopQuestion
+from faintspot.experiments import loop_tuning, tuning
+from faintspot.experiments.loop_answer import LoopAnswer
+from faintspot.experiments.loop_question import LoopQuestion
 
 KNOWN = ("--read-noise-e", 3, "--pixels", 8, "--fwhm-px", "1.8", "--flux-e", 200)
 

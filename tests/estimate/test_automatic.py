@@ -20,9 +20,9 @@ from faintspot.estimate.automatic import (
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.study.cell import realisations
-from faintspot.study.sweep import Cell
-from faintspot.study.tables import error_sums
+from faintspot.experiments.cell import realisations
+from faintspot.experiments.cell_arms import error_sums
+from faintspot.experiments.sweep import Cell
 
 FWHM_OF_SIZE = {"diffraction": 1.772, "gaussian": 2.0}
 REALISATIONS = 600

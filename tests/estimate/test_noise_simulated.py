@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faintspot.compare.statistics import slope_error
 from faintspot.estimate.noise import pixel_noise, suggested_strength
+from faintspot.experiments.statistics import slope_error
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.layout import Layout
 from faintspot.settings import Settings

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.loop.experiment_cases import small
+from tests.experiments.experiment_cases import small
 
 import faintspot as fs
 from faintspot.control.learning import CONTROLS, INTEGRATOR
 from faintspot.errors import InputError
+from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, arm_kind
 from faintspot.loop import Arm, LoopConfiguration, simulate_loop
-from faintspot.loop.arm_kinds import LOOP_GAIN, NOISE_SCALE, arm_kind
 from faintspot.loop.arms import PRIOR
 from faintspot.loop.control import learnt_control, telemetry_of
 from faintspot.loop.observatory import prepare

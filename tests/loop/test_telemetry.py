@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.loop.result_cases import small_interleaved
+from tests.experiments.result_cases import small_interleaved
 
 from faintspot.loop.pseudo_open_loop import open_loop_slopes
 from faintspot.loop.telemetry import analyse_telemetry

@@ -21,10 +21,10 @@ from faintspot.advice.proposals import Progress, Proposal, Sensor, new_estimator
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
 from faintspot.advice.seen import seen_in_telemetry
 from faintspot.advice.trial import Loop, Verdict, try_on
-from faintspot.compare.statistics import Estimate, mean_by_blocks
 from faintspot.control.configuration import load_control
 from faintspot.control.learnt import INTEGRATOR
 from faintspot.errors import InputError
+from faintspot.experiments.statistics import Estimate, mean_by_blocks
 from faintspot.files import derived, parse_json, write_atomically
 from faintspot.io.telemetry import Telemetry
 from faintspot.settings import Settings

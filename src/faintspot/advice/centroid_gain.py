@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.compare.statistics import Estimate
 from faintspot.control.telemetry import without_prior
+from faintspot.experiments.statistics import Estimate
 from faintspot.pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gain
 from faintspot.advice.seen import Seen
-from faintspot.compare.statistics import Estimate, paired_mean
 from faintspot.control.learnt import Plant
 from faintspot.control.telemetry import Telemetry, replayed
 from faintspot.errors import InputError
 from faintspot.estimators.base import Need
 from faintspot.estimators.window import Window
+from faintspot.experiments.question import Question
+from faintspot.experiments.statistics import Estimate, paired_mean
+from faintspot.experiments.tuning import tune
 from faintspot.pipeline import SlopePipeline
-from faintspot.planner.question import Question
-from faintspot.planner.tuning import tune
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.psf import PSF
@@ -182,7 +182,7 @@ def new_estimators(
         By which the slopes of the estimator that runs grow with the spots' motion; a window is told a gain of
         its own that makes its slopes as large, so that the loop's gain stays what it is.
     progress : callable, optional
-        As of `faintspot.planner.tune`.
+        As of `faintspot.experiments.tune`.
 
     Returns
     -------

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.advice.seen import Seen
-from faintspot.compare.statistics import Estimate, paired_mean
-from faintspot.loop.statistics import neighbour_differences
+from faintspot.experiments.loop_results import neighbour_differences
+from faintspot.experiments.statistics import Estimate, paired_mean
 from faintspot.sensor.layout import Layout
 from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.wavefront.fit import fit_wavefront

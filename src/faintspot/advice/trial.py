@@ -16,9 +16,9 @@ from faintspot.advice.proposals import Proposal, Sensor
 from faintspot.advice.residual import compared_residual, residual_wavefront
 from faintspot.advice.seen import Seen, seen_in_telemetry
 from faintspot.advice.watching import watch
-from faintspot.compare.statistics import Estimate
 from faintspot.control.configuration import Control, prior_std_px
 from faintspot.errors import InputError
+from faintspot.experiments.statistics import Estimate
 from faintspot.io.telemetry import Telemetry
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.control_loop import BY_REQUEST, CLOSED

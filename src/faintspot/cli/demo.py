@@ -18,12 +18,12 @@ from faintspot.cli import demo_live
 from faintspot.cli.needs import can_make
 from faintspot.cli.progress import progress_bar
 from faintspot.errors import InputError
+from faintspot.experiments import demonstration
+from faintspot.experiments.demonstration import Comparison
 from faintspot.files import write_atomically
 from faintspot.io.slopes import read_slopes
 from faintspot.pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
-from faintspot.study import demonstration
-from faintspot.study.demonstration import Comparison
 
 if TYPE_CHECKING:
     from faintspot.recorded.statistics import Arm

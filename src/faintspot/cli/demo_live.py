@@ -17,7 +17,7 @@ from faintspot.errors import MissingExtraError
 from faintspot.extras import present, require_linux
 
 if TYPE_CHECKING:
-    from faintspot.compare.statistics import Estimate
+    from faintspot.experiments.statistics import Estimate
     from faintspot.live_page.demonstration import ArmShown, Shown
 
 NAMES = ("seconds", "rate", "photons", "name", "port")

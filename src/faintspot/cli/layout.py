@@ -16,9 +16,9 @@ from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
 from faintspot.errors import InputError
+from faintspot.experiments.first_settings import FirstSettings, first_settings
 from faintspot.files import derived
 from faintspot.io.frames import FrameSource, open_frames
-from faintspot.planner.first_settings import FirstSettings, first_settings
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.sensor.hot_pixels import find_hot_pixels

@@ -16,7 +16,7 @@ from faintspot.cli.progress import progress_bar
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from faintspot.compare.running import Workplace
+    from faintspot.experiments.running import Workplace
 
 
 _needs_loop = needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
@@ -103,9 +103,9 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
       faintspot loop run --quick
       faintspot loop run mine.toml -o mine
     """
+    from faintspot.experiments.interleaved import run_interleaved
+    from faintspot.experiments.loop_verdict import interleaved_summary
     from faintspot.loop.configuration import load_loop
-    from faintspot.loop.interleaved import run_interleaved
-    from faintspot.loop.summary import interleaved_summary
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
@@ -145,9 +145,9 @@ def magnitude(
       faintspot loop magnitude diffraction_limit --arms map_predicted,map+kalman --photons 20
       faintspot loop magnitude camera_3e --arms brightest,smoothed,tv,ml --photons 60,200,640
     """
+    from faintspot.experiments.loop_verdict import magnitude_summary
+    from faintspot.experiments.magnitude import run_magnitude
     from faintspot.loop.configuration import load_loop
-    from faintspot.loop.magnitude import run_magnitude
-    from faintspot.loop.summary import magnitude_summary
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
@@ -176,9 +176,9 @@ def budget(
     Examples:
       faintspot loop budget camera_3e --quick
     """
-    from faintspot.loop.budget import run_budget
+    from faintspot.experiments.budget import run_budget
+    from faintspot.experiments.loop_verdict import budget_summary
     from faintspot.loop.configuration import load_loop
-    from faintspot.loop.summary import budget_summary
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
@@ -233,7 +233,7 @@ def engine(configuration: str, folder: str, control: str, rate: float | None) ->
 @contextmanager
 def _workplace(workers: int | None, scheduler: str | None) -> Iterator[Workplace]:
     """Yield where the work is done, with a progress bar."""
-    from faintspot.compare.running import Workplace
+    from faintspot.experiments.running import Workplace
 
     with progress_bar("loop") as advance:
         yield Workplace(workers, scheduler, advance, lambda text: click.echo(text, err=True))
@@ -249,7 +249,7 @@ def _listed(text: str) -> list[str]:
 
 def _arms(text: str) -> list[str]:
     """Return the arms that are asked for; say of those that could be told a prediction that they are not."""
-    from faintspot.loop.arm_kinds import arm_kind
+    from faintspot.experiments.loop_arms import arm_kind
 
     names = _listed(text)
     for name in names:
@@ -272,7 +272,7 @@ def _number(text: str) -> float:
 
 def _report(folder: str) -> None:
     """Write the page of a folder of results."""
-    from faintspot.loop.page import write_loop_report
+    from faintspot.experiments.loop_page import write_loop_report
 
     page = Path(folder) / "report.html"
     write_loop_report(folder, page)

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from faintspot.cli.needs import needs
-from faintspot.compare.store import kind_of_store
 from faintspot.errors import InputError
+from faintspot.experiments.store import kind_of_store
 from faintspot.files import derived
 from faintspot.io.locations import split_location
 from faintspot.io.zarr_store import holds_telemetry
@@ -43,9 +43,9 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
       faintspot report night.zarr
       faintspot report canary -o canary.html
     """
+    from faintspot.experiments.study_page import report_of_study
     from faintspot.recorded.report_of_stored import report_of_stored
     from faintspot.report.page import write_report
-    from faintspot.study.page import report_of_study
 
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
@@ -57,7 +57,7 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
     for name in frames:
         split_location(name)  # refuses what is not there
     if len(paths) == 1 and holds_loop_results(paths[0]):
-        from faintspot.loop.page import write_loop_report
+        from faintspot.experiments.loop_page import write_loop_report
 
         page = Path(output) if output is not None else paths[0] / "report.html"
         write_loop_report(paths[0], page)

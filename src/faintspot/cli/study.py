@@ -15,7 +15,7 @@ from faintspot.files import derived, write_atomically
 if TYPE_CHECKING:
     import xarray
 
-    from faintspot.study.specification import StudySpecification
+    from faintspot.experiments.specification import StudySpecification
 
 
 def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,7 +74,7 @@ def run(
     TOML lists what is varied (flux, read noise, spot size and shape, elongation, sub-aperture size, range of
     positions, background, EM gain, turbulence), which methods are compared and what they may choose from;
     docs/study.md has examples. Each finished cell of the sweep is stored; interrupted or killed and started
-    again, the command goes on where it stopped. The store opens with faintspot.study.open_study or
+    again, the command goes on where it stopped. The store opens with faintspot.experiments.open_study or
     xarray.open_zarr.
 
     \b
@@ -82,7 +82,7 @@ def run(
       faintspot study run my-study.toml -o my-study.zarr
       faintspot study run my-study.toml --scheduler tls://head-node:8786
     """
-    from faintspot.study.specification import StudySpecification
+    from faintspot.experiments.specification import StudySpecification
 
     described = StudySpecification.from_file(specification)
     target = output or str(derived(specification, ".zarr"))
@@ -122,8 +122,8 @@ def paper(
       faintspot study paper -o paper.zarr
       faintspot study paper --figure fig4 --figure fig6
     """
-    from faintspot.study.page import write_study_report
-    from faintspot.study.paper import paper_study
+    from faintspot.experiments.built_in_studies import paper_study
+    from faintspot.experiments.study_page import write_study_report
 
     described = paper_study(quick, figures or None)
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
@@ -162,9 +162,9 @@ def estimators(
       faintspot study estimators --quick
       faintspot study estimators -o estimators.zarr --table efficiency.md
     """
-    from faintspot.study.efficiency import markdown
-    from faintspot.study.estimators import estimators_study
-    from faintspot.study.page import write_study_report
+    from faintspot.experiments.built_in_studies import estimators_study
+    from faintspot.experiments.efficiency import markdown
+    from faintspot.experiments.study_page import write_study_report
 
     described = estimators_study(quick)
     target = output or f"estimators{'-quick' if quick else ''}.zarr"
@@ -181,7 +181,7 @@ def estimators(
 
 def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:
     """Run a study with a progress bar."""
-    from faintspot.study.running import run as run_study
+    from faintspot.experiments.study import run as run_study
 
     realisations, measured = described.realisations, 0
 

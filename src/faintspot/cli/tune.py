@@ -20,25 +20,24 @@ from faintspot.cli.layout_options import grid_shape
 from faintspot.cli.needs import suggested_slopes
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
-from faintspot.compare.photometry import (
+from faintspot.errors import InputError
+from faintspot.experiments import answer_text
+from faintspot.experiments.question import PROFILES, TABLES, read_camera
+from faintspot.io.frames import open_frames
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.simulate.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
     DEFAULT_THROUGHPUT,
     ZERO_POINTS,
 )
-from faintspot.errors import InputError
-from faintspot.io.frames import open_frames
-from faintspot.planner import answer_text
-from faintspot.planner.camera_file import TABLES, read_camera
-from faintspot.planner.question import PROFILES
-from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from faintspot.planner.answer import Answer
-    from faintspot.planner.question import Question
+    from faintspot.experiments.answer import Answer
+    from faintspot.experiments.question import Question
 
 _MOST_FRAMES, _MOST_PIXELS = 200, 1 << 26
 _MOST_NAMES = 3  # of files that are repeated in the suggested command
@@ -168,7 +167,7 @@ def command(
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
     with progress_bar("tuning", "steps") as advance:
         question = _question(frames, dark, key, given)
-        from faintspot.planner.tuning import tune
+        from faintspot.experiments.tuning import tune
 
         answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
     console = Console(highlight=False)
@@ -274,8 +273,8 @@ def _question(
     frames: tuple[str, ...], dark: tuple[str, ...], key: str | None, given: dict[str, Any]
 ) -> Question:
     """Check what is given, and measure the rest in the frames."""
-    from faintspot.planner.question import Question
-    from faintspot.planner.recorded import question_from_frames
+    from faintspot.experiments.question import Question
+    from faintspot.experiments.recorded import question_from_frames
 
     if dark and not frames:
         raise InputError("--dark: expected --frames as well")

@@ -17,8 +17,8 @@ from faintspot.cli.tune_output import check_target, picture_file, wrapped, write
 from faintspot.errors import InputError
 
 if TYPE_CHECKING:
-    from faintspot.planner.loop_answer import LoopAnswer
-    from faintspot.planner.loop_question import LoopQuestion
+    from faintspot.experiments.loop_answer import LoopAnswer
+    from faintspot.experiments.loop_question import LoopQuestion
 
 NAMES = ("magnitudes", "arms", "strehl", "radius", "minutes", "workers", "folder")
 """Options that only --loop has."""
@@ -70,9 +70,9 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
     check_target(target, options["overwrite"])
     picture = picture_file(target, options["picture"])
     question = _question(config, options)
-    from faintspot.compare.running import Workplace
+    from faintspot.experiments.loop_tuning import tune_loop
+    from faintspot.experiments.running import Workplace
     from faintspot.loop.engine_files import CONFIGURATION as ENGINE_FILE
-    from faintspot.planner.loop_tuning import tune_loop
 
     folder = options["folder"] or f"{question.configuration.name}-tune"
     with progress_bar("loop") as advance:
@@ -93,7 +93,7 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
 
 def show(answer: LoopAnswer) -> None:
     """Print the answer."""
-    from faintspot.planner import loop_text
+    from faintspot.experiments import loop_text
 
     console = Console(highlight=False)
 
@@ -116,7 +116,7 @@ def show(answer: LoopAnswer) -> None:
 
 def strehl_table(answer: LoopAnswer) -> Table:
     """Return the Strehl ratios of all candidates at all measured magnitudes as a table."""
-    from faintspot.planner.answer_text import plain_number
+    from faintspot.experiments.answer_text import plain_number
 
     table = _table()
     for flux in reversed(range(len(answer.photons))):
@@ -132,7 +132,7 @@ def strehl_table(answer: LoopAnswer) -> Table:
 
 def gain_table(answer: LoopAnswer) -> Table:
     """Return limiting magnitudes and what is gained over both references as a table."""
-    from faintspot.planner import loop_text
+    from faintspot.experiments import loop_text
 
     table = _table()
     for heading in ("limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest"):
@@ -149,8 +149,8 @@ def gain_table(answer: LoopAnswer) -> Table:
 
 def sky_table(answer: LoopAnswer) -> Table:
     """Return the fraction of the sky that every candidate opens as a table."""
-    from faintspot.planner import loop_text
-    from faintspot.planner.sky import PLACES
+    from faintspot.experiments import loop_text
+    from faintspot.experiments.loop_question import PLACES
 
     table = _table()
     for place in PLACES:
@@ -170,8 +170,8 @@ def _table() -> Table:
 
 
 def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
+    from faintspot.experiments.loop_question import LoopQuestion
     from faintspot.loop.configuration import load_loop
-    from faintspot.planner.loop_question import LoopQuestion
 
     loop = load_loop(config)
     if options["magnitude"] is not None and options["flux_e"] is not None:

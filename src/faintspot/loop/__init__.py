@@ -8,12 +8,9 @@ from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.loop.arms import Arm as Arm
-    from faintspot.loop.budget import run_budget as run_budget
     from faintspot.loop.configuration import LoopConfiguration as LoopConfiguration
     from faintspot.loop.configuration import load_loop as load_loop
     from faintspot.loop.configuration import shipped_loops as shipped_loops
-    from faintspot.loop.interleaved import run_interleaved as run_interleaved
-    from faintspot.loop.magnitude import run_magnitude as run_magnitude
     from faintspot.loop.record import LoopRecord as LoopRecord
     from faintspot.loop.simulation import simulate_loop as simulate_loop
 
@@ -22,9 +19,6 @@ _HOMES = {
     "LoopConfiguration": "faintspot.loop.configuration",
     "LoopRecord": "faintspot.loop.record",
     "load_loop": "faintspot.loop.configuration",
-    "run_budget": "faintspot.loop.budget",
-    "run_interleaved": "faintspot.loop.interleaved",
-    "run_magnitude": "faintspot.loop.magnitude",
     "shipped_loops": "faintspot.loop.configuration",
     "simulate_loop": "faintspot.loop.simulation",
 }

@@ -13,10 +13,10 @@ import numpy as np
 import tomlkit
 
 from faintspot.checks import one_of
-from faintspot.compare.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
 from faintspot.errors import InputError
 from faintspot.estimators.scene import Scene
 from faintspot.loop.checked_fields import LIST, NUMBER_OR_LIST, checked_section, number
+from faintspot.simulate.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
 from faintspot.sizes import check_size
 from faintspot.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
 from faintspot.turbulence.von_karman import R0_WAVELENGTH_M

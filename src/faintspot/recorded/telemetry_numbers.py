@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.compare.statistics import Estimate, mean_by_blocks
+from faintspot.experiments.statistics import Estimate, mean_by_blocks
 from faintspot.io.frame_numbers import all_left_out
 from faintspot.io.telemetry import Telemetry
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from faintspot.compare.statistics import Estimate
 from faintspot.errors import InputError
+from faintspot.experiments.statistics import Estimate
 from faintspot.io.telemetry import Telemetry, read_telemetry
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run

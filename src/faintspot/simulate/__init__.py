@@ -2,7 +2,8 @@
 
 from faintspot.simulate.detector import Detector
 from faintspot.simulate.frames import sensor_frames, subapertures
+from faintspot.simulate.photometry import Photometry
 from faintspot.simulate.spots import spots
 from faintspot.simulate.turbulence import speckled_spots
 
-__all__ = ["Detector", "sensor_frames", "speckled_spots", "spots", "subapertures"]
+__all__ = ["Detector", "Photometry", "sensor_frames", "speckled_spots", "spots", "subapertures"]

@@ -1,0 +1,57 @@
+"""Experiments: studies of slope errors, the planner, and closed loops compared by their Strehl ratio."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from faintspot.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from faintspot.experiments.answer import Answer as Answer
+    from faintspot.experiments.budget import run_budget as run_budget
+    from faintspot.experiments.cell import measure_cell as measure_cell
+    from faintspot.experiments.interleaved import run_interleaved as run_interleaved
+    from faintspot.experiments.loop_answer import LoopAnswer as LoopAnswer
+    from faintspot.experiments.loop_question import LoopQuestion as LoopQuestion
+    from faintspot.experiments.loop_tuning import tune_loop as tune_loop
+    from faintspot.experiments.magnitude import run_magnitude as run_magnitude
+    from faintspot.experiments.promise import Promise as Promise
+    from faintspot.experiments.promise import check_promises as check_promises
+    from faintspot.experiments.question import Question as Question
+    from faintspot.experiments.recorded import question_from_frames as question_from_frames
+    from faintspot.experiments.specification import StudySpecification as StudySpecification
+    from faintspot.experiments.study import open_study as open_study
+    from faintspot.experiments.study import run as run
+    from faintspot.experiments.sweep import Cell as Cell
+    from faintspot.experiments.sweep import Sweep as Sweep
+    from faintspot.experiments.tuning import tune as tune
+
+_HOMES = {
+    "Answer": "faintspot.experiments.answer",
+    "Cell": "faintspot.experiments.sweep",
+    "LoopAnswer": "faintspot.experiments.loop_answer",
+    "LoopQuestion": "faintspot.experiments.loop_question",
+    "Promise": "faintspot.experiments.promise",
+    "Question": "faintspot.experiments.question",
+    "StudySpecification": "faintspot.experiments.specification",
+    "Sweep": "faintspot.experiments.sweep",
+    "check_promises": "faintspot.experiments.promise",
+    "measure_cell": "faintspot.experiments.cell",
+    "open_study": "faintspot.experiments.study",
+    "question_from_frames": "faintspot.experiments.recorded",
+    "run": "faintspot.experiments.study",
+    "run_budget": "faintspot.experiments.budget",
+    "run_interleaved": "faintspot.experiments.interleaved",
+    "run_magnitude": "faintspot.experiments.magnitude",
+    "tune": "faintspot.experiments.tuning",
+    "tune_loop": "faintspot.experiments.loop_tuning",
+}
+
+__all__ = sorted(_HOMES)
+
+
+__getattr__ = lazy_attributes(__name__, _HOMES)
+
+
+def __dir__() -> list[str]:
+    return __all__

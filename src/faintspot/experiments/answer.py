@@ -1,0 +1,220 @@
+"""The planner's answer: what to use, how good everything else is, and what this rests on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot import configuration
+from faintspot.errors import InputError
+from faintspot.experiments.arms import Knowledge
+from faintspot.experiments.curves import Curve
+from faintspot.experiments.promise import Promise
+from faintspot.experiments.question import Question
+from faintspot.experiments.statistics import Estimate, SlopeStatistics
+from faintspot.loop.arms import Arm
+from faintspot.notebook import table
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import Score
+from faintspot.settings import Settings
+from faintspot.tables import save_tables
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmResult:
+    """One arm at the star's flux, with its best settings."""
+
+    arm: Arm
+    statistics: SlopeStatistics
+    error_px: Floats
+    """(m,) R at every flux, the settings chosen anew at each."""
+    standard_error_px: Floats
+    """(m,) of R."""
+    over_brightest: Estimate
+    """Magnitudes of guide star gained over brightest pixels, by R."""
+    over_thresholded: Estimate
+    """The same over thresholding."""
+    limiting_flux_e: Estimate | None = None
+    """Flux at which R equals the budget: 0 below and infinity above all that was tried; None without one."""
+
+    @property
+    def settings(self) -> Settings:
+        """The best settings."""
+        return self.arm.settings
+
+    @property
+    def psf(self) -> PSF | None:
+        """What the arm knows of the spot."""
+        return self.arm.psf
+
+    @property
+    def score(self) -> Score | None:
+        """What the arm has learnt."""
+        return self.arm.score
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What `faintspot.experiments.tune` found.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.experiments import Question
+    >>> question = Question(read_noise_e=3.0, pixels=8, fwhm_px=1.8, flux_e=200.0)
+    >>> answer = fs.tune(question, realisations=256, steps=1)
+    >>> answer.save("faintspot.toml")
+    >>> fs.Settings.load("faintspot.toml").estimator.name == answer.best.arm.name
+    True
+    """
+
+    question: Question
+    curve: Curve
+    """R of all arms at m fluxes."""
+    results: tuple[ArmResult, ...]
+    equal: tuple[str, ...]
+    """Names of the arms that are as good as the best within the errors; the first is recommended."""
+    bound_px: Floats
+    """(m,) R of an estimator at the Cramer-Rao bound, for spots without speckles."""
+    realisations: int
+    """Spots that were scored at each flux."""
+    left_out: dict[str, str]
+    """Arms that were not tried, and why."""
+    promises: dict[str, Promise] = field(default_factory=dict)
+    """Slope error of every arm, checked on the recording; empty where there is none."""
+
+    @property
+    def flux_e(self) -> Floats:
+        """(m,) fluxes of the curves; the star's is one of them."""
+        return self.curve.flux_e
+
+    @property
+    def at_star(self) -> int:
+        """Which of them is the star's."""
+        return int(np.argmin(np.abs(np.log(self.flux_e / self.question.star_flux_e))))
+
+    @property
+    def best(self) -> ArmResult:
+        """The recommended arm."""
+        return self[self.equal[0]]
+
+    @property
+    def promise(self) -> Promise | None:
+        """The recommended arm's slope error, checked on the recording."""
+        return self.promises.get(self.best.arm.name)
+
+    @property
+    def best_without_psf(self) -> ArmResult:
+        """The best arm of those that need not know the spot."""
+        free = [result for result in self.results if Knowledge.of(result.arm.estimator) < Knowledge.SPOT]
+        if self.best in free:
+            return self.best
+        return min(free, key=lambda result: _finite(result.statistics.corrected_rms.value))
+
+    @property
+    def prior_rms_px(self) -> float:
+        """Rms per axis of the spots' positions, and so of always answering the reference."""
+        return float(self.question.search_range_px / math.sqrt(3))
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether even the recommended arm's corrected rms is not below the spots' own motion."""
+        return not self.best.statistics.corrected_rms.value < self.prior_rms_px
+
+    @property
+    def magnitude_label(self) -> str:
+        """What `magnitudes` counts."""
+        photometry = self.question.photometry
+        if photometry is None:
+            return "magnitudes fainter than the star"
+        return f"guide star magnitude ({photometry.band})"
+
+    def magnitudes(self, flux_e: ArrayLike) -> Floats:
+        """Return the magnitudes of stars of these fluxes; relative to the star without photometry."""
+        photometry = self.question.photometry
+        if photometry is not None:
+            return photometry.magnitude(flux_e)
+        return np.asarray(-2.5 * np.log10(np.asarray(flux_e) / self.question.star_flux_e))
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera, with the maps that the question brought along."""
+        question = self.question
+        base = Calibration() if question.calibration is None else question.calibration
+        return replace(
+            base,
+            gain_e_per_adu=question.gain_e_per_adu,
+            em_gain=question.em_gain,
+            read_noise_e=question.read_noise_e,
+            background_e=question.background_e,
+        )
+
+    def _repr_html_(self) -> str:
+        from faintspot.experiments.answer_text import settings_in_words
+
+        rows = {"recommended": f"{self.best.arm.label} ({settings_in_words(self.best.settings)})"}
+        for result in sorted(self.results, key=lambda each: _finite(each.statistics.corrected_rms.value)):
+            rows[result.arm.label] = (
+                f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
+                f"R {result.error_px[self.at_star]:.3g} px"
+            )
+        return table(f"Estimators for a star of {self.question.star_flux_e:.4g} e-", rows)
+
+    def __getitem__(self, name: str) -> ArmResult:
+        """Return the result of an estimator.
+
+        Raises
+        ------
+        InputError
+            For one that was not tried.
+        """
+        results = {result.arm.name: result for result in self.results}
+        found = results.get(name)
+        if found is None:
+            raise InputError(f"estimator {name!r}: expected one that was tried: {', '.join(results)}")
+        return found
+
+    def save(self, path: str | Path) -> None:
+        """Write the recommended settings as a configuration file; what else it holds stays.
+
+        PSF and score lie beside it; the table [promise] says what the recording made of it, if any. Without a
+        layout the file holds the other tables only.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        best = self.best
+        for item in (self.question.layout, best.settings, self.calibration, best.psf, best.score):
+            if item is not None:
+                configuration.save(path, item)
+        save_tables(path, {"promise": None if self.promise is None else self.promise.to_table()})
+
+    def figure(self) -> Figure:
+        """Draw R against the star's brightness.
+
+        Raises
+        ------
+        MissingExtraError
+            Without matplotlib.
+        """
+        from faintspot.experiments.answer_figures import tune_figure
+
+        return tune_figure(self)
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else math.inf

@@ -1,0 +1,260 @@
+"""The figures of answers: slope error against brightness; Strehl ratios against magnitude, and the sky."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.control.learning import INTEGRATOR
+from faintspot.experiments import answer_text
+from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, SECOND
+from faintspot.report.drawing import GREY, LIGHT_GREY, new_figure, plain_ticks, styled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
+
+
+_WIDTH, _HEIGHT = 10.5, 6.6
+_TICKS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5)
+
+
+@styled
+def tune_figure(answer: Any) -> Figure:
+    """Draw R of every arm and the bound against the star's magnitude, and the limiting magnitude.
+
+    `answer` is a `faintspot.experiments.Answer`, whose module calls this one.
+    """
+    figure = new_figure(_WIDTH, _HEIGHT)
+    axes = figure.subplots()
+    place = answer.magnitudes(answer.flux_e)
+    for result in answer.results:
+        _draw_arm(axes, answer, result, place)
+    saturated = answer.question.search_range_px / 2
+    bound = np.where(answer.bound_px < 1.5 * saturated, answer.bound_px, np.nan)
+    axes.plot(place, bound, color="black", lw=1.3, label="Cramér-Rao bound", zorder=6)
+    axes.axhline(saturated, color=GREY, lw=1, ls=(0, (1, 4)), label="always the reference")
+    axes.set_yscale("log")
+    _axis_limits(axes, answer, saturated)
+    _mark_star(axes, answer)
+    _mark_budget(axes, answer)
+    _electrons_above(axes, answer)
+    plain_ticks(axes.yaxis, _TICKS)
+    axes.grid(which="major", color=LIGHT_GREY, lw=0.7)
+    if answer.promise is not None and answer.promise.contradicted:
+        axes.set_title(answer_text.promise_lines(answer)[-1], color="#b00020", loc="left")
+    axes.set_xlabel(answer.magnitude_label)
+    axes.set_ylabel("slope error R, mean |error| per axis (px)")
+    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0)
+    return figure
+
+
+def _draw_arm(axes: Axes, answer: Any, result: Any, place: NDArray[np.float64]) -> None:
+    style = result.arm.estimator.style
+    best = result is answer.best
+    axes.errorbar(
+        place,
+        result.error_px,
+        result.standard_error_px,
+        color=style.colour,
+        ls=style.line,
+        marker=style.marker,
+        ms=7 if best else 5,
+        lw=3 if best else 1.6,
+        elinewidth=1,
+        zorder=4 if best else 3,
+        label=f"{result.arm.label} (recommended)" if best else result.arm.label,
+    )
+
+
+def _axis_limits(axes: Axes, answer: Any, saturated: float) -> None:
+    drawn = [result.error_px for result in answer.results]
+    lowest = min(float(np.min(drawn)), float(answer.bound_px.min()))
+    highest = min(float(np.max(drawn)), 2.5 * saturated)
+    budget = answer.question.budget_px
+    if budget is not None and lowest / 3 < budget < 3 * highest:
+        lowest, highest = min(lowest, budget), max(highest, budget)
+    axes.set_ylim(lowest / 1.15, highest * 1.15)
+
+
+def _mark_star(axes: Axes, answer: Any) -> None:
+    where = float(answer.magnitudes(answer.question.star_flux_e))
+    axes.axvline(where, color="black", lw=0.8, ls=":", zorder=0)
+    axes.annotate(
+        "the star",
+        (where, 0.015),
+        xycoords=("data", "axes fraction"),
+        xytext=(4, 0),
+        textcoords="offset points",
+    )
+
+
+def _mark_budget(axes: Axes, answer: Any) -> None:
+    budget, limit = answer.question.budget_px, answer.best.limiting_flux_e
+    if budget is None:
+        return
+    axes.axhline(budget, color="#E69F00", lw=1.4, zorder=0)
+    axes.annotate(
+        f"budget {budget:.3g} px",
+        (0.99, budget),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 3),
+        textcoords="offset points",
+        ha="right",
+        color="#8a5f00",
+    )
+    if limit is None or not 0 < limit.value < math.inf:
+        return
+    where = float(answer.magnitudes(limit.value))
+    axes.plot([where], [budget], "o", ms=13, mfc="none", mec="#E69F00", mew=2.5, zorder=5)
+    axes.annotate(
+        f"limit {where:.2f}",
+        (where, budget),
+        xytext=(12, -16),
+        textcoords="offset points",
+        color="#8a5f00",
+        weight="bold",
+    )
+
+
+def _electrons_above(axes: Axes, answer: Any) -> None:
+    """Put an axis of electrons on top, at every flux that was simulated."""
+    top = axes.secondary_xaxis("top")
+    top.set_xticks(answer.magnitudes(answer.flux_e), [f"{float(f'{flux:.3g}'):g}" for flux in answer.flux_e])
+    top.set_xlabel("electrons per sub-aperture and frame")
+
+
+_LOOP_WIDTH, _LOOP_HEIGHT = 13.0, 5.6
+_LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
+
+
+@styled
+def loop_figure(answer: LoopAnswer) -> Figure:
+    """Draw Strehl ratios with errors and limiting magnitudes; where there is a radius, bars of the sky."""
+    figure = new_figure(_LOOP_WIDTH, _LOOP_HEIGHT)
+    if answer.question.radius is None:
+        left = figure.subplots()
+    else:
+        left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+        _draw_sky(right, answer)
+    _draw_strehl(left, answer)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles), frameon=False)
+    return figure
+
+
+def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
+    magnitudes = answer.magnitudes
+    for result in answer.results:
+        drawn = _look(result)
+        axes.plot(magnitudes, answer.curve(result.name), lw=1.6, color=drawn["color"], ls=drawn["ls"])
+        values = [answer.strehl(result.name, flux) for flux in range(len(magnitudes))]
+        axes.errorbar(
+            magnitudes,
+            [each.value for each in values],
+            [each.standard_error for each in values],
+            lw=0,
+            elinewidth=1.2,
+            capsize=2.5,
+            color=drawn["color"],
+            marker=drawn["marker"],
+            mfc=drawn["mfc"],
+            ms=6,
+        )
+        limit = answer.limit(result.name)
+        if limit.is_known:
+            error = limit.error if np.isfinite(limit.error) else 0.0
+            axes.errorbar(limit.magnitude.value, answer.level, xerr=error, **_limit_mark(drawn), zorder=5)
+        name = f"{result.name} (recommended)" if result is answer.best else result.name
+        axes.plot([], [], label=name, lw=1.6, ms=6, **drawn)
+    axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
+    axes.annotate(
+        f"Strehl {answer.level:.2f}: limiting magnitudes",
+        (0.99, answer.level),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 3),
+        textcoords="offset points",
+        ha="right",
+        color="#666666",
+    )
+    if answer.question.configuration.photons in answer.photons:
+        axes.axvline(magnitudes[answer.at_star], color="black", lw=0.8, ls=":", zorder=0)
+        where = (magnitudes[answer.at_star], 0.99)
+        axes.annotate(
+            "the star", where, xycoords=("data", "axes fraction"), xytext=(4, -10), textcoords="offset points"
+        )
+    axes.set_ylim(0, 1)
+    axes.grid(color=LIGHT_GREY, lw=0.7)
+    loop = answer.question.configuration
+    axes.set_xlabel(f"guide star magnitude ({loop.camera.band}); markers are measured, lines interpolated")
+    axes.set_ylabel(f"Strehl ratio at {1e6 * loop.science.wavelength_m:.3g} µm")
+    top = axes.secondary_xaxis("top")
+    top.set_xticks(magnitudes, [f"{float(f'{flux:.3g}'):g}" for flux in answer.photons])
+    top.set_xlabel("photo-electrons per sub-aperture and frame")
+
+
+def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
+    """Draw the fraction of the sky: thick error bars are the limits', thin ones with the star counts'."""
+    width = 0.8 / len(answer.results)
+    for number, result in enumerate(answer.results):
+        drawn = _look(result)
+        for group, place in enumerate(PLACES):
+            found = answer.coverage(result.name, place)
+            assert found is not None
+            where, value = group + (number + 0.5) * width - 0.4, 100 * found.fraction
+            own = 100 * np.nan_to_num(found.strehl_error)
+            both = float(np.hypot(own, 100 * found.model_error))
+            learns = result.kind.control != INTEGRATOR
+            axes.bar(
+                where,
+                value,
+                width * 0.9,
+                color=drawn["color"],
+                alpha=0.75,
+                hatch="//" if learns else "",
+                ec="white",
+            )
+            axes.errorbar(where, value, min(both, 0.95 * value), color="black", lw=0, elinewidth=0.8)
+            axes.errorbar(where, value, min(own, 0.95 * value), color="black", lw=0, elinewidth=3)
+            if found.bound:
+                axes.annotate(
+                    "≥" if found.bound > 0 else "≤",
+                    (where, value + both),
+                    ha="center",
+                    va="bottom",
+                    fontsize=12,
+                )
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(PLACES)), [place.replace(" degrees", "°") for place in PLACES])
+    axes.set_ylabel(f"sky with such a star within {answer.question.radius:.3g}″ (%)")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.grid(axis="y", color=LIGHT_GREY, lw=0.7)
+    axes.set_axisbelow(True)
+    axes.set_title(
+        f"thick: error of the limits; thin: with {100 * MODEL_ERROR:.0f} % of the star counts, common to all",
+        fontsize=10,
+        loc="left",
+        color="#666666",
+    )
+
+
+def _look(result: LoopArmResult) -> dict[str, Any]:
+    """Return colour, line and marker: the estimator's, open and dash-dotted where control learns."""
+    style = result.kind.estimator.style
+    colour = GREY if result.kind.estimator.name == SECOND else style.colour
+    learns = result.kind.control != INTEGRATOR
+    return {
+        "color": colour,
+        "ls": _LEARNING_LINE if learns else style.line,
+        "marker": style.marker,
+        "mfc": "white" if learns else colour,
+    }
+
+
+def _limit_mark(drawn: dict[str, Any]) -> dict[str, Any]:
+    return {"color": drawn["color"], "marker": "|", "ms": 16, "mew": 2.2, "lw": 0, "elinewidth": 2.2}

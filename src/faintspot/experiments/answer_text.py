@@ -1,0 +1,223 @@
+"""The planner's answer in words."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.experiments.answer import Answer, ArmResult
+from faintspot.experiments.arms import Knowledge
+from faintspot.experiments.statistics import Estimate
+from faintspot.settings import Settings
+
+BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
+
+CONTRADICTED = "THE RECORDING CONTRADICTS THE PROMISE"
+UNCHECKED = (
+    "NOTHING WAS CHECKED on the recording: a single frame cannot both teach and check; give two or more"
+)
+_HELPS_ABOVE_MAG = 0.02
+_LOW_GAIN = 0.9
+_SMALLEST_ERROR_MAG = 0.01  # that is shown
+
+
+def situation(answer: Answer) -> str:
+    """Say which star and which spots it is about."""
+    question = answer.question
+    star = f"{plain_number(question.star_flux_e)} electrons per sub-aperture and frame"
+    if question.photometry is not None:
+        star = f"{question.photometry.band} = {_magnitude(answer, question.star_flux_e):.2f}, {star}"
+    kind = f"{question.profile} spots" if question.psf is None else "spots as learnt"
+    if question.d_over_r0:
+        kind = f"speckled spots (sub-aperture {question.d_over_r0:.2g} r0)"
+    return (
+        f"{star}; {kind} of {question.fwhm_px:.2f} px FWHM in {question.shape[0]} x {question.shape[1]} px, "
+        f"within ±{question.search_range_px:.3g} px; read noise {question.read_noise_photoelectrons:.3g} e-"
+    )
+
+
+def settings_in_words(settings: Settings) -> str:
+    """Return the settings that are not at their defaults as `name value` pairs."""
+    pairs = [f'estimator "{settings.estimator.name}"']
+    for name, value in settings.chosen().items():
+        pairs.append(f'{name} "{value}"' if isinstance(value, str) else f"{name} {value:g}")
+    return ", ".join(pairs)
+
+
+def recommendation(answer: Answer) -> list[str]:
+    """Return the recommendation in a few sentences, the first a heading."""
+    best = answer.best
+    lines = [f"Recommended: {best.arm.label} ({settings_in_words(best.settings)})"]
+    if answer.is_hopeless:
+        lines.append(
+            "but the star is too faint: its corrected rms, "
+            f"{best.statistics.corrected_rms.value:.2f} px, is not below "
+            f"that of the spots' own motion, {answer.prior_rms_px:.2f} px"
+        )
+    if best.arm.name != BRIGHTEST:
+        lines.append(
+            f"saves {gain_in_words(answer, best.over_brightest)} over brightest pixels and "
+            f"{gain_in_words(answer, best.over_thresholded)} over thresholding"
+        )
+    others = [answer[name].arm.label for name in answer.equal[1:]]
+    if others:
+        lines.append(
+            f"as good within the error: {', '.join(others)}; taken is what has to know less, and of these "
+            "the cheapest"
+        )
+    lines += _about_tv(answer)
+    gain = best.statistics.gain.value
+    if gain < _LOW_GAIN:
+        lines.append(f"its gain is {gain:.2f} at this flux: divide the slopes by it, or raise the loop gain")
+    alternative = answer.best_without_psf
+    if Knowledge.of(best.arm.estimator) == Knowledge.SPOT:
+        lines.append(
+            f"the best that need not know the spot's shape: {alternative.arm.label} "
+            f"({settings_in_words(alternative.settings)}), "
+            f"{gain_in_words(answer, alternative.over_brightest)} over brightest pixels"
+        )
+    return lines + _limiting(answer) + promise_lines(answer)
+
+
+def promise_lines(answer: Answer) -> list[str]:
+    """Say what the recording makes of the promised error."""
+    promise = answer.promise
+    if promise is None:
+        return [UNCHECKED] if answer.question.facts else []
+    text = (
+        f"checked on frames kept for it, thinned to {plain_number(promise.flux_e)} electrons: predicted R "
+        f"{_with_error(promise.predicted)}, measured {_with_error(promise.measured)} px; pixels are "
+        f"{promise.noise_ratio:.2f} times as noisy as taken"
+    )
+    if math.isfinite(promise.frame_to_frame.value):
+        text += f"; from frame to frame, movement included, {_with_error(promise.frame_to_frame)} px"
+    lines = [text]
+    simulated = min(answer.results, key=lambda result: _rms(result.statistics.corrected_rms.value))
+    if answer.promises[simulated.arm.name].factor > 1 and simulated is not answer.best:
+        lines.append(
+            f"{simulated.arm.label} would be best by simulation alone, but the recording contradicts it: its "
+            f"error is {answer.promises[simulated.arm.name].factor:.2f} times the predicted"
+        )
+    if promise.contradicted:
+        why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
+        expected = f"expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px"
+        if promise.factor == 1:
+            expected = f"its noise is below the predicted; R {promise.promised_px:.3g} px is not corrected"
+        lines.append(f"{CONTRADICTED}: {expected}{why}")
+    return lines
+
+
+def _rms(value: float) -> float:
+    return value if math.isfinite(value) else math.inf
+
+
+def _with_error(value: Estimate) -> str:
+    return f"{value.value:.4f} ± {value.standard_error:.4f}"
+
+
+def foundations(answer: Answer) -> list[str]:
+    """Say what the answer rests on."""
+    question = answer.question
+    spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
+    lines = list(question.facts)
+    if question.psf is None:
+        lines.append(
+            f"{spots} of an assumed profile ({question.profile}, --profile), which matched filter, "
+            "likelihood and trained score know exactly: wrong, it costs them most of their lead; with "
+            "--frames the real spots are learnt"
+        )
+    else:
+        lines.append(f"{spots} with the learnt PSF, which matched filter and likelihood know exactly")
+    lines.append(
+        "positions uniform within the search range, which every arm knows; photon noise and read noise; no "
+        "drifts, no flat-field errors, no scintillation"
+    )
+    if question.photometry is not None:
+        light = question.photometry
+        lines.append(
+            f"photometry: {light.zero_point:.3g} photons/s/m^2 at {light.band} = 0, throughput "
+            f"{light.throughput:g}, quantum efficiency {light.quantum_efficiency:g}"
+        )
+    if question.d_over_r0:
+        lines.append("the bound is that of spots without speckles, and of estimators without a prior")
+    lines += [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
+    return lines
+
+
+def gain_in_words(answer: Answer, gain: Estimate) -> str:
+    """Return magnitudes gained, `more than` what the plot spans where beyond."""
+    if math.isfinite(gain.value):
+        return f"{gain.value:.2f} ± {max(gain.standard_error, _SMALLEST_ERROR_MAG):.2f} mag"
+    span = _span(answer)
+    return f"more than {span:.1f} mag" if gain.value > 0 else f"-{span:.1f} mag or less"
+
+
+def short_gain(answer: Answer, gain: Estimate) -> str:
+    """Return the same for a table."""
+    if math.isfinite(gain.value):
+        return f"{gain.value:+.2f}±{max(gain.standard_error, _SMALLEST_ERROR_MAG):.2f}"
+    return f">+{_span(answer):.1f}" if gain.value > 0 else f"<-{_span(answer):.1f}"
+
+
+def plain_number(value: float, digits: int = 3) -> str:
+    """Return a number to so many digits, without an exponent up to a million."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def _span(answer: Answer) -> float:
+    return float(2.5 * math.log10(answer.flux_e[-1] / answer.question.star_flux_e))
+
+
+def _about_tv(answer: Answer) -> list[str]:
+    """Say whether TV pays, where it is not what is recommended."""
+    tv, best = answer[TV], answer.best
+    if tv is best:
+        return []
+    times = tv.arm.estimator.cost / best.arm.estimator.cost
+    gain = tv.over_brightest
+    if not math.isfinite(gain.value):
+        helps = gain.value > 0
+    else:
+        helps = gain.value > max(_HELPS_ABOVE_MAG, 2 * gain.standard_error)
+    if not helps:
+        return [f"TV denoising does not help here: {gain_in_words(answer, gain)} over brightest pixels"]
+    return [
+        f"TV denoising saves {gain_in_words(answer, gain)} over brightest pixels, at {times:.1f} times "
+        f"the cost of {best.arm.label}"
+    ]
+
+
+def _limiting(answer: Answer) -> list[str]:
+    """Return the limiting magnitudes of the recommended arm and of brightest pixels."""
+    budget = answer.question.budget_px
+    if budget is None:
+        return []
+    brightest = answer[BRIGHTEST]
+    text = f"for R = {budget:.3g} px: {_limit(answer, answer.best)}"
+    if answer.best is not brightest:
+        text += f"; with brightest pixels {_limit(answer, brightest)}"
+    return [f"limiting {'magnitude' if answer.question.photometry else 'flux'} {text}"]
+
+
+def _limit(answer: Answer, result: ArmResult) -> str:
+    limit: Any = result.limiting_flux_e
+    if limit.value == 0:
+        return f"fainter than all that was tried ({_place(answer, answer.flux_e[0])})"
+    if math.isinf(limit.value):
+        return f"brighter than all that was tried ({_place(answer, answer.flux_e[-1])})"
+    if answer.question.photometry is None:
+        return f"{plain_number(limit.value)} ± {plain_number(limit.standard_error, 1)} electrons"
+    error = 2.5 / math.log(10) * limit.standard_error / limit.value
+    return f"{_magnitude(answer, limit.value):.2f} ± {error:.2f}"
+
+
+def _place(answer: Answer, flux_e: float) -> str:
+    if answer.question.photometry is None:
+        return f"{plain_number(flux_e)} electrons"
+    return f"{_magnitude(answer, flux_e):.2f}"
+
+
+def _magnitude(answer: Answer, flux_e: float) -> float:
+    return float(answer.magnitudes(flux_e))

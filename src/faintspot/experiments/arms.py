@@ -1,0 +1,244 @@
+"""Arms for spots of a scene, what they know, and the arms of studies by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.estimate.brightest import RULES
+from faintspot.estimators.base import Estimator, Need, Style
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.gravity import KeepingBrightest
+from faintspot.estimators.registry import estimator_named, estimators
+from faintspot.estimators.scene import Scene
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.thresholded import Thresholded
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.loop.arms import Arm
+from faintspot.options import AUTO, option
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import Score, TrainedScore
+from faintspot.settings import Settings
+from faintspot.simulate.detector import Detector
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
+
+
+class Knowledge(IntEnum):
+    """What an estimator has to know beside the noise; more is larger."""
+
+    NOISE = 0
+    WIDTH = 1
+    SPOT = 2
+
+    @classmethod
+    def of(cls, estimator: Estimator | type[Estimator]) -> Knowledge:
+        """Return what follows from an estimator's needs."""
+        if estimator.needs & {Need.PSF, Need.SCORE}:
+            return cls.SPOT
+        return cls.WIDTH if Need.WIDTH in estimator.needs else cls.NOISE
+
+
+def arm_for_scene(
+    kind: type[Estimator],
+    scene: Scene,
+    *,
+    psf: PSF | None = None,
+    score: Score | None = None,
+) -> Arm:
+    """Return an estimator with the options that a scene asks for, before any are tuned.
+
+    Parameters
+    ----------
+    kind : type of Estimator
+    scene : Scene
+        Its range of positions is the search range.
+    psf, score : PSF, Score, optional
+        Only what the estimator needs is kept.
+
+    Raises
+    ------
+    InputError
+        When an option that it cannot do without is neither automatic nor found in the scene.
+    """
+    automatic = {name: AUTO for name, option in kind.declared().items() if option.automatic}
+    estimator = kind(**automatic).for_scene(scene)
+    usual = {name: values[0] for name, values in estimator.tuned(scene).items()}
+    width = {"spot_fwhm_px": scene.seen_fwhm_px} if Need.WIDTH in kind.needs else {}
+    settings = Settings(
+        estimator.replaced(_rounded({**estimator.chosen(), **usual})),
+        search_range_px=scene.position_range_px,
+        **_rounded(width),
+    )
+    return Arm(
+        kind.label,
+        settings,
+        psf=psf if Need.PSF in kind.needs else None,
+        score=score if Need.SCORE in kind.needs else None,
+    )
+
+
+def score_for_scene(
+    scene: Scene,
+    detector: Detector,
+    rng: np.random.Generator,
+    *,
+    flux_e: Any = None,
+    search_range_px: float | None = None,
+    realisations: int = 20_000,
+) -> TrainedScore:
+    """Train a score on simulated spots of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    detector : Detector
+    rng : numpy.random.Generator
+    flux_e : float or (float, float), optional
+        As `faintspot.train_estimator`. Default: the scene's.
+    search_range_px : float, optional
+        Default: half the window.
+    realisations : int
+    """
+    from faintspot.training.simulation import train_estimator
+
+    return train_estimator(
+        flux_e=scene.flux_e if flux_e is None else flux_e,
+        detector=detector,
+        shape=scene.window,
+        profile=scene.profile,
+        size=scene.spot_fwhm_px / math.sqrt(scene.elongation) / FWHM_OF_SIZE_1_PX[scene.profile],
+        elongation=scene.elongation,
+        d_over_r0=scene.d_over_r0,
+        position_range_px=scene.position_range_px,
+        search_range_px=search_range_px,
+        realisations=realisations,
+        rng=rng,
+    )
+
+
+def tuned_options(arm: Arm, scene: Scene) -> dict[str, list[Any]]:
+    """Return what an arm may choose from in a scene; the usual value of each option is the first."""
+    return {
+        name: list(dict.fromkeys(_rounded(dict(enumerate(values))).values()))
+        for name, values in arm.estimator.tuned(scene).items()
+    }
+
+
+def _rounded(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return numbers to three digits: what is written is what was measured."""
+    return {
+        key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in values.items()
+    }
+
+
+Images = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BrightestAsTheyAre(BrightestPixels):
+    """All but the brightest pixels are zeroed; those stay as they are."""
+
+    rule: Any = option("threshold", "As of `KeepingBrightest`.", choices=RULES)
+
+    name = "threshold"
+    label = "brightest pixels, rule “threshold”"
+    style = Style("#0072B2", "--", "v")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MedianFiltered(KeepingBrightest):
+    """The median of 3 x 3 pixels, then the brightest of them."""
+
+    name = "median"
+    label = "3 × 3 median filter"
+    style = Style("#56B4E9", "-", "<")
+    automatic_method = BrightestPixels.automatic_method
+
+    def denoised(self, images: Images) -> Images:
+        """See `KeepingBrightest`."""
+        return median_of_nine(images)
+
+
+def median_of_nine(images: Images) -> Images:
+    """Return the median of each pixel and its eight neighbours; pixels at the edge continue outwards.
+
+    The median of nine numbers in three sorted columns is the median of the largest of the small ones, the
+    median of the middle ones and the smallest of the large ones.
+    """
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    low, middle, high = _sorted_three(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
+    small = np.maximum(np.maximum(low[..., :-2], low[..., 1:-1]), low[..., 2:])
+    centre = _sorted_three(middle[..., :-2], middle[..., 1:-1], middle[..., 2:])[1]
+    large = np.minimum(np.minimum(high[..., :-2], high[..., 1:-1]), high[..., 2:])
+    return _sorted_three(small, centre, large)[1]
+
+
+def _sorted_three(a: Images, b: Images, c: Images) -> tuple[Images, Images, Images]:
+    """Return the smallest, the middle and the largest of three images, pixel by pixel."""
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    return np.minimum(low, c), np.maximum(low, np.minimum(high, c)), np.maximum(high, c)
+
+
+Kind = type[Estimator]
+
+TV, NO_TV, SMOOTHING = TotalVariation.name, BrightestPixels.name, Smoothed.name
+"""The arms that the paper's claims compare, and the simplest rival."""
+TV_OVER_NO_TV = {"method": TV, "reference": NO_TV}
+"""Which curves gains are taken between."""
+
+_ONLY_HERE: dict[str, Kind] = {kind.name: kind for kind in (BrightestAsTheyAre, MedianFiltered)}
+DEFAULT_ARMS = tuple(
+    kind.name
+    for kind in (BrightestPixels, TotalVariation, BrightestAsTheyAre, Smoothed, MedianFiltered, Thresholded)
+)
+"""The built-in ones that know nothing of the spot."""
+
+
+def kind_of(arm: str) -> Kind:
+    """Return the estimator that an arm is.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
+    """
+    known = [*estimators(), *_ONLY_HERE]
+    if arm not in known:
+        raise InputError(f"arms = {arm!r}: expected one of {', '.join(map(repr, known))}")
+    return _ONLY_HERE.get(arm) or estimator_named(arm)
+
+
+def label_of(arm: str) -> str:
+    """Return what tables and figures call an arm; its name where its estimator is not installed here."""
+    return kind_of(arm).label if _is_known(arm) else arm
+
+
+def style_of(arm: str) -> Style:
+    """Return how figures draw an arm."""
+    return kind_of(arm).style if _is_known(arm) else Estimator.style
+
+
+def knows_the_spot(arm: str) -> bool:
+    """Whether an arm is told more than the noise."""
+    return _is_known(arm) and Knowledge.of(kind_of(arm)) > Knowledge.NOISE
+
+
+def is_estimator(arm: str) -> bool:
+    """Whether an arm is not of studies alone."""
+    return arm not in _ONLY_HERE
+
+
+def keeps_every_k(kind: Kind) -> bool:
+    """Whether all numbers of kept pixels are measured at once: its denoised images are known."""
+    return issubclass(kind, KeepingBrightest) and kind.denoised is not KeepingBrightest.denoised
+
+
+def _is_known(arm: str) -> bool:
+    return arm in _ONLY_HERE or arm in estimators()

@@ -1,0 +1,180 @@
+"""The error budget: what the Strehl ratio would be without one of the things that spoil it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import one_of
+from faintspot.errors import InputError
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.experiments.loop_arms import ArmKind, Choice
+from faintspot.experiments.loop_results import BudgetResult
+from faintspot.experiments.magnitude import checked_arms, quick_run, tuned_choices, unit_store
+from faintspot.experiments.running import Advance, Unit, Workplace, run_units
+from faintspot.experiments.search import QUICK, Search
+from faintspot.loop.configuration import CLOSED, LoopConfiguration
+from faintspot.loop.files import BUDGET_FILE, make_folder
+from faintspot.loop.simulation import Idealised, simulate_loop
+
+KIND = "budget"
+DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation))
+_NOTHING = "nothing"
+_FASTER = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """Something that spoils the Strehl ratio."""
+
+    name: str
+    meaning: str
+    """What is done to switch it off."""
+    off: Idealised
+    """A loop without it."""
+
+
+TERMS = {
+    term.name: term
+    for term in (
+        Term(_NOTHING, "the loop as it is", Idealised()),
+        Term("photon and read noise", "mean light in every pixel", Idealised(noiseless=True)),
+        Term(
+            "servo lag",
+            "ten times the frame rate, as much light in every frame, in stretches over the same time",
+            Idealised(faster=_FASTER),
+        ),
+        Term(
+            "fitting and aliasing",
+            "the wavefront is only what the mirror can make",
+            Idealised(correctable=True),
+        ),
+        Term(
+            "centroid gain error",
+            "slopes are divided by the gain that they had in the run",
+            Idealised(exact_gain=True),
+        ),
+        Term("slope error", "slopes are the mean gradients of the wavefront", Idealised(true_slopes=True)),
+        Term("slope error and servo lag", "both", Idealised(true_slopes=True, faster=_FASTER)),
+    )
+}
+"""What is switched off, by name; the first is nothing."""
+
+Floats = NDArray[np.float64]
+
+
+def run_budget(
+    configuration: LoopConfiguration,
+    folder: str | Path,
+    arms: Sequence[str] | None = None,
+    *,
+    quick: bool = False,
+    search: Search | None = None,
+    place: Workplace | None = None,
+    overwrite: bool = False,
+) -> BudgetResult:
+    """Measure the Strehl ratio of arms with each of `TERMS` switched off, or what is left of it.
+
+    Each arm is tuned as for `run_magnitude`, at the configuration's own light with everything on, and keeps
+    these settings and its loop gain throughout. The result is also written to the folder.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    folder : path
+        Where finished units are remembered; made where it is not there.
+    arms : sequence of str, optional
+        See `faintspot.experiments.loop_arms.arm_kind`. Default: brightest pixels, Gaussian smoothing and TV.
+    quick, search, place, overwrite
+        As for `run_magnitude`.
+
+    Raises
+    ------
+    InputError
+        For unknown arms, a folder that holds another experiment, or a loop that is open.
+    MissingExtraError
+        When HCIPy, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.experiments import run_budget
+    >>> from faintspot.loop import load_loop
+    >>> result = run_budget(load_loop("canary"), "budget", quick=True)  # doctest: +SKIP
+    """
+    if configuration.control.mode != CLOSED:
+        raise InputError(
+            f"control.mode = {configuration.control.mode!r}: expected 'closed' for an error budget"
+        )
+    place = Workplace() if place is None else place
+    configuration = quick_run(configuration) if quick else configuration
+    search = search or (QUICK if quick else Search())
+    kinds = checked_arms(DEFAULT_ARMS if arms is None else arms)
+    folder = make_folder(folder)
+    flux = configuration.photons
+    choices = tuned_choices(configuration, kinds, [flux], search, folder, KIND, place, overwrite=overwrite)
+    runs = range(configuration.run.realisations)
+    units = [
+        Unit(
+            _key(kind, term, run),
+            (kind, configuration, choices[kind.name, flux], term, run),
+            configuration.run.frames,
+        )
+        for kind in kinds
+        for term in TERMS
+        for run in runs
+    ]
+    store = unit_store(folder, KIND, (configuration, search), units, overwrite=overwrite)
+    place.say("scoring")
+    results = run_units(budget_run, units, store, place)
+
+    def of(variable: str) -> Floats:
+        return np.array(
+            [[[results[_key(kind, term, run)][variable] for run in runs] for term in TERMS] for kind in kinds]
+        )
+
+    names, labels = (tuple(getattr(kind, what) for kind in kinds) for what in ("name", "label"))
+    result = BudgetResult(names, tuple(TERMS), labels, of("strehl"), of("residual_nm"))
+    result.save(folder / BUDGET_FILE)
+    return result
+
+
+def _key(kind: ArmKind, term: str, realisation: int) -> str:
+    return f"{kind.name}-{term}-{realisation}"
+
+
+def budget_run(
+    kind: ArmKind,
+    configuration: LoopConfiguration,
+    choice: Choice,
+    term: str,
+    realisation: int,
+    advance: Advance,
+) -> dict[str, NDArray[Any]]:
+    """Run a tuned arm once with a term switched off; Strehl ratio and rms wavefront as arrays.
+
+    Raises
+    ------
+    InputError
+        For an unknown term.
+    """
+    off = TERMS[one_of("term", term, list(TERMS))].off
+    arm = kind.arm(configuration, choice)
+    record = simulate_loop(
+        configuration,
+        [arm],
+        realisation=realisation,
+        progress=lambda done, total: advance(done),
+        idealised=off,
+    )
+    scored = record.scored & off.settled(record.frames)
+    return {
+        "strehl": np.asarray(record.strehl[scored].mean()),
+        "residual_nm": np.asarray(np.sqrt(np.mean(record.residual_nm[scored] ** 2))),
+    }

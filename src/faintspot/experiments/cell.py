@@ -1,0 +1,353 @@
+"""One cell of a study: simulate, choose each arm's settings on one half, score them on the other.
+
+All arms see the same images. They are simulated and measured block by block, so that memory does not grow
+with the number of realisations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
+from faintspot.experiments.arms import keeps_every_k, knows_the_spot
+from faintspot.experiments.cell_arms import (
+    Candidate,
+    CellArms,
+    Floats,
+    Images,
+    detector_of,
+    error_sums,
+    errors_of,
+    moments_of,
+    position_table,
+    shown,
+)
+from faintspot.experiments.specification import BEST, CORRECTED, StudySpecification
+from faintspot.experiments.statistics import OUTLIER_PX, slope_statistics
+from faintspot.experiments.sweep import Cell
+from faintspot.simulate import subapertures
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What an arm chose in a mode."""
+
+    candidate: Candidate
+    column: int | None
+    """Number of kept pixels less one; None where every k is not measured."""
+
+
+class Tuning:
+    """Errors of all candidates on the first half of a cell's images, and what follows from them."""
+
+    def __init__(self, arms: CellArms, specification: StudySpecification) -> None:
+        self._arms = arms
+        self._modes = specification.kept_pixels(arms.cell)
+        self._candidates = {arm: arms.candidates(arm) for arm in specification.arms}
+        self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
+        self._moments: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)
+
+    def add(self, blocks: list[Any]) -> None:
+        """Add images and their true positions."""
+        for arm, candidates in self._candidates.items():
+            if keeps_every_k(self._arms.kinds[arm]):
+                for block in blocks:
+                    self._add_table(arm, candidates, *block)
+            elif len(candidates) > 1:  # else there is nothing to choose
+                self._add_measured(arm, candidates, blocks)
+
+    def _add_table(self, arm: str, candidates: Sequence[Candidate], images: Images, truth: Floats) -> None:
+        estimators: list[Any] = [self._arms.estimator(arm, candidate) for candidate in candidates]
+        reach = self._arms.search_range_px
+        self._errors[arm] += error_sums(estimators, images, truth, reach)
+        if CORRECTED in self._modes:
+            tables = (position_table(each, images, reach)[0] for each in estimators)
+            self._moments[arm] += np.stack([moments_of(table, truth) for table in tables], axis=1)
+
+    def _add_measured(self, arm: str, candidates: Sequence[Candidate], blocks: list[Any]) -> None:
+        images, truth = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+        slopes = [self._arms.measure(arm, candidate, images) for candidate in candidates]
+        positions = [np.stack([s.x, s.y], axis=-1).astype(np.float64) for s in slopes]
+        sums = np.array([[np.abs(part - truth).mean(axis=1).sum()] for part in positions])
+        self._errors[arm] += sums
+        moments = [moments_of(part[:, None], truth) for part in positions]
+        self._moments[arm] += np.stack(moments, axis=1)
+
+    def choices(self) -> dict[tuple[str, str], Choice]:
+        """Return the choice of every arm and mode."""
+        chosen = {}
+        for arm, candidates in self._candidates.items():
+            for mode, kept in self._modes.items():
+                if np.ndim(self._errors[arm]) == 0:
+                    chosen[arm, mode] = Choice(candidates[0], None)
+                    continue
+                errors = _corrected_rms(self._moments[arm]) if mode == CORRECTED else self._errors[arm]
+                chosen[arm, mode] = _smallest(candidates, errors, kept)
+        return chosen
+
+
+def _smallest(candidates: Sequence[Candidate], errors: Floats, kept: int | None) -> Choice:
+    """Return the candidate, and where `kept` is None the k, of a table's smallest error (candidates, K)."""
+    if errors.shape[1] == 1:
+        return Choice(candidates[int(np.argmin(errors))], None)
+    if kept is not None:
+        return Choice(candidates[int(np.argmin(errors[:, kept - 1]))], kept - 1)
+    row, column = np.unravel_index(np.argmin(errors), errors.shape)
+    return Choice(candidates[int(row)], int(column))
+
+
+def _corrected_rms(moments: Floats) -> Floats:
+    """Root mean square of the residuals over the gain, as `slope_statistics`."""
+    n, true_x, true_y, true_squares, x, y, squares, across = moments
+    spread = true_squares - (np.square(true_x) + np.square(true_y)) / n
+    together = across - (x * true_x + y * true_y) / n
+    own = squares - (np.square(x) + np.square(y)) / n
+    gain = together / spread
+    residual = np.maximum(own - gain * together, 0.0) / (2 * n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(gain > 0, np.sqrt(residual) / gain, np.inf)
+
+
+_BLOCK_PIXELS = 1 << 18  # small enough for the processor's cache
+_STACK_PIXELS = 1 << 21  # that an estimator measures at once
+
+
+Block = tuple[Images, Floats]
+"""Images (n, side, side) and the true positions of their spots, (n, 2) px."""
+STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
+"""Variables beside R that are made with their standard errors, from `slope_statistics`."""
+
+
+def realisations(cell: Cell, count: int, rng: np.random.Generator) -> Iterator[Block]:
+    """Yield blocks of noisy images (n, side, side), the mean background subtracted, and true positions."""
+    detector = detector_of(cell)
+    block = _BLOCK_PIXELS // cell.pixels**2
+    for start in range(0, count, block):
+        images, truth = subapertures(
+            min(block, count - start),
+            shape=(cell.pixels, cell.pixels),
+            flux_e=cell.flux_e,
+            profile=cell.profile,
+            size=cell.size,
+            elongation=cell.elongation,
+            position_range_px=cell.position_range_px,
+            d_over_r0=cell.d_over_r0,
+            detector=detector,
+            rng=rng,
+        )
+        yield images - np.float32(cell.background_e), truth
+
+
+def _stacks(blocks: Iterable[Block], pixels: int) -> Iterator[list[Block]]:
+    """Yield several blocks at a time."""
+    stack: list[Block] = []
+    for block in blocks:
+        stack.append(block)
+        if sum(len(truth) for _, truth in stack) * pixels**2 >= _STACK_PIXELS:
+            yield stack
+            stack = []
+    if stack:
+        yield stack
+
+
+def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDArray[Any]]:
+    """Measure one cell of a study.
+
+    Parameters
+    ----------
+    cell : Cell
+    specification : StudySpecification
+
+    Returns
+    -------
+    dict
+        The variables of the study's dataset for this cell (`faintspot.experiments.study.VARIABLES`), without
+        the dimension cell; K = pixels^2 - 1. NaN in modes that keep more pixels than the window can.
+
+    Examples
+    --------
+    >>> from faintspot.experiments import StudySpecification, Sweep, measure_cell
+    >>> light = Sweep("light", flux_e=100, pixels=8)
+    >>> study = StudySpecification("mine", [light], realisations=400, arms=["brightest"], fixed_k=[])
+    >>> measured = measure_cell(study.cells()[0], study)
+    >>> print(f"R = {measured['error'][0, 0]:.2f} px, {measured['chosen_k'][0, 0]:.0f} pixels kept")
+    R = 0.07 px, 12 pixels kept
+    """
+    rng = np.random.default_rng(cell.seed(specification.seed))
+    half = specification.realisations // 2
+    arms: CellArms | None = None
+    for stack in _stacks(realisations(cell, half, rng), cell.pixels):
+        if arms is None:
+            light = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
+            arms = CellArms(cell, specification, float(light.mean()))
+            tuning = Tuning(arms, specification)
+        tuning.add(stack)
+    assert arms is not None
+    scores = Scores(arms, tuning.choices())
+    for stack in _stacks(realisations(cell, specification.realisations - half, rng), cell.pixels):
+        scores.add(stack)
+    return _results(cell, specification, scores)
+
+
+class Scores:
+    """Positions with the chosen settings, stack after stack."""
+
+    def __init__(self, arms: CellArms, choices: dict[tuple[str, str], Choice]) -> None:
+        self._arms, self.choices = arms, choices
+        self._truth: list[Floats] = []
+        self._positions: dict[tuple[str, str], list[Floats]] = {key: [] for key in choices}
+        self._valid: dict[tuple[str, str], list[Any]] = {key: [] for key in choices}
+        self._stated: dict[str, list[Floats]] = {}
+        self.sums: dict[str, Any] = {}  # of the errors and of their squares, for every k
+
+    @property
+    def truth(self) -> Floats:
+        """True positions (n, 2), px."""
+        return np.concatenate(self._truth)
+
+    def add(self, blocks: list[Block]) -> None:
+        """Score images."""
+        self._truth += [truth for _, truth in blocks]
+        for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
+            if keeps_every_k(self._arms.kinds[arm]):
+                for block in blocks:
+                    self._add_table(arm, candidate, *block)
+            else:
+                self._add_measured(arm, candidate, np.concatenate([images for images, _ in blocks]))
+
+    def _modes(self, arm: str, candidate: Candidate) -> list[str]:
+        """Modes in which an arm chose a candidate."""
+        same = (arm, candidate)
+        return [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
+
+    def _add_measured(self, arm: str, candidate: Candidate, images: Images) -> None:
+        slopes = self._arms.measure(arm, candidate, images)
+        modes = self._modes(arm, candidate)
+        for mode in modes:
+            self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
+            self._valid[arm, mode].append(slopes.valid)
+        stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
+        if BEST in modes and knows_the_spot(arm):
+            self._stated.setdefault(arm, []).append(stated.astype(np.float64))
+
+    def _add_table(self, arm: str, candidate: Candidate, images: Images, truth: Floats) -> None:
+        estimator: Any = self._arms.estimator(arm, candidate)
+        positions, valid = position_table(estimator, images, self._arms.search_range_px)
+        modes = self._modes(arm, candidate)
+        for mode in modes:
+            column = self.choices[arm, mode].column or 0
+            self._positions[arm, mode].append(positions[:, column])
+            self._valid[arm, mode].append(valid[:, column])
+        if BEST in modes:
+            errors = errors_of(positions, truth[:, None])
+            sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
+            self.sums[arm] = self.sums.get(arm, 0.0) + sums
+
+    def positions(self, arm: str, mode: str) -> Floats:
+        """Return the positions of all realisations, (n, 2) px."""
+        return np.concatenate(self._positions[arm, mode])
+
+    def valid(self, arm: str, mode: str) -> NDArray[np.bool_]:
+        """Return which realisations have a valid position."""
+        return np.concatenate(self._valid[arm, mode])
+
+    def stated(self, arm: str) -> Floats | None:
+        """Return the standard errors (n, 2) that an estimator states, px, in mode "best"."""
+        return np.concatenate(self._stated[arm]) if arm in self._stated else None
+
+
+def _results(cell: Cell, specification: StudySpecification, scores: Scores) -> dict[str, NDArray[Any]]:
+    """Arrange choices and scores as the dataset has them."""
+    arms, modes, truth = specification.arms, specification.modes, scores.truth
+    names = ["error", "error_se", "chosen_k", "chosen_candidate", "chosen_model_error", "invalid_fraction"]
+    names += [name for statistic in STATISTICS for name in (statistic, f"{statistic}_se")]
+    results: dict[str, NDArray[Any]] = {name: np.full((len(arms), len(modes)), np.nan) for name in names}
+    results["error_covariance"] = np.full((len(modes), len(arms), len(arms)), np.nan)
+    for j, mode in enumerate(modes):
+        if (arms[0], mode) not in scores.choices:
+            continue
+        positions = [scores.positions(arm, mode) for arm in arms]
+        errors = np.stack([errors_of(part, truth) for part in positions])
+        covariance = _covariance_of_means(errors)
+        results["error"][:, j] = errors.mean(axis=1)
+        results["error_se"][:, j] = np.sqrt(np.diag(covariance))
+        results["error_covariance"][j] = covariance
+        for i, arm in enumerate(arms):
+            choice = scores.choices[arm, mode]
+            results["chosen_k"][i, j] = np.nan if choice.column is None else choice.column + 1
+            results["chosen_candidate"][i, j] = shown(choice.candidate)
+            results["chosen_model_error"][i, j] = shown(choice.candidate, "model_error")
+            results["invalid_fraction"][i, j] = 1.0 - scores.valid(arm, mode).mean()
+            statistics = slope_statistics(positions[i][:, 0], positions[i][:, 1], truth)
+            for name in STATISTICS:
+                estimate = getattr(statistics, name)
+                results[name][i, j] = estimate.value
+                results[f"{name}_se"][i, j] = estimate.standard_error
+    results |= _stated_over_actual(arms, scores)
+    return results | _results_at_k(cell, arms, scores) | _against_the_bound(cell, results["error"])
+
+
+def _stated_over_actual(arms: Any, scores: Scores) -> dict[str, NDArray[Any]]:
+    """Root mean squares of stated standard errors and of errors: their ratio, without outliers and with."""
+    without, whole = np.full((2, len(arms)), np.nan)
+    for i, arm in enumerate(arms):
+        stated = scores.stated(arm)
+        if stated is not None:
+            errors = scores.positions(arm, BEST) - scores.truth
+            known = np.all(np.isfinite(stated), axis=1)
+            near = known & np.all(np.abs(errors) <= OUTLIER_PX, axis=1)
+            without[i], whole[i] = (
+                np.sqrt(np.mean(np.square(stated[part])) / np.mean(np.square(errors[part])))
+                if part.any()
+                else np.nan
+                for part in (near, known)
+            )
+    return {"stated_over_actual": without, "stated_over_actual_all": whole}
+
+
+def _against_the_bound(cell: Cell, errors: Floats) -> dict[str, NDArray[Any]]:
+    """Cramer-Rao bound and photon efficiency; NaN for speckled spots, whose bound is not known."""
+    bounds, efficiency = np.full(2, np.nan), np.full(errors.shape, np.nan)
+    if cell.d_over_r0 == 0:
+        conditions: dict[str, Any] = {
+            "shape": (cell.pixels, cell.pixels),
+            "profile": cell.profile,
+            "size": cell.size,
+            "elongation": cell.elongation,
+            "detector": detector_of(cell),
+            "position_range_px": cell.position_range_px,
+        }
+        bound = cramer_rao(cell.flux_e, **conditions)
+        bounds = np.array([MEAN_ABSOLUTE * bound.mean(), np.sqrt(np.mean(np.square(bound)))])
+        known = errors > 0
+        efficiency[known] = photon_efficiency(errors[known], cell.flux_e, **conditions)
+    return {"bound": bounds[0], "bound_rms": bounds[1], "photon_efficiency": efficiency}
+
+
+def _results_at_k(cell: Cell, arms: Any, scores: Scores) -> dict[str, NDArray[Any]]:
+    """R and its standard error for every k, at the candidate of mode "best"."""
+    errors, standard_errors = np.full((2, len(arms), cell.pixels**2 - 1), np.nan)
+    count = len(scores.truth)
+    for i, arm in enumerate(arms):
+        if arm in scores.sums:
+            mean, mean_square = scores.sums[arm] / count
+            errors[i] = mean
+            standard_errors[i] = np.sqrt(np.maximum(mean_square - mean**2, 0.0) / (count - 1))
+    return {"error_at_k": errors, "error_at_k_se": standard_errors}
+
+
+def _covariance_of_means(errors: Floats) -> Floats:
+    """Covariance of the means of (arms, n) errors.
+
+    Products are summed without BLAS, whose results depend on its number of threads.
+    """
+    n = errors.shape[1]
+    centred = errors - errors.mean(axis=1, keepdims=True)
+    products: Floats = np.array([[(a * b).sum() for b in centred] for a in centred])
+    products /= n * (n - 1)
+    return products

@@ -1,0 +1,257 @@
+"""The arms of a study in one cell: what each may choose from, how it measures, and its errors for every k."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot import estimators
+from faintspot.estimators.base import Estimator, Need
+from faintspot.estimators.gravity import KeepingBrightest
+from faintspot.estimators.scene import Scene
+from faintspot.experiments.arms import Kind, keeps_every_k, kind_of, score_for_scene
+from faintspot.kernels import scoring
+from faintspot.loop.arms import Arm
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.settings import Settings
+from faintspot.simulate import Detector
+from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
+from faintspot.slopes import Slopes
+
+if TYPE_CHECKING:
+    from faintspot.experiments.specification import StudySpecification
+    from faintspot.experiments.sweep import Cell
+
+
+Images = NDArray[np.float32]
+
+_KEPT = "keep_brightest"
+_TRAINING = 1  # word that is added to a cell's seed
+_LEAST_LIGHT_E = 1e-3  # a mean of noise may be negative
+
+# In a cell ------------------------------------------------------------------------------------------------
+
+Candidate = tuple[tuple[str, float], ...]
+"""What an arm may choose: options, in the units of the specification."""
+
+
+def shown(candidate: Candidate, option: str | None = None) -> float:
+    """Return the value of an option, or of the first; NaN where there is none."""
+    values = dict(candidate)
+    return next(iter(values.values()), math.nan) if option is None else values.get(option, math.nan)
+
+
+def detector_of(cell: Cell) -> Detector:
+    """Return the camera of a cell."""
+    return Detector(
+        read_noise_e=cell.read_noise_e * cell.em_gain, background_e=cell.background_e, em_gain=cell.em_gain
+    )
+
+
+class CellArms:
+    """The arms of a study in one cell: candidates, estimators, and slopes of images.
+
+    Parameters
+    ----------
+    cell : Cell
+    specification : StudySpecification
+    light_e : float, optional
+        Mean electrons of an image as measured, which arms without a table are told. Default: the cell's.
+    """
+
+    def __init__(self, cell: Cell, specification: StudySpecification, light_e: float | None = None) -> None:
+        self.cell, self._specification = cell, specification
+        self.light_e = max(cell.flux_e if light_e is None else light_e, _LEAST_LIGHT_E)
+        self.search_range_px = specification.search_range_of(cell)
+        self._within_px = min(self.search_range_px, cell.pixels / 2)
+        self.kinds = {arm: kind_of(arm) for arm in specification.arms}
+        self._calibration = Calibration(
+            dark=0.0,
+            read_noise_e=cell.read_noise_e * cell.em_gain,
+            em_gain=cell.em_gain,
+            background_e=cell.background_e,
+        )
+
+    def candidates(self, arm: str) -> list[Candidate]:
+        """Return what an arm chooses from."""
+        axes = self._axes(self.kinds[arm])
+        return [tuple(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+
+    def estimator(self, arm: str, candidate: Candidate) -> Estimator:
+        """Return the estimator with a candidate's options."""
+        return self.kinds[arm](**{name: value * self._unit(name) for name, value in candidate})
+
+    def measure(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
+        """Return the slopes of images (n, side, side) in photo-electrons."""
+        output = images * np.float32(self.cell.em_gain)  # as the camera gives it
+        made = self._arm(self.estimator(arm, candidate))
+        return estimators.measure(output, made.settings, calibration=self._calibration, **made.parts)
+
+    def _arm(self, estimator: Estimator) -> Arm:
+        """Tell an estimator what it has to know."""
+        told: dict[str, Any] = {}
+        if Need.WIDTH in estimator.needs:
+            told["spot_fwhm_px"], told["spot_fwhm_y_px"] = self._spot_fwhm_px
+        return Arm(
+            estimator.label,
+            Settings(estimator, search_range_px=self._within_px, flux_e=self.light_e, **told),
+            psf=self._psf if Need.PSF in estimator.needs else None,
+            score=self._score if Need.SCORE in estimator.needs else None,
+        )
+
+    def _axes(self, kind: Kind) -> dict[str, list[float]]:
+        """Values of every option that an arm chooses, in the units of the specification."""
+        listed = {
+            name: list(self._listed(name)) for name in kind.declared() if name in self._specification.LISTED
+        }
+        found_by_table = {_KEPT} if keeps_every_k(kind) else set()
+        made = kind(**{name: values[0] * self._unit(name) for name, values in listed.items()})
+        own = {
+            name: list(values)
+            for name, values in made.tuned(self.scene).items()
+            if name not in self._specification.LISTED.keys() | found_by_table
+        }
+        return {**listed, **own}
+
+    def _listed(self, option: str) -> tuple[float, ...]:
+        key, only_speckled = self._specification.LISTED[option]
+        if only_speckled and self.cell.d_over_r0 == 0:
+            return (0.0,)
+        return tuple(getattr(self._specification, key))
+
+    def _unit(self, option: str) -> float:
+        """Return what a number of the specification is multiplied with."""
+        if option in ("noise_std", "threshold_e"):
+            return self.cell.pixel_noise_e
+        return math.sqrt(math.prod(self._spot_fwhm_px)) if option == "weight_fwhm_px" else 1
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """What estimators are told of the cell that tune options of their own."""
+        cell = self.cell
+        return Scene(
+            flux_e=self.light_e,
+            read_noise_e=cell.read_noise_e,
+            window=(cell.pixels, cell.pixels),
+            spot_fwhm_px=FWHM_OF_SIZE_1_PX[cell.profile] * cell.size * math.sqrt(cell.elongation),
+            position_range_px=self._within_px,
+            elongation=cell.elongation,
+            excess_noise=cell.excess_noise,
+            background_e=cell.background_e,
+            d_over_r0=cell.d_over_r0,
+            profile=cell.profile,
+        )
+
+    @property
+    def _psf(self) -> PSF:
+        """The PSF without turbulence, as far out as a window sees it."""
+        cell = self.cell
+        radius = math.ceil(cell.pixels / 2 + self._within_px) + 2
+        return _psf_of(cell.profile, cell.size, cell.elongation, radius)
+
+    @functools.cached_property
+    def _spot_fwhm_px(self) -> tuple[float, float]:
+        """Width along x and y, without turbulence."""
+        along, across = self._psf.fwhm_px[0].tolist()
+        return along, across
+
+    @functools.cached_property
+    def _score(self) -> TrainedScore:
+        """Trained on spots of a seed of their own."""
+        cell = self.cell
+        entropy = [*cell.seed(self._specification.seed).entropy, _TRAINING]  # type: ignore[misc]
+        rng = np.random.default_rng(np.random.SeedSequence(entropy))
+        scene = replace(self.scene, position_range_px=cell.position_range_px)
+        return score_for_scene(scene, detector_of(cell), rng, search_range_px=self._within_px)
+
+
+@functools.lru_cache(maxsize=16)
+def _psf_of(profile: str, size: float, elongation: float, radius_px: float) -> PSF:
+    return PSF.analytic(profile, size=size, elongation=elongation, radius_px=radius_px)
+
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+RULES = {"subtract_next": scoring.SUBTRACT_NEXT, "threshold": scoring.THRESHOLD}
+
+
+def error_sums(
+    estimators: Sequence[KeepingBrightest], images: Images, truth: Floats, search_range_px: float = math.inf
+) -> Floats:
+    """Return sums of (|dx| + |dy|) / 2 over images for every estimator and k, (estimators, K)."""
+    tables = (error_table(each, images, truth, search_range_px)[0] for each in estimators)
+    return np.stack([table.sum(axis=0, dtype=np.float64) for table in tables])
+
+
+def error_table(
+    estimator: KeepingBrightest, images: Images, truth: Floats, search_range_px: float = math.inf
+) -> tuple[NDArray[np.float32], Bools]:
+    """Return (|dx| + |dy|) / 2 of every image for every number k of kept pixels.
+
+    Parameters
+    ----------
+    estimator : KeepingBrightest
+        What it says of the number of pixels does not count.
+    images : (n, side, side) array, float32
+    truth : (n, 2) array, px
+    search_range_px : float
+        Positions beyond plus or minus this become it, on each axis.
+
+    Returns
+    -------
+    errors : (n, K) array, float32
+        For k = 1 to K = side^2 - 1, px.
+    valid : (n, K) array, bool
+        Whether there was light. Where not, the position counts as (0, 0).
+    """
+    prepared = _prepared(estimator, images)
+    errors = np.empty((len(images), prepared.shape[1] - 1), np.float32)
+    valid = np.empty(errors.shape, np.bool_)
+    how = images.shape[-1], RULES[estimator.rule], estimator.flux_floor, search_range_px
+    scoring.errors_of_every_k(prepared, *how, truth, 0, len(images), errors, valid)
+    return errors, valid
+
+
+def position_table(
+    estimator: KeepingBrightest, images: Images, search_range_px: float = math.inf
+) -> tuple[Floats, Bools]:
+    """Return the positions (n, K, 2), px, whose errors `error_table` returns, and their validity (n, K)."""
+    prepared = _prepared(estimator, images)
+    positions = np.empty((len(images), prepared.shape[1] - 1, 2))
+    valid = np.empty(positions.shape[:2], np.bool_)
+    how = images.shape[-1], RULES[estimator.rule], estimator.flux_floor, search_range_px
+    scoring.positions_of_every_k(prepared, *how, 0, len(images), positions, valid)
+    return positions, valid
+
+
+def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
+    """Return the images (n, pixels) as the brightest pixels are sought in them."""
+    denoised = estimator.denoised(images)
+    assert denoised is not None
+    return np.ascontiguousarray(denoised).reshape(len(images), -1)
+
+
+def moments_of(positions: Floats, truth: Floats) -> Floats:
+    """Sums that a regression of (n, K, 2) positions on the truth needs, (8, K)."""
+    x, y = positions[..., 0], positions[..., 1]
+    whole = [len(truth), *truth.sum(axis=0), np.square(truth).sum()]
+    own = [x.sum(axis=0), y.sum(axis=0), np.square(positions).sum(axis=(0, 2))]
+    across = (x * truth[:, :1]).sum(axis=0) + (y * truth[:, 1:]).sum(axis=0)
+    same = np.repeat(np.array(whole)[:, None], positions.shape[1], axis=1)
+    return np.concatenate([same, np.stack([*own, across])])
+
+
+def errors_of(positions: Floats, truth: Floats) -> Floats:
+    """(|dx| + |dy|) / 2, to the precision of `error_table`."""
+    errors: NDArray[np.float32] = np.abs(positions - truth).mean(axis=-1).astype(np.float32)
+    return errors.astype(np.float64)

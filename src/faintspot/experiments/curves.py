@@ -1,0 +1,303 @@
+"""Curves of the slope error against the light, and the light that a method saves, with intervals.
+
+The Strehl ratio of a closed loop against the star's magnitude is no such curve: there the same few
+realisations of the air are seen at every magnitude, and whole realisations are drawn again, while here each
+flux has means of thousands of spots whose errors are normal and independent of those of other fluxes. Both
+give an `Estimate`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import number_between, numbers_between
+from faintspot.errors import InputError
+from faintspot.experiments.statistics import Estimate, magnitudes
+
+Floats = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+_RESAMPLES = 400
+_GRID_POINTS = 1000  # over two to three decades of flux: the gain is exact to 0.1 %
+_SMALLEST_ERROR_PX = 1e-6  # of a resampled R
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The slope error R of all arms at increasing flux, px; the arms have seen the same spots."""
+
+    flux_e: Floats
+    """(n_flux,)"""
+    arms: tuple[str, ...]
+    error: Floats
+    """(n_flux, n_arms)."""
+    covariance: Floats
+    """(n_flux, n_arms, n_arms) of the means, px^2."""
+
+    @classmethod
+    def of_errors(cls, flux_e: ArrayLike, errors: Mapping[str, ArrayLike]) -> Curve:
+        """Return the curve of the errors (|dx| + |dy|) / 2 of each spot, (n_flux, n) px for every arm.
+
+        Raises
+        ------
+        InputError
+            For fluxes that do not increase, or errors of other shapes.
+        """
+        flux = numbers_between("flux_e", flux_e, 0.0, low_open=True).astype(np.float64)
+        if flux.ndim != 1 or len(flux) < 2 or np.any(np.diff(flux) <= 0):
+            raise InputError(f"flux_e: expected at least two increasing numbers, got {flux.tolist()}")
+        shapes = {np.shape(values) for values in errors.values()}
+        if len(shapes) != 1 or len(shape := shapes.pop()) != 2 or shape[0] != len(flux):
+            raise InputError(f"errors: expected arrays of one shape ({len(flux)}, n) for all arms")
+        every = np.stack([np.asarray(values, np.float64) for values in errors.values()])
+        mean = every.mean(axis=2)
+        centred = every - mean[..., None]
+        covariance = np.einsum("ifn,jfn->fij", centred, centred) / shape[1] ** 2
+        return cls(flux, tuple(errors), mean.T, covariance)
+
+    def of(self, arm: str) -> Floats:
+        """Return R of an arm, (n_flux,)."""
+        return self.error[:, self._index(arm)]
+
+    def se_of(self, arm: str) -> Floats:
+        """Return the standard error of R of an arm."""
+        index = self._index(arm)
+        return np.sqrt(self.covariance[:, index, index])
+
+    def has(self, *arms: str) -> bool:
+        """Whether these arms are measured."""
+        return all(arm in self.arms for arm in arms)
+
+    def difference(self, arm: str, reference: str) -> tuple[Floats, Floats]:
+        """Return R of `reference` minus R of `arm` at each flux and its paired standard error."""
+        i, j = self._index(arm), self._index(reference)
+        covariance = self.covariance
+        variance = covariance[:, i, i] + covariance[:, j, j] - 2 * covariance[:, i, j]
+        return self.error[:, j] - self.error[:, i], np.sqrt(np.maximum(variance, 0.0))
+
+    def at(self, flux_e: float, arm: str) -> tuple[float, float] | None:
+        """Return R and its standard error at that flux; None when there is none."""
+        found = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(arm)))
+        return (float(self.of(arm)[found[0]]), float(self.se_of(arm)[found[0]])) if found.size else None
+
+    def _index(self, arm: str) -> int:
+        if arm not in self.arms:
+            raise InputError(f"arm {arm!r}: expected one of {', '.join(self.arms)}")
+        return self.arms.index(arm)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """By what factor less light a method reaches the same R, with its confidence interval."""
+
+    factor: float
+    """inf: the method's R is smaller than that at the lowest flux measured; 0: it never gets there."""
+    low: float
+    high: float
+    log_samples: Floats
+    """Natural logarithm of the bootstrap's factors."""
+
+    @property
+    def magnitudes(self) -> tuple[float, float, float]:
+        """The gain and its interval in magnitudes."""
+        with np.errstate(divide="ignore"):
+            return magnitudes(self.factor), magnitudes(self.low), magnitudes(self.high)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the method's flux is within those measured; below the lowest, no upper end is known."""
+        return bool(np.isfinite(self.high))
+
+    @property
+    def log_se(self) -> float:
+        """Standard error of ln(factor), from the interquartile range: samples may be infinite."""
+        if not np.isfinite(self.log_samples).mean() > 0.8:
+            return float("inf")
+        low, high = np.percentile(self.log_samples, [25, 75], method="nearest")
+        return float((high - low) / 1.349)
+
+    def in_words(self) -> str:
+        """Return "1.43 (1.36 to 1.50)"."""
+        return f"{_factor(self.factor)} ({_factor(self.low)} to {_factor(self.high)})"
+
+
+def gain_at_flux(
+    curve: Curve,
+    flux_e: float,
+    rng: np.random.Generator,
+    *,
+    method: str,
+    reference: str,
+) -> Gain | None:
+    """Return by how much less light `method` reaches the R that `reference` has at a flux.
+
+    log R is interpolated monotonically (PCHIP) in log flux. The 95 % interval is a parametric bootstrap: R of
+    both arms is drawn from the normal distribution of their standard errors and covariance.
+
+    Returns
+    -------
+    Gain or None
+        None when the flux is outside the curve or a curve has fewer than two points.
+
+    Raises
+    ------
+    InputError
+        For a flux that is not above 0 or an unknown arm.
+    """
+    flux_e = number_between("flux_e", flux_e, 0.0, low_open=True)
+    curves = _resampled(curve, reference, method, rng)
+    if curves is None or not curves.log_flux[0] - 1e-9 <= np.log(flux_e) <= curves.log_flux[-1] + 1e-9:
+        return None
+    place = np.clip(np.log(flux_e), curves.log_flux[0], curves.log_flux[-1])
+    wanted = _values_at(curves, curves.reference, place)
+    return _gain(place - _crossings(curves, curves.method, wanted))
+
+
+def gain_at_error(
+    curve: Curve,
+    error_px: float,
+    rng: np.random.Generator,
+    *,
+    method: str,
+    reference: str,
+) -> Gain | None:
+    """Return by how much less light `method` reaches a given R than `reference`; see `gain_at_flux`.
+
+    Returns
+    -------
+    Gain or None
+        None when `reference` does not have that R within the curve, or a curve has fewer than two points.
+
+    Raises
+    ------
+    InputError
+        For an error that is not above 0 or an unknown arm.
+    """
+    error_px = number_between("error_px", error_px, 0.0, low_open=True)
+    curves = _resampled(curve, reference, method, rng)
+    if curves is None:
+        return None
+    wanted = np.full(curves.reference.shape[1], np.log(error_px))
+    needed = _crossings(curves, curves.reference, wanted)
+    if not np.isfinite(needed[0]):
+        return None
+    known = np.isfinite(needed)  # resamples in which the reference just misses that error
+    return _gain(needed[known] - _crossings(curves, curves.method, wanted)[known])
+
+
+def magnitude_gain(
+    curve: Curve, flux_e: float, rng: np.random.Generator, *, method: str, reference: str
+) -> Estimate:
+    """Return how many magnitudes fainter a star may be with `method` for R of `reference` at a flux.
+
+    Returns
+    -------
+    Estimate
+        Infinite where the method's R is smaller on its whole curve, minus infinity where it is larger; NaN as
+        `gain_at_flux`.
+    """
+    if method == reference:
+        return Estimate(0.0, 0.0)
+    gain = gain_at_flux(curve, flux_e, rng, method=method, reference=reference)
+    if gain is None:
+        return Estimate(math.nan)
+    value, low, high = gain.magnitudes
+    error = magnitudes(math.e) * gain.log_se if math.isfinite(value + gain.log_se) else math.nan
+    return Estimate(value, error, low, high)
+
+
+def limiting_flux(curve: Curve, arm: str, budget_px: float, rng: np.random.Generator) -> Estimate:
+    """Return the flux at which R of an arm equals a budget.
+
+    Returns
+    -------
+    Estimate
+        0 where R is below the budget on the whole curve, infinite where it is above; NaN where a curve has
+        fewer than two points.
+
+    Raises
+    ------
+    InputError
+        For a budget that is not above 0 or an unknown arm.
+    """
+    budget_px = number_between("budget_px", budget_px, 0.0, low_open=True)
+    curves = _resampled(curve, arm, arm, rng)
+    if curves is None:
+        return Estimate(math.nan)
+    flux = np.exp(_crossings(curves, curves.method, np.full(curves.method.shape[1], np.log(budget_px))))
+    drawn = flux[1:][np.isfinite(flux[1:]) & (flux[1:] > 0)]
+    known = 0 < flux[0] < np.inf and len(drawn) > 1
+    return Estimate(float(flux[0]), float(drawn.std()) if known else math.nan)
+
+
+@dataclass(frozen=True)
+class _Resampled:
+    """Falling curves of log R on a fine grid of log flux, (grid, 1 + resamples); the first as measured."""
+
+    log_flux: Floats
+    reference: Floats
+    method: Floats
+
+
+def _resampled(curve: Curve, reference: str, method: str, rng: np.random.Generator) -> _Resampled | None:
+    from scipy.interpolate import PchipInterpolator
+
+    pair = [curve.arms.index(arm) for arm in (reference, method) if curve.has(arm)]
+    if len(pair) < 2:
+        raise InputError(f"arms {reference!r} and {method!r}: expected two of {', '.join(curve.arms)}")
+    kept = np.all(np.isfinite(curve.error[:, pair]), axis=1)
+    if np.count_nonzero(kept) < 2:
+        return None
+    error = curve.error[kept][:, pair]
+    covariance = curve.covariance[kept][:, pair][:, :, pair]
+    variances, axes = np.linalg.eigh(covariance)
+    normal = rng.standard_normal((_RESAMPLES, *error.shape))
+    drawn = error + np.einsum("fij,fj,sfj->sfi", axes, np.sqrt(np.maximum(variances, 0.0)), normal)
+    every = np.maximum(np.concatenate([error[None], drawn]), _SMALLEST_ERROR_PX)
+    # Made to fall: where noise makes a curve rise, by 1e-9, far below any error of R.
+    falling = np.minimum.accumulate(np.log(every), axis=1) - 1e-9 * np.arange(error.shape[0])[:, None]
+    knots = np.log(curve.flux_e[kept])
+    grid = np.linspace(knots[0], knots[-1], _GRID_POINTS)
+    values = PchipInterpolator(knots, falling, axis=1)(grid)
+    return _Resampled(grid, values[:, :, 0].T, values[:, :, 1].T)
+
+
+def _values_at(curves: _Resampled, values: Floats, place: float) -> Floats:
+    """Return every curve's log R at a log flux."""
+    step = curves.log_flux[1] - curves.log_flux[0]
+    position = (place - curves.log_flux[0]) / step
+    below = min(int(position), len(curves.log_flux) - 2)
+    weight = position - below
+    result: Floats = (1 - weight) * values[below] + weight * values[below + 1]
+    return result
+
+
+def _crossings(curves: _Resampled, values: Floats, wanted: Floats) -> Floats:
+    """Return the log flux where each falling curve has its wanted value: -inf below the curve, inf beyond."""
+    above = np.count_nonzero(values > wanted, axis=0)
+    index = np.clip(above, 1, len(values) - 1)
+    columns = np.arange(values.shape[1])
+    before, after = values[index - 1, columns], values[index, columns]
+    step = curves.log_flux[1] - curves.log_flux[0]
+    place = curves.log_flux[index - 1] + step * (before - wanted) / (before - after)
+    tolerance = 1e-9
+    place = np.where((above == 0) & (wanted > values[0] + tolerance), -np.inf, place)
+    return np.where((above == len(values)) & (wanted < values[-1] - tolerance), np.inf, place)
+
+
+def _gain(log_factors: Floats) -> Gain:
+    tail = 50 * (1 - CONFIDENCE)
+    # "nearest" never averages with an infinite sample.
+    low, high = np.percentile(log_factors[1:], [tail, 100 - tail], method="nearest")
+    return Gain(float(np.exp(log_factors[0])), float(np.exp(low)), float(np.exp(high)), log_factors[1:])
+
+
+def _factor(value: float) -> str:
+    if value == 0:
+        return "less than any measured"
+    return "more than any measured" if np.isinf(value) else f"{value:.2f}"

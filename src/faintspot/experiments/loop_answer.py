@@ -1,0 +1,332 @@
+"""The planner's answer for a closed loop: Strehl ratios, limiting magnitudes, and the sky that they open."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot import configuration as configuration_file
+from faintspot.control.learning import INTEGRATOR
+from faintspot.errors import InputError
+from faintspot.estimators.base import Need
+from faintspot.experiments.arms import Knowledge
+from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice
+from faintspot.experiments.loop_question import (
+    BASELINE,
+    MODEL_ERROR,
+    PLACES,
+    SECOND,
+    LoopQuestion,
+    known_magnitudes,
+    sky_coverage,
+)
+from faintspot.experiments.loop_results import falling, limiting_magnitudes, magnitude_gain
+from faintspot.experiments.magnitude import with_flux
+from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
+from faintspot.files import derived, write_atomically
+from faintspot.loop.arms import Arm
+from faintspot.loop.camera import camera_calibration
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.sensor.psf import PSF
+from faintspot.tables import save_tables
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopArmResult:
+    """One candidate: F fluxes, R realisations of the air."""
+
+    kind: ArmKind
+    choices: tuple[Choice, ...]
+    """(F,): tuned values at every flux."""
+    strehl: Floats
+    """(F, R): long exposure, at the science wavelength."""
+    centroid_gain: Floats
+    """(F, R): that slopes were divided by, where the arm does so."""
+    at_end: tuple[tuple[str, ...], ...]
+    """(F,): which of the values are the first or the last that were on offer."""
+
+    @property
+    def name(self) -> str:
+        """See `faintspot.experiments.loop_arms.arm_kind`."""
+        return self.kind.name
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Where a curve of the Strehl ratio falls below a level, or how far apart two curves are there."""
+
+    magnitude: Estimate
+    """Infinite: above the level with every star that was measured; minus infinite: below it."""
+    interpolation_error: float
+    """How far straight lines between what was measured may be off, as the curve bends."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is within what was measured."""
+        return math.isfinite(self.magnitude.value)
+
+    @property
+    def error(self) -> float:
+        """Standard error, both kinds together; NaN with too few realisations."""
+        return math.hypot(self.magnitude.standard_error, self.interpolation_error)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Fraction of a part of the sky that has a bright enough star."""
+
+    fraction: float
+    strehl_error: float
+    """What the limiting magnitude's error makes of it."""
+    model_error: float
+    """What the error of the star counts makes of it; the same for all arms."""
+    bound: int
+    """1: at least this fraction, as the limit is fainter than all that was measured; -1: at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopAnswer:
+    """What `faintspot.experiments.tune_loop` found.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop
+    >>> from faintspot.experiments import LoopQuestion, tune_loop
+    >>> answer = tune_loop(LoopQuestion(load_loop("canary")), "loop-tune")  # doctest: +SKIP
+    >>> answer.best.name  # doctest: +SKIP
+    """
+
+    question: LoopQuestion
+    results: tuple[LoopArmResult, ...]
+    photons: Floats
+    """(F,), rising: photo-electrons of a fully lit sub-aperture in a frame. All of these are measured."""
+    scored_frames: int
+    """Of every run."""
+    left_out: dict[str, str]
+    """Candidates that were not tried, and why."""
+
+    @cached_property
+    def magnitudes(self) -> Floats:
+        """(F,) of these stars."""
+        return self.question.configuration.photometry.magnitude(self.photons)
+
+    @property
+    def at_star(self) -> int:
+        """The measured flux of the configuration's star; the faintest one where it is not among them."""
+        same = np.isclose(self.photons, self.question.configuration.photons, rtol=1e-3)
+        return int(np.argmax(same)) if same.any() else 0
+
+    @property
+    def realisations(self) -> int:
+        """Realisations of the air that were scored."""
+        return int(self.results[0].strehl.shape[1])
+
+    @property
+    def level(self) -> float:
+        """The Strehl ratio that limiting magnitudes are for."""
+        asked = self.question.strehl
+        return float(0.5 * self[BASELINE].strehl[-1].mean()) if asked is None else float(asked)
+
+    def __getitem__(self, name: str) -> LoopArmResult:
+        """Return the result of a candidate.
+
+        Raises
+        ------
+        InputError
+            For one that was not tried.
+        """
+        results = {result.name: result for result in self.results}
+        if name not in results:
+            raise InputError(f"arm {name!r}: expected one that was tried: {', '.join(results)}")
+        return results[name]
+
+    def strehl(self, name: str, flux: int) -> Estimate:
+        """Return an arm's Strehl ratio at a measured flux."""
+        return paired_mean(self[name].strehl[flux])
+
+    def difference(self, name: str, reference: str, flux: int) -> Estimate:
+        """Return by how much an arm's Strehl ratio is above another's on the same air.
+
+        Its interval holds for all comparisons with one arm together.
+        """
+        differences = self[name].strehl[flux] - self[reference].strehl[flux]
+        return paired_mean(differences, max(1, len(self.results) - 1))
+
+    def equal(self, flux: int) -> tuple[str, ...]:
+        """Return the arms that are not below the best beyond the error; the first is recommended.
+
+        That is the baseline where it is among them, else the one that need not learn, has to know least and
+        costs least.
+        """
+        best = max(self.results, key=lambda result: float(result.strehl[flux].mean()))
+        same = [each for each in self.results if self.difference(best.name, each.name, flux).decided != 1]
+        return tuple(each.name for each in sorted(same, key=_simplicity))
+
+    @property
+    def best(self) -> LoopArmResult:
+        """What is recommended for the star."""
+        return self[self.equal(self.at_star)[0]]
+
+    def limit(self, name: str) -> Limit:
+        """Return an arm's limiting magnitude."""
+        faint, strehl = self._from_bright(name)
+        value = float(limiting_magnitudes(faint, strehl.mean(axis=1), self.level))
+        if not math.isfinite(value):
+            return Limit(Estimate(value), 0.0)
+        between = abs(_interpolation_error(faint, strehl.mean(axis=1), value))
+        realisations = strehl.shape[1]
+        if realisations < FEWEST_PIECES:
+            return Limit(Estimate(value), between)
+        draws = np.random.default_rng(SEED).integers(0, realisations, (DRAWS, realisations))
+        drawn = limiting_magnitudes(faint, strehl[:, draws].mean(axis=2).T, self.level)
+        return Limit(of_draws(value, drawn, realisations), between)
+
+    def gain(self, name: str, reference: str) -> Limit:
+        """Return the gain in limiting magnitude over another arm; NaN where one of them has no limit."""
+        faint, strehl = self._from_bright(name)
+        found = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
+        if not math.isfinite(found.gain.value):
+            return Limit(found.gain, 0.0)
+        curves = [self[each].strehl[::-1].mean(axis=1) for each in (name, reference)]
+        values = [float(limiting_magnitudes(faint, curve, self.level)) for curve in curves]
+        # Curves that bend alike are wrong alike.
+        mine, other = (_interpolation_error(faint, *each) for each in zip(curves, values, strict=True))
+        return Limit(found.gain, abs(mine - other))
+
+    def coverage(self, name: str, place: str) -> Coverage | None:
+        """Return what part of a place of `PLACES` an arm can use; None: no radius."""
+        limit, radius = self.limit(name), self.question.radius
+        if radius is None:
+            return None
+        value = limit.magnitude.value
+        ends = float(self.magnitudes[0]), float(self.magnitudes[-1])
+        bound = 0 if limit.is_known else int(math.copysign(1, value))
+        error = limit.error if limit.is_known else 0.0
+        middle = value if limit.is_known else max(ends) if bound > 0 else min(ends)
+        band = self.question.configuration.camera.band
+        low, high = known_magnitudes(band)
+        magnitudes = np.clip([middle, middle - error, middle + error], low, high)
+        if not np.isfinite(magnitudes).all():  # too few realisations for an error
+            magnitudes = np.clip([middle] * 3, low, high)
+        fraction, less, more = sky_coverage(magnitudes, radius, PLACES[place], band)
+        stars = -math.log1p(-min(float(fraction), 1 - 1e-12))
+        few, many = (-math.expm1(-stars * (1 + sign * MODEL_ERROR)) for sign in (-1, 1))
+        strehl_error = float(more - less) / 2 if math.isfinite(error) else math.nan
+        return Coverage(float(fraction), strehl_error, (many - few) / 2, bound)
+
+    def curve(self, name: str) -> Floats:
+        """Return an arm's mean Strehl ratios (F,), made to fall with magnitude; straight lines join them."""
+        return falling(self._from_bright(name)[1].mean(axis=1))[::-1]
+
+    def star(self, flux: int) -> LoopConfiguration:
+        """Return the loop with the star of a measured flux."""
+        return with_flux(self.question.configuration, float(self.photons[flux]))
+
+    def arm(self, name: str, flux: int) -> Arm:
+        """Return a candidate with its settings for a measured flux, as `simulate_loop` takes it."""
+        result = self[name]
+        return result.kind.arm(self.star(flux), result.choices[flux])
+
+    def save(self, path: str | Path) -> Path:
+        """Write what is recommended for the star as a configuration file; what else it holds stays.
+
+        PSF and score lie beside it; the table [loop] has control and loop gain, for people. The camera is
+        written where the file has none. Beside it, NAME-loop.toml is the loop with this star and loop gain.
+
+        Returns
+        -------
+        Path
+            That of NAME-loop.toml.
+
+        Raises
+        ------
+        InputError
+            When a file cannot be written.
+        """
+        path, flux, best = Path(path), self.at_star, self.best
+        arm, star = self.arm(best.name, flux), self.star(flux)
+        settings = arm.settings
+        if settings.estimator.uses_light:
+            settings = settings.replace(flux_e=float(f"{star.photons:.4g}"))
+        psf = arm.psf
+        if psf is None and settings.estimator.needs & {Need.PSF, Need.WIDTH}:  # what the loop gives it
+            psf = PSF.analytic(size=star.spot_width_px / 2, elongation=star.sensor.spot_elongation)
+        for item in (settings, psf, arm.score):
+            if item is not None:
+                configuration_file.save(path, item)
+        if not configuration_file.has(path, "calibration"):
+            configuration_file.save(path, camera_calibration(star))
+        save_tables(path, {"loop": self._loop_table(best, flux)})
+        loop = derived(path, "-loop.toml")
+        gain = {} if arm.gain is None else {"gain": arm.gain}
+        write_atomically(loop, star.replace("control", **gain).to_text())
+        return loop
+
+    def _loop_table(self, best: LoopArmResult, flux: int) -> dict[str, Any]:
+        strehl, choice = self.strehl(best.name, flux), best.choices[flux]
+        table = {
+            "arm": best.name,
+            "control": best.kind.control,
+            "gain": float(choice[LOOP_GAIN]),
+            "photons_per_subaperture": float(self.photons[flux]),
+            "strehl": round(strehl.value, 4),
+        }
+        if NOISE_SCALE in choice:
+            table["noise_scale"] = float(choice[NOISE_SCALE])
+        if self.arm(best.name, flux).correct_gain:
+            table["centroid_gain"] = round(float(best.centroid_gain[flux].mean()), 3)
+        if math.isfinite(strehl.standard_error):
+            table["strehl_error"] = round(strehl.standard_error, 4)
+        return table
+
+    def figure(self) -> Figure:
+        """Draw Strehl ratios against magnitude, and what they open of the sky.
+
+        Raises
+        ------
+        MissingExtraError
+            Without matplotlib.
+        """
+        from faintspot.experiments.answer_figures import loop_figure
+
+        return loop_figure(self)
+
+    def _from_bright(self, name: str) -> tuple[Floats, Floats]:
+        """Return rising magnitudes (F,), and the Strehl ratios (F, R) there."""
+        return self.magnitudes[::-1], self[name].strehl[::-1]
+
+
+def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
+    """Return by how much a crossing that was read off a straight line is too large as the curve bends, about.
+
+    That is the second divided difference, the mean of those at both ends of the line, times the distances
+    from the ends, over the slope. Of curves of several shapes it is 0.5 to 1 times the actual error (rms).
+    """
+    curve = falling(strehl)
+    end = int(np.clip(np.searchsorted(faint, value), 1, len(faint) - 1))
+    slopes = np.diff(curve) / np.diff(faint)
+    bends = np.diff(slopes) / (faint[2:] - faint[:-2])  # of the knots but the first and the last
+    bend = bends[max(0, end - 2) : end].mean()
+    return float(bend * (value - faint[end - 1]) * (faint[end] - value) / abs(slopes[end - 1]))
+
+
+def _simplicity(result: LoopArmResult) -> tuple[Any, ...]:
+    kind = result.kind
+    estimator = kind.estimator
+    own = result.name != BASELINE, kind.control != INTEGRATOR
+    return *own, int(Knowledge.of(estimator)), estimator.cost, result.name
+
+
+__all__ = ["BASELINE", "SECOND", "Coverage", "Limit", "LoopAnswer", "LoopArmResult"]

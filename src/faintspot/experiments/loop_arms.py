@@ -1,0 +1,277 @@
+"""The arms that a closed-loop experiment compares: an estimator, and what the loop does with its slopes."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from faintspot.checks import one_of
+from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, MODAL
+from faintspot.errors import InputError
+from faintspot.estimators.base import Estimator, Need
+from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
+from faintspot.estimators.registry import estimator_named, estimators
+from faintspot.estimators.window import Window
+from faintspot.experiments.arms import score_for_scene
+from faintspot.loop.arms import PRIOR, Arm
+from faintspot.loop.camera import make_detector
+from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
+from faintspot.options import AUTO, Option
+from faintspot.sensor.psf import PSF
+from faintspot.sensor.score import TrainedScore
+from faintspot.settings import Settings
+
+Choice = Mapping[str, Any]
+"""Values of what is tuned, by name: `LOOP_GAIN` and options of the estimator."""
+
+LOOP_GAIN = "loop_gain"
+NOISE_SCALE = "noise_scale"
+_NOISE_SCALES = (0.35, 0.6, 1.0)
+_FIRST_NOISE_SCALES = (0.6,)
+_LOOP_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_FIRST_LOOP_GAINS = (0.2, 0.4, 0.7)
+# Of control that learns it is only the gain at which telemetry is taken, which takes long.
+_TELEMETRY_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4)
+_FIRST_TELEMETRY_GAINS = (0.2,)
+# How far spots are from where a prior expects them is the loop's to say: parts of their range.
+_PRIORS = (0.1, 0.175, 0.25, 0.35, 0.5, 0.75)
+_STEPS_BEYOND = 2  # in the ratio of an end to its neighbour
+_FEWEST_TO_WIDEN = 4
+_FIRST_VALUES = (3, 2)  # of an arm's first option, and of each further one
+_TRAINING_SPOTS = 8000
+_TRAINING_SEED = 4
+
+
+@dataclass(frozen=True)
+class Tunable:
+    """Something of an arm that is tuned."""
+
+    values: tuple[Any, ...]
+    """What it may be, in their order."""
+    first: tuple[Any, ...]
+    """Those of the first look."""
+
+    def nearest(self, value: Any) -> Tunable:
+        """Return only the value that is nearest to another one, or that one itself."""
+        if value in self.values or isinstance(value, str):
+            return Tunable((value,), (value,))
+        near = min(self.values, key=lambda each: abs(each - value))
+        return Tunable((near,), (near,))
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What a loop does with an estimator beyond the usual."""
+
+    label: str
+    meaning: str
+    changes: Mapping[str, bool]
+    """Of the arm."""
+
+
+VARIANTS = {
+    "_predicted": Variant(
+        "predicted",
+        "the estimator's prior, or where it starts, is what the loop predicts",
+        # What stays near the prediction has no gain of its own, and is measured without one.
+        {"predict_prior": True, "correct_gain": False},
+    ),
+    "_weighted": Variant(
+        "weighted reconstructor", "slopes count by their standard errors", {"weighted_reconstructor": True}
+    ),
+    "_uncorrected": Variant(
+        "gain not corrected", "slopes are not divided by the centroid gain", {"correct_gain": False}
+    ),
+}
+"""By what follows the estimator's name in that of an arm: "map_predicted_weighted"."""
+_PREDICTED = "_predicted"
+CONTROL_SIGN = "+"
+"""Between an arm's slopes and its control: "map+kalman"."""
+
+
+@dataclass(frozen=True)
+class ArmKind:
+    """An estimator and what the loop does with it; values are still to be chosen."""
+
+    estimator: type[Estimator]
+    variants: tuple[str, ...] = ()
+    """Of `VARIANTS`, in their order there."""
+    control: str = INTEGRATOR
+
+    @property
+    def name(self) -> str:
+        """What command lines and results call it."""
+        # The Kalman filter always predicts.
+        variants = [each for each in self.variants if each != _PREDICTED or self.control != KALMAN]
+        slopes = "".join([self.estimator.name, *variants])
+        return slopes if self.control == INTEGRATOR else f"{slopes}{CONTROL_SIGN}{self.control}"
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether it is told what the loop predicts."""
+        return _PREDICTED in self.variants
+
+    @property
+    def label(self) -> str:
+        """What reports call it."""
+        parts = [self.estimator.label, *(VARIANTS[name].label for name in self.variants)]
+        return ", ".join(parts if self.control == INTEGRATOR else [*parts, CONTROLS[self.control]])
+
+    def tuned(self, configuration: LoopConfiguration) -> dict[str, Tunable]:
+        """Return what is tuned for a configuration's light: the loop gain and options of the estimator."""
+        estimator = self._untuned(configuration)
+        declared = estimator.declared()
+        options = {
+            name: _wider(values, declared[name])
+            for name, values in estimator.tuned(configuration.scene).items()
+        }
+        if PRIOR in declared:
+            reach = configuration.position_range_px(predicted=_PREDICTED in self.variants)
+            options[PRIOR] = [part * reach for part in _PRIORS]
+        if self.control == KALMAN:
+            options.pop(PRIOR, None)  # the filter knows it
+        tuned = {LOOP_GAIN: Tunable(_LOOP_GAINS, _FIRST_LOOP_GAINS)}
+        if self.control != INTEGRATOR:
+            tuned[LOOP_GAIN] = Tunable(_TELEMETRY_GAINS, _FIRST_TELEMETRY_GAINS)
+        if self.control not in (INTEGRATOR, MODAL):
+            tuned[NOISE_SCALE] = Tunable(_NOISE_SCALES, _FIRST_NOISE_SCALES)
+        for number, (name, values) in enumerate(options.items()):
+            tuned[name] = _spread(values, _FIRST_VALUES[min(number, len(_FIRST_VALUES) - 1)])
+        return tuned
+
+    def arm(self, configuration: LoopConfiguration, choice: Choice) -> Arm:
+        """Return the arm with tuned values, for the configuration's own light.
+
+        The PSF of those that need one is that of a flat wavefront; the score is trained on simulated spots
+        of the same strength of turbulence, light and camera.
+
+        Raises
+        ------
+        InputError
+            When a value is missing.
+        """
+        for name in self.tuned(configuration):
+            if name not in choice:
+                raise InputError(f"choice: expected a value for {name!r} of the arm {self.name!r}")
+        of_loop = (LOOP_GAIN, NOISE_SCALE)
+        options = {name: value for name, value in choice.items() if name not in of_loop}
+        estimator = self._untuned(configuration).replaced(options)
+        changes = {key: value for name in self.variants for key, value in VARIANTS[name].changes.items()}
+        return Arm(
+            self.label,
+            Settings(estimator),
+            float(choice[LOOP_GAIN]),
+            control=self.control,
+            noise_scale=float(choice.get(NOISE_SCALE, 1.0)),
+            psf=_flat_psf(configuration) if Need.PSF in estimator.required else None,
+            score=_trained_score(_without_runs(configuration)) if Need.SCORE in estimator.required else None,
+            **changes,
+        )
+
+    def _untuned(self, configuration: LoopConfiguration) -> Estimator:
+        automatic = {name: AUTO for name, each in self.estimator.declared().items() if each.automatic}
+        return self.estimator(**automatic).for_scene(configuration.scene)
+
+
+def arm_kind(name: str) -> ArmKind:
+    """Return an arm by its name: that of an estimator, of variants and of control, as "ml_weighted+polc".
+
+    With the Kalman filter, estimators that take a prior are given its prediction.
+
+    Raises
+    ------
+    InputError
+        For an unknown estimator or control, or a prediction for one that takes none.
+    """
+    slopes, _, control = name.partition(CONTROL_SIGN)
+    control = one_of("control of the arm", control or INTEGRATOR, list(CONTROLS))
+    base, variants = slopes, set()
+    while base not in estimators():
+        ending = next((ending for ending in VARIANTS if base.endswith(ending)), None)
+        if ending is None:
+            break
+        base = base.removesuffix(ending)
+        variants.add(ending)
+    try:
+        estimator = estimator_named(base)
+    except InputError as error:
+        text = str(error).removeprefix("estimator")
+        raise InputError(f"arm{text}; after it may follow {', '.join(VARIANTS)}") from None
+    if _PREDICTED in variants and not estimator.takes_prior:
+        raise InputError(f"arm = {name!r}: expected an estimator that takes a prior, {base!r} takes none")
+    if control == KALMAN and estimator.takes_prior:
+        variants.add(_PREDICTED)
+    return ArmKind(estimator, tuple(variant for variant in VARIANTS if variant in variants), control)
+
+
+def default_arms(configuration: LoopConfiguration) -> list[str]:
+    """Return the names of the arms that are compared where none are asked for.
+
+    Every estimator, as far as it suits; those that take a prior also with the loop's prediction, and those
+    that weigh pixels by their noise also with a weighted reconstructor. A score is trained for spots that
+    turbulence speckles: not where the source is elongated. In closed loop, the strongest usual estimator and
+    the one that gains most from a prior also with the Kalman filter. In open loop, where an error of the
+    centroid gain is not fed back, those that know nothing of the spot also without its correction.
+    """
+    names = []
+    for name, kind in estimators().items():
+        if Need.SCORE in kind.needs and configuration.sensor.spot_elongation > 1:
+            continue
+        names.append(name)
+        predicted = f"{name}{_PREDICTED}" if kind.takes_prior else name
+        names += [predicted] if kind.takes_prior else []
+        names += [f"{predicted}_weighted"] if Need.READ_NOISE in kind.needs else []
+        if configuration.control.mode != CLOSED and not kind.needs:
+            names.append(f"{name}_uncorrected")
+    kalman = [Window.name, MaximumAPosteriori.name] if configuration.control.mode == CLOSED else []
+    return names + [f"{name}{CONTROL_SIGN}{KALMAN}" for name in kalman]
+
+
+def _wider(values: Sequence[Any], option: Option) -> Sequence[Any]:
+    """Return values with some beyond both ends: in loops the best may be beyond."""
+    if option.choices or option.whole or len(values) < _FEWEST_TO_WIDEN or min(values) <= 0:
+        return values
+    low, below, *_ = ordered = sorted(set(values))
+    *_, above, high = ordered
+    for step in range(1, _STEPS_BEYOND + 1):
+        ordered += [low * (low / below) ** step, high * (high / above) ** step]
+    return [value for value in ordered if option.low < value <= option.high]
+
+
+def _spread(values: Sequence[Any], count: int) -> Tunable:
+    """Return values in their order, and some of them, evenly spread, for a first look."""
+    ordered = sorted(set(values))
+    if len(ordered) <= count:
+        return Tunable(tuple(ordered), tuple(ordered))
+    middles = (2 * np.arange(count) + 1) / (2 * count) * (len(ordered) - 1)
+    return Tunable(tuple(ordered), tuple(ordered[int(place + 0.5)] for place in middles))
+
+
+def _flat_psf(configuration: LoopConfiguration) -> PSF:
+    sensor = configuration.sensor
+    return _psf(configuration.spot_width_px / 2, sensor.spot_elongation, float(sensor.pixels))
+
+
+@functools.lru_cache(maxsize=4)
+def _psf(size: float, elongation: float, radius_px: float) -> PSF:
+    return PSF.analytic(size=size, elongation=elongation, radius_px=radius_px)
+
+
+def _without_runs(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without what no score depends on, so that one serves runs of any length."""
+    return replace(configuration, run=Run(seed=configuration.run.seed))
+
+
+@functools.lru_cache(maxsize=4)
+def _trained_score(configuration: LoopConfiguration) -> TrainedScore:
+    """Train the score on spots of the weakest seeing: when unsure, the larger d / r0 is better."""
+    scene = configuration.scene
+    # Spots are elongated along another direction in each sub-aperture; it is trained on round ones.
+    scene = replace(scene, elongation=1.0, spot_fwhm_px=scene.spot_fwhm_px / math.sqrt(scene.elongation))
+    rng = np.random.default_rng([configuration.run.seed, _TRAINING_SEED])
+    return score_for_scene(scene, make_detector(configuration), rng, realisations=_TRAINING_SPOTS)

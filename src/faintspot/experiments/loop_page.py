@@ -1,0 +1,370 @@
+"""The report page of a closed-loop experiment: one HTML text that needs nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from faintspot.errors import InputError
+from faintspot.experiments.budget import TERMS
+from faintspot.experiments.loop_analysis import (
+    NO_TV,
+    Measurements,
+    measurements,
+)
+from faintspot.experiments.loop_figures import (
+    budget_figure,
+    gain_figure,
+    interleaved_figures,
+    magnitude_figure,
+    psf_figure,
+    strehl_axis,
+)
+from faintspot.experiments.loop_results import (
+    BudgetResult,
+    InterleavedResult,
+    MagnitudeResult,
+    in_words,
+    with_error,
+)
+from faintspot.experiments.loop_tables import (
+    centroid_gain_table,
+    difference_table,
+    gain_table,
+    regression_table,
+    seeing_table,
+    settings_table,
+    strehl_groups_table,
+)
+from faintspot.experiments.loop_verdict import (
+    LoopResults,
+    loop_verdict,
+    options_that_may_pay,
+    reference_arms,
+    tv_arm,
+)
+from faintspot.experiments.statistics import paired_mean
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.report.figure_data import FigureWithData
+from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of, write_page
+
+_FEW_REALISATIONS = 5
+_SHOWN_STRENGTH = 0.85  # of the images: in the middle of 0.6 to 1.1
+_LEAST_STREHL = 0.1  # of a flux whose images are shown
+_SLOPE_ERROR = "slope error"
+_NOT_RUN = "Not run: {} does that."
+
+
+def loop_sections(results: LoopResults) -> list[Section]:
+    """Return all sections in the page's order."""
+    interleaved, magnitude, budget = results.interleaved, results.magnitude, results.budget
+    lines = loop_verdict(results)
+    sections = [
+        Section("verdict", "What was found", lines, missing="" if lines else "Nothing to compare yet.")
+    ]
+    if interleaved is None:
+        sections.append(_missing("interleaved", "Interleaved observations", "run"))
+    else:
+        sections += _interleaved(interleaved)
+    if magnitude is None:
+        sections.append(_missing("magnitude", "Strehl against magnitude", "magnitude"))
+    else:
+        sections += _magnitude(magnitude)
+    sections.append(_images(interleaved, magnitude))
+    sections.append(
+        _missing("budget", "Error budget", "budget") if budget is None else _budget(budget, results)
+    )
+    return sections
+
+
+def loop_warnings(results: LoopResults) -> list[str]:
+    """Return what a reader should know before the results: what is unfinished or too little."""
+    lines = []
+    for name, strehl in (
+        ("Strehl against magnitude", None if results.magnitude is None else results.magnitude.strehl),
+        ("Error budget", None if results.budget is None else results.budget.strehl),
+    ):
+        if strehl is None:
+            continue
+        missing = int(np.isnan(strehl).sum())
+        if missing:
+            lines.append(
+                f"{name}: {missing} of {strehl.size} runs are still missing; what is there will change."
+            )
+        if strehl.shape[-1] < _FEW_REALISATIONS:
+            lines.append(
+                f"{name}: {strehl.shape[-1]} realisations of the air; errors between fewer than "
+                f"{_FEW_REALISATIONS} are themselves uncertain."
+            )
+    if results.interleaved is not None:
+        frames = measurements(results.interleaved).frames
+        if frames.min() < 400:
+            lines.append(
+                f"Interleaved observations: measurements of {frames.min()} frames after settling; at "
+                "least 400 "
+                "make a Strehl ratio that means something."
+            )
+    return lines
+
+
+def configuration_text(results: LoopResults) -> str:
+    """Return the configuration of the experiments as TOML text; "" when not known."""
+    if results.interleaved is not None and results.interleaved.records:
+        return results.interleaved.records[0].configuration
+    return "" if results.magnitude is None else results.magnitude.configuration
+
+
+def configuration_of(results: LoopResults) -> LoopConfiguration | None:
+    """Return the configuration, or None when it is not known."""
+    text = configuration_text(results)
+    try:
+        return LoopConfiguration.from_text(text) if text else None
+    except InputError:
+        return None
+
+
+def _missing(name: str, title: str, command: str) -> Section:
+    return Section(name, title, missing=_NOT_RUN.format(f"“faintspot loop {command}”"))
+
+
+def _interleaved(result: InterleavedResult) -> list[Section]:
+    table = measurements(result)
+    record = result.records[0]
+    strehl, *others = interleaved_figures(table, record.science_wavelength_m)
+    text = [
+        f"{len(table.strehl)} measurements in {len(result.records)} sets of {np.median(table.frames):.0f} "
+        "frames "
+        f"({np.median(table.frames) / record.frame_rate_hz:.1f} s) each after settling: first one without "
+        "TV, then "
+        "with rising strengths, again and again. Strehl ratios are of the long exposure."
+    ]
+    seeing = _seeing_line(table)
+    return [
+        Section(
+            "interleaved",
+            "Interleaved observations",
+            text,
+            [strehl_groups_table(result, table), regression_table(table)],
+            [strehl],
+        ),
+        Section("differences", "Paired differences by strength", figures=others[:1]),
+        Section("seeing", "r0 from the telemetry", seeing, [seeing_table(result)], others[1:]),
+    ]
+
+
+def _seeing_line(table: Measurements) -> list[str]:
+    known = np.isfinite(table.r0_m)
+    lines = []
+    for name, chosen in (("without TV", known & table.group(NO_TV)), ("of all", known)):
+        if chosen.any():
+            ratio = table.r0_m[chosen] / table.true_r0_m[chosen]
+            within = float((np.abs(ratio - 1) < 0.1).mean())
+            lines.append(
+                f"Measurements {name}: r0 from the telemetry is {np.median(ratio):.2f} of the true one in "
+                "the median; "
+                f"{100 * within:.0f} % of {chosen.sum()} single measurements are within 10 %."
+            )
+    if not known.all():
+        lines.append(
+            f"{int((~known).sum())} measurements tell no r0: fewer than 90 % of their slopes could be "
+            "measured."
+        )
+    return lines
+
+
+def _magnitude(result: MagnitudeResult) -> list[Section]:
+    references = reference_arms(result)
+    base = " and then with ".join(result.labels[arm] for arm in references)
+    wavelength = LoopConfiguration.from_text(result.configuration).science.wavelength_m
+    tables = []
+    for place, reference in enumerate(references):
+        others = [arm for arm in range(len(result.labels)) if arm not in references[: place + 1]]
+        tables += [
+            gain_table(result, others, reference),
+            difference_table(result, [(arm, reference) for arm in others]),
+        ]
+    pairs = [(arm, without) for _, arm, without in options_that_may_pay(result)]
+    if pairs:
+        tables.append(
+            difference_table(
+                result, pairs, "Whether the loop’s own prediction, weights and the gain’s correction pay."
+            )
+        )
+    realisations = result.strehl.shape[-1]
+    text = [
+        f"{len(result.labels)} arms, {len(result.photons)} fluxes, {realisations} realisations of the "
+        "air, the same "
+        f"for all arms. Compared with {base}."
+    ]
+    return [
+        Section(
+            "magnitude",
+            "Strehl against magnitude",
+            text,
+            tables,
+            [magnitude_figure(result, references[0], strehl_axis(wavelength))],
+        ),
+        Section("gain", "Centroid gain", tables=[centroid_gain_table(result)], figures=[gain_figure(result)]),
+        Section("settings", "Tuned settings", tables=[settings_table(result)]),
+    ]
+
+
+def _images(interleaved: InterleavedResult | None, magnitude: MagnitudeResult | None) -> Section:
+    figure = None
+    if magnitude is not None:
+        figure = _images_of_arms(magnitude)
+    if figure is None and interleaved is not None:
+        figure = _images_of_set(interleaved)
+    title = "Long-exposure image with and without TV"
+    if figure is None:
+        return Section("psf", title, missing="Not drawn: arms with and without TV are not both there.")
+    return Section("psf", title, figures=[figure])
+
+
+def _images_of_arms(result: MagnitudeResult) -> FigureWithData | None:
+    tv, reference = tv_arm(result), reference_arms(result)[-1]
+    if tv is None or tv == reference:
+        return None
+    curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
+    if not np.isfinite(curve).any():
+        return None
+    good = np.flatnonzero(curve >= _LEAST_STREHL)
+    flux = int(good[0]) if len(good) else int(np.nanargmax(curve))
+    images = [result.psf[arm, flux] for arm in (reference, tv)]
+    where = f"Mean of {result.strehl.shape[-1]} realisations at {result.photons[flux]:.3g} photo-electrons"
+    return psf_figure(images, [result.labels[arm] for arm in (reference, tv)], where)
+
+
+def _images_of_set(result: InterleavedResult) -> FigureWithData | None:
+    strengths, record = result.strengths[0], result.records[0]
+    without, strong = np.flatnonzero(np.isnan(strengths)), np.flatnonzero(strengths > 0)
+    if not len(without) or not len(strong):
+        return None
+    tv = strong[np.argmin(np.abs(strengths[strong] - _SHOWN_STRENGTH))]
+    names = [NO_TV, f"TV, strength {strengths[tv]:.2g} e⁻"]
+    where = f"Mean of all frames of each in the set “{result.set_names[0]}”, settling ones included"
+    return psf_figure([record.psf[without[0]], record.psf[tv]], names, where)
+
+
+def _budget(result: BudgetResult, results: LoopResults) -> Section:
+    configuration = configuration_of(results)
+    label = strehl_axis(1.65e-6 if configuration is None else configuration.science.wavelength_m)
+    rows = []
+    for arm, name in enumerate(result.labels):
+        for number, term in enumerate(result.terms):
+            strehl, residual = (
+                paired_mean(values[arm, number]) for values in (result.strehl, result.residual_nm)
+            )
+            change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
+            off = "–" if number == 0 else term
+            rows.append([name, off, with_error(strehl), with_error(residual, 0), in_words(change)])
+    table = Table(
+        ["arm", "switched off", "Strehl", "residual wavefront (nm rms)", "change in Strehl"],
+        rows,
+        "Means and their standard errors. Change: against the whole loop, over the same realisations, with "
+        "its 95 % interval. "
+        + "; ".join(f"{term}: {TERMS[term].meaning}" for term in result.terms[1:] if term in TERMS)
+        + ".",
+    )
+    text = _budget_lines(result)
+    return Section("budget", "Error budget", text, [table], [budget_figure(result, label)])
+
+
+def _budget_lines(result: BudgetResult) -> list[str]:
+    """Say of each arm what costs most Strehl, and of arms what becomes of their difference."""
+    lines = []
+    changes = result.strehl - result.strehl[:, :1]
+    for arm, name in enumerate(result.labels):
+        gains = [paired_mean(runs) for runs in changes[arm]]
+        order = sorted(range(1, len(gains)), key=lambda number: -np.nan_to_num(gains[number].value))
+        parts = [f"{result.terms[n]} {in_words(gains[n])}" for n in order[:3] if gains[n].decided > 0]
+        if parts:
+            lines.append(f"{name}: most Strehl is gained without {', then '.join(parts)}.")
+        if _SLOPE_ERROR in result.terms:
+            most = in_words(gains[result.terms.index(_SLOPE_ERROR)])
+            lines.append(
+                f"{name}: slopes without any error would change the Strehl by {most} at this loop gain."
+            )
+    for arm, name in enumerate(result.labels[1:], start=1):
+        parts = [
+            f"{_without(number, term)} {in_words(paired_mean(difference))}"
+            for number, (term, difference) in enumerate(
+                zip(result.terms, result.strehl[arm] - result.strehl[0], strict=True)
+            )
+        ]
+        lines.append(f"{name} less {result.labels[0]}: {'; '.join(parts)}.")
+    return lines
+
+
+def _without(number: int, term: str) -> str:
+    return f"without {term}" if number else "in the whole loop"
+
+
+def write_loop_report(folder_of_results: str | Path, out_html: str | Path) -> list[Path]:
+    """Write the report of what `faintspot loop` left in a folder, finished or not.
+
+    Beside the page, a folder holds each figure as PNG and SVG and its numbers as CSV.
+
+    Returns
+    -------
+    list of Path
+        The files written, the page first.
+
+    Raises
+    ------
+    InputError
+        When there are no results, or a file cannot be written.
+    MissingExtraError
+        When matplotlib or jinja2 is not installed.
+    """
+    return write_page(_page(LoopResults.load(folder_of_results)), out_html)
+
+
+def loop_report(results: LoopResults) -> str:
+    """Return the report page of closed-loop results as HTML: self-contained, without scripts.
+
+    Raises
+    ------
+    MissingExtraError
+        When matplotlib or jinja2 is not installed.
+    """
+    return html_of(_page(results))
+
+
+def _page(results: LoopResults) -> Page:
+    configuration = configuration_of(results)
+    name = "" if configuration is None else f": “{configuration.name}”"
+    return Page(
+        title=f"Closed loop with and without TV{name}",
+        facts=_facts(results),
+        sections=[*loop_sections(results), configuration_section(configuration_text(results))],
+        warnings=loop_warnings(results),
+        remark=POSITIONS,
+    )
+
+
+def _facts(results: LoopResults) -> dict[str, str]:
+    """Return what was simulated, in words, for the top of the page."""
+    configuration = configuration_of(results)
+    if configuration is None:
+        return {}
+    telescope, sensor, air = configuration.telescope, configuration.sensor, configuration.atmosphere
+    camera, control = configuration.camera, configuration.control
+    r0 = f"{air.r0_m[0]:g} to {air.r0_m[1]:g}" if isinstance(air.r0_m, tuple) else f"{air.r0_m:g}"
+    return {
+        "Telescope": f"{telescope.diameter_m:g} m, central obstruction {telescope.obstruction:g} of the "
+        "diameter",
+        "Sensor": f"{sensor.subapertures} × {sensor.subapertures} sub-apertures of "
+        f"{configuration.subaperture_m:.2g} m, "
+        f"{sensor.pixels} × {sensor.pixels} px, {sensor.wavelength_m * 1e9:.0f} nm",
+        "Air": f"r0 {r0} m at 500 nm, outer scale {air.outer_scale_m:g} m, {len(air.fraction)} layers",
+        "Camera": f"read noise {camera.read_noise_e / camera.em_gain:.3g} e⁻"
+        + (f", multiplication gain {camera.em_gain:g}" if camera.em_gain > 1 else ""),
+        "Star": f"{configuration.photons:g} photo-electrons of a sub-aperture in a frame, where not varied",
+        "Control": f"{control.frame_rate_hz:g} frames/s, {control.mode} loop; the command computed from "
+        "frame k acts "
+        f"first during frame k + {control.delay_frames}",
+        "Wavefront": "that of the middle of each exposure stands for all of it",
+        "Strehl ratio": f"on axis at {configuration.science.wavelength_m * 1e6:.3g} µm",
+    }

@@ -1,0 +1,178 @@
+"""The planner's answer for a closed loop in words."""
+
+from __future__ import annotations
+
+import math
+
+from faintspot.experiments.answer_text import plain_number
+from faintspot.experiments.loop_answer import BASELINE, SECOND, Coverage, LoopAnswer
+from faintspot.experiments.loop_arms import LOOP_GAIN, Choice
+from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, magnitudes_apart
+from faintspot.experiments.statistics import Estimate
+
+REFERENCES = (BASELINE, SECOND)
+_SMALLEST_ERROR = 0.001
+_SMALLEST_ERROR_MAG = 0.01
+
+
+def situation(answer: LoopAnswer) -> str:
+    """Say which loop and which star it is about."""
+    loop = answer.question.configuration
+    camera, flux = loop.camera, answer.at_star
+    noise = camera.read_noise_e / camera.em_gain
+    return (
+        f"{loop.name}: {loop.telescope.diameter_m:g} m, {loop.sensor.subapertures} x "
+        f"{loop.sensor.subapertures} sub-apertures, spots {loop.d_over_r0:.2g} r0 wide, {noise:g} e- of read "
+        f"noise, {loop.control.frame_rate_hz:g} frames/s; star "
+        f"{camera.band} = {answer.magnitudes[flux]:.2f}, "
+        f"{plain_number(answer.photons[flux])} photo-electrons in a sub-aperture and frame"
+    )
+
+
+def choice_in_words(choice: Choice) -> str:
+    """Return tuned values as `name value` pairs, the loop gain first."""
+    order = sorted(choice, key=lambda name: name != LOOP_GAIN)
+    return ", ".join(
+        f"{name} {plain_number(choice[name]) if not isinstance(choice[name], str) else choice[name]}"
+        for name in order
+    )
+
+
+def recommendation(answer: LoopAnswer) -> list[str]:
+    """Return the recommendation in a few sentences, the first a heading."""
+    flux, best = answer.at_star, answer.best
+    same = [name for name in answer.equal(flux) if name != best.name]
+    lines = [f"Recommended: {best.name} ({choice_in_words(best.choices[flux])})"]
+    lines.append(
+        f"expected Strehl ratio {_plus_minus(answer.strehl(best.name, flux), _SMALLEST_ERROR)} at "
+        f"{1e6 * answer.question.configuration.science.wavelength_m:.3g} um"
+    )
+    if same:
+        lines.append(
+            f"no winner: the errors do not tell it from {', '.join(same)}; taken is "
+            f"{'the baseline' if best.name == BASELINE else 'what is simplest'}"
+        )
+    lines += [
+        f"against {reference}: {difference_in_words(answer, best.name, reference)}"
+        for reference in REFERENCES
+        if reference != best.name
+    ]
+    lines += _along_the_magnitudes(answer)
+    lines += [f"{_ends(answer)}"] if _ends(answer) else []
+    return lines
+
+
+def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
+    """Say what an arm gains over another, in Strehl ratio at the star and in limiting magnitude."""
+    found = answer.difference(name, reference, answer.at_star)
+    verdict = {1: "", 0: ", within its error", -1: ", less beyond its error"}[found.decided]
+    text = f"Strehl ratio {_signed(found, 3, _SMALLEST_ERROR)}{verdict}"
+    return f"{text}; limiting magnitude {gain_in_words(answer, name, reference)}"
+
+
+def gain_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
+    """Return the gain in limiting magnitude with its error, or what is known of it."""
+    found = answer.gain(name, reference)
+    if found.is_known:
+        return _signed(Estimate(found.magnitude.value, found.error), 2, _SMALLEST_ERROR_MAG)
+    mine, other = (answer.limit(each).magnitude.value for each in (name, reference))
+    if math.isinf(mine) and mine == other:
+        return "not within what was measured"
+    ends = float(answer.magnitudes[-1]), float(answer.magnitudes[0])
+    least = (min(max(mine, ends[0]), ends[1])) - (min(max(other, ends[0]), ends[1]))
+    return f"{'>' if mine > other else '<'}{least:+.2f}"
+
+
+def limit_in_words(answer: LoopAnswer, name: str) -> str:
+    """Return an arm's limiting magnitude with its error."""
+    limit = answer.limit(name)
+    if limit.is_known:
+        return _plus_minus(Estimate(limit.magnitude.value, limit.error), _SMALLEST_ERROR_MAG, 2)
+    if limit.magnitude.value > 0:
+        return f">{answer.magnitudes[0]:.2f}"
+    return f"<{answer.magnitudes[-1]:.2f}"
+
+
+def coverage_in_words(coverage: Coverage) -> str:
+    """Return a fraction of the sky in per cent, with what the Strehl ratio's error makes of it."""
+    sign = {1: ">", 0: "", -1: "<"}[coverage.bound]
+    value = 100 * coverage.fraction
+    if coverage.bound or not math.isfinite(coverage.strehl_error):
+        return f"{sign}{plain_number(value, 2)}"
+    error = 100 * coverage.strehl_error
+    digits = max(0, -math.floor(math.log10(max(error, 1e-3))))
+    return f"{value:.{digits}f}±{error:.{digits}f}"
+
+
+def about_the_sky(answer: LoopAnswer) -> list[str]:
+    """Say what the table of the sky means, and its errors."""
+    radius = answer.question.radius
+    if radius is None:
+        return [
+            "sky coverage: not known, as all turbulence is on the ground (--radius: how far a star serves)"
+        ]
+    given = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
+    best, parts = answer.best.name, []
+    for place in PLACES:
+        found = answer.coverage(best, place)
+        assert found is not None
+        parts.append(f"{plain_number(100 * found.model_error, 2)} ({place})")
+    return [
+        f"percentage of the sky with a star bright enough for a Strehl ratio of {answer.level:.3g} within "
+        f"{radius:.3g} arcsec ({given}; the ratio is that towards the star, a target beside it has less)",
+        "errors in the table: of the limiting magnitude. Star counts are off by about "
+        f"{100 * MODEL_ERROR:.0f} %, for all methods alike: {best} ± {', '.join(parts)}",
+    ]
+
+
+def foundations(answer: LoopAnswer) -> list[str]:
+    """Say what the answer rests on."""
+    step = magnitudes_apart(answer.photons.tolist())
+    measured = ", ".join(f"{magnitude:.2f}" for magnitude in answer.magnitudes[::-1])
+    lines = [
+        f"measured at magnitudes {measured} (photo-electrons "
+        f"{', '.join(plain_number(flux) for flux in answer.photons[::-1])}); limiting magnitudes are "
+        f"interpolated between these, up to {step:.2f} apart, with straight lines on a falling curve; how "
+        "far off that may be, by the curves' bends, is part of their errors",
+        f"{answer.realisations} realisations of the air, {answer.scored_frames} scored frames each, the same "
+        "for all candidates; settings tuned coarsely on other air, so a longer search may add to any of them",
+        "differences are paired; their intervals (95 %, Student's t) hold for all candidates together",
+        "frozen layers, a star on axis, no vibrations; control that learns has learnt in the same seeing",
+    ]
+    return lines + [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
+
+
+def _along_the_magnitudes(answer: LoopAnswer) -> list[str]:
+    """Say what is recommended for the other stars."""
+    parts = []
+    for flux in range(len(answer.photons) - 1, -1, -1):
+        best, *same = answer.equal(flux)
+        text = f"{answer.magnitudes[flux]:.2f} {best}"
+        parts.append(f"{text} (as good: {', '.join(same)})" if same else text)
+    return [f"by magnitude: {'; '.join(parts)}"]
+
+
+def _ends(answer: LoopAnswer) -> str:
+    """Say which values of the recommended and the reference arms are at the end of what was on offer."""
+    flux = answer.at_star
+    parts = []
+    for name in dict.fromkeys((answer.best.name, *REFERENCES)):
+        result = answer[name]
+        parts += [
+            f"{value} {plain_number(result.choices[flux][value])} of {name}" for value in result.at_end[flux]
+        ]
+    if not parts:
+        return ""
+    return f"at the end of what was tried, so a better value may lie beyond: {', '.join(parts)}"
+
+
+def _plus_minus(value: Estimate, smallest: float, digits: int = 3) -> str:
+    if not math.isfinite(value.standard_error):
+        return f"{value.value:.{digits}f}"
+    return f"{value.value:.{digits}f}±{max(value.standard_error, smallest):.{digits}f}"
+
+
+def _signed(value: Estimate, digits: int, smallest: float) -> str:
+    if not math.isfinite(value.standard_error):
+        return f"{value.value:+.{digits}f} (no error: too few realisations)"
+    return f"{value.value:+.{digits}f}±{max(value.standard_error, smallest):.{digits}f}"

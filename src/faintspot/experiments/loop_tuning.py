@@ -1,0 +1,154 @@
+"""Recommend an estimator and a control for a closed loop, from a quick measurement of `run_magnitude`."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from faintspot.checks import number_between
+from faintspot.control.learning import INTEGRATOR
+from faintspot.errors import InputError
+from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
+from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind
+from faintspot.experiments.loop_question import LoopQuestion
+from faintspot.experiments.loop_results import MagnitudeResult
+from faintspot.experiments.magnitude import run_magnitude, with_flux
+from faintspot.experiments.running import Workplace
+from faintspot.experiments.search import Search
+from faintspot.loop.configuration import LoopConfiguration
+
+_SEARCH = Search(
+    coarse_frames=120, frames=120, settle_frames=40, realisations=1, finalists=1, climbs=1, rounds=1
+)
+
+
+@dataclass(frozen=True)
+class LoopPlan:
+    """How much is simulated.
+
+    Parameters
+    ----------
+    fluxes : int
+        Number of fluxes measured; limiting magnitudes are interpolated between them.
+    frames, settle_frames : int
+        Frames of a scored run, and how many at its start do not count.
+    realisations : int
+        Realisations of the atmosphere that are scored, the same for all candidates.
+    search : Search
+        How settings are sought.
+    """
+
+    fluxes: int = 5
+    frames: int = 360
+    settle_frames: int = 60
+    realisations: int = 4
+    search: Search = _SEARCH
+
+    def __post_init__(self) -> None:
+        lowest = {"fluxes": 3, "frames": self.settle_frames + 1, "realisations": 1, "settle_frames": 0}
+        for name, low in lowest.items():
+            number_between(f"plan.{name}", getattr(self, name), low, 10**6, integer=True)
+
+    def configuration(self, loop: LoopConfiguration) -> LoopConfiguration:
+        """Return a loop with the length and number of scored runs; its own star does not count."""
+        run = {name: getattr(self, name) for name in ("frames", "settle_frames", "realisations")}
+        return with_flux(loop.replace("run", **run, photons_per_subaperture=()), 1.0)
+
+
+def tune_loop(
+    question: LoopQuestion,
+    folder: str | Path,
+    *,
+    plan: LoopPlan | None = None,
+    place: Workplace | None = None,
+    overwrite: bool = False,
+) -> LoopAnswer:
+    """Find out which estimator and control suit a closed loop, and with which settings.
+
+    Candidates are tuned and scored as by `faintspot.loop.run_magnitude`, with short runs and a short search.
+    Of the default candidates those whose control learns are measured only while there is time.
+
+    Parameters
+    ----------
+    question : LoopQuestion
+    folder : path
+        Where finished units are remembered; made where it is not there. Interrupted, the same call goes on.
+    plan : LoopPlan, optional
+    place : Workplace, optional
+        Where the work is done. Default: processes on this machine.
+    overwrite : bool
+        Whether another question's units in the folder are replaced.
+
+    Raises
+    ------
+    InputError
+        For a question of the wrong kind, or a folder that holds another question's units.
+    MissingExtraError
+        When HCIPy, zarr, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.loop import load_loop
+    >>> from faintspot.experiments import LoopQuestion, tune_loop
+    >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0))
+    >>> answer = tune_loop(question, "loop-tune")  # doctest: +SKIP
+    """
+    if not isinstance(question, LoopQuestion):
+        raise InputError(f"question: expected a LoopQuestion, got {type(question).__name__}")
+    plan = LoopPlan() if plan is None else plan
+    base, fluxes = plan.configuration(question.configuration), question.photons(plan.fluxes)
+    started, left_out = time.monotonic(), dict(question.left_out)
+
+    def measured(names: list[str], *, overwrite: bool = False) -> MagnitudeResult:
+        return run_magnitude(
+            base, folder, names, fluxes, search=plan.search, place=place, overwrite=overwrite
+        )
+
+    names = [kind.name for kind in question.kinds if kind.control == INTEGRATOR]
+    try:
+        result = measured(names)
+    except InputError:
+        if not overwrite:
+            raise
+        result = measured(names, overwrite=True)
+    for kind in question.kinds:
+        if kind.control == INTEGRATOR:
+            continue
+        minutes = (time.monotonic() - started) / 60
+        if question.arms is None and minutes > question.minutes:
+            left_out[kind.name] = (
+                f"{minutes:.1f} of the {question.minutes:g} minutes were over; the same command goes on"
+            )
+        else:
+            names.append(kind.name)
+            result = measured(names)
+    return LoopAnswer(
+        question, _results(base, result), result.photons, plan.frames - plan.settle_frames, left_out
+    )
+
+
+def _results(base: LoopConfiguration, result: MagnitudeResult) -> tuple[LoopArmResult, ...]:
+    stars = [with_flux(base, float(flux)) for flux in result.photons]
+    found = []
+    for arm, name in enumerate(result.names):
+        kind = arm_kind(name)
+        choices: list[dict[str, Any]] = [json.loads(text) for text in result.choices[arm]]
+        ends = tuple(values_at_end(kind, *each) for each in zip(stars, choices, strict=True))
+        found.append(LoopArmResult(kind, tuple(choices), result.strehl[arm], result.centroid_gain[arm], ends))
+    return tuple(found)
+
+
+def values_at_end(kind: ArmKind, configuration: LoopConfiguration, choice: Choice) -> tuple[str, ...]:
+    """Return which chosen values are the first or last that were on offer, but could be beyond."""
+    declared = kind.estimator.declared()
+    found = []
+    for name, each in kind.tuned(configuration).items():
+        if len(each.values) < 2 or isinstance(choice[name], str):
+            continue
+        limits = (declared[name].low, declared[name].high) if name in declared else ()
+        if choice[name] in (min(each.values), max(each.values)) and choice[name] not in limits:
+            found.append(name)
+    return tuple(found)

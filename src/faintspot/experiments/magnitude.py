@@ -1,0 +1,278 @@
+"""Strehl ratio against the star's light, for any list of arms, each tuned at every flux."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.checks import numbers_between
+from faintspot.errors import InputError
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.smoothed import Smoothed
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.estimators.trained import Trained
+from faintspot.estimators.window import Window
+from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind, default_arms
+from faintspot.experiments.loop_results import MagnitudeResult
+from faintspot.experiments.running import Advance, Unit, Workplace, run_units
+from faintspot.experiments.search import (
+    QUICK,
+    Search,
+    stored_choice,
+    tuning_frames,
+    tuning_unit,
+    with_integrator,
+)
+from faintspot.experiments.store import Arrays, ZarrStore, fingerprint_of
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.files import MAGNITUDE_FILE, make_folder
+from faintspot.loop.simulation import simulate_loop
+
+KIND = "magnitude"
+QUICK_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
+_QUICK_RUN = {"frames": 300, "settle_frames": 60, "realisations": 2}
+_QUICK_FLUXES = 3
+
+
+def run_magnitude(
+    configuration: LoopConfiguration,
+    folder: str | Path,
+    arms: Sequence[str] | None = None,
+    photons: Sequence[float] | None = None,
+    *,
+    quick: bool = False,
+    search: Search | None = None,
+    place: Workplace | None = None,
+    overwrite: bool = False,
+) -> MagnitudeResult:
+    """Measure the Strehl ratio of arms against the star's light, or what is left of it.
+
+    Each arm is tuned at each flux on air of its own, then scored on the configuration's number of
+    realisations, which are the same for all. The result is also written to the folder.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    folder : path
+        Where finished units are remembered; made where it is not there.
+    arms : sequence of str, optional
+        See `faintspot.experiments.loop_arms.arm_kind`. Default: `default_arms`; with `quick`, five.
+    photons : sequence of float, optional
+        Photo-electrons of a fully lit sub-aperture in a frame. Default: the configuration's.
+    quick : bool
+        Few fluxes, short runs, a coarse search.
+    search : Search, optional
+        How settings are sought.
+    place : Workplace, optional
+        Where the work is done. Default: processes on this machine.
+    overwrite : bool
+        Whether another experiment in the folder is replaced.
+
+    Raises
+    ------
+    InputError
+        For unknown arms, no flux, or a folder that holds another experiment.
+    MissingExtraError
+        When HCIPy, or Dask where it is needed, is not installed.
+
+    Examples
+    --------
+    >>> from faintspot.experiments import run_magnitude
+    >>> from faintspot.loop import load_loop
+    >>> result = run_magnitude(load_loop("canary"), "magnitude", quick=True)  # doctest: +SKIP
+    """
+    place = Workplace() if place is None else place
+    configuration = quick_run(configuration) if quick else configuration
+    search = search or (QUICK if quick else Search())
+    kinds = checked_arms(arms if arms is not None else _default(configuration, quick))
+    fluxes = _checked_fluxes(
+        photons if photons is not None else configuration.run.photons_per_subaperture, quick
+    )
+    folder = make_folder(folder)
+    choices = tuned_choices(configuration, kinds, fluxes, search, folder, KIND, place, overwrite=overwrite)
+    units = [
+        Unit(
+            _key(kind, flux, realisation),
+            (kind, with_flux(configuration, flux), choices[kind.name, flux], realisation),
+            configuration.run.frames,
+        )
+        for kind in kinds
+        for flux in fluxes
+        for realisation in range(configuration.run.realisations)
+    ]
+    store = unit_store(folder, KIND, (configuration, search), units, overwrite=overwrite)
+    place.say("scoring")
+    result = _gathered(configuration, kinds, fluxes, choices, run_units(scored_run, units, store, place))
+    result.save(folder / MAGNITUDE_FILE)
+    return result
+
+
+def tuned_choices(
+    configuration: LoopConfiguration,
+    kinds: Sequence[ArmKind],
+    fluxes: Sequence[float],
+    search: Search,
+    folder: Path,
+    experiment: str,
+    place: Workplace,
+    *,
+    overwrite: bool,
+) -> dict[tuple[str, float], dict[str, Any]]:
+    """Return the tuned values of every arm at every flux, tuned now where they are not stored.
+
+    Slopes first, with the integrator, also of arms whose control learns; then what is that control's own.
+    """
+    plain = {kind.name: kind for kind in map(with_integrator, kinds)}
+    learning = {kind.name: kind for kind in kinds if kind.name not in plain}
+    choices: dict[tuple[str, float], dict[str, Any]] = {}
+
+    def units(kinds: Mapping[str, ArmKind]) -> dict[tuple[str, float], Unit]:
+        return {
+            (name, flux): _tuning_unit(
+                kind, with_flux(configuration, flux), search, choices.get((with_integrator(kind).name, flux))
+            )
+            for name, kind in kinds.items()
+            for flux in fluxes
+        }
+
+    every = [*units(plain).values(), *units(learning).values()]
+    store = unit_store(folder, f"{experiment}-tuning", (configuration, search), every, overwrite=overwrite)
+    for stage, kinds_now in (("tuning", plain), ("tuning of control", learning)):
+        if now := units(kinds_now):
+            place.say(stage)
+            results = run_units(tuning_unit, list(now.values()), store, place)
+            choices.update({key: stored_choice(results[unit.key]) for key, unit in now.items()})
+    return choices
+
+
+def _tuning_unit(kind: ArmKind, star: LoopConfiguration, search: Search, slopes: Choice | None) -> Unit:
+    key = f"{kind.name}-{star.camera.photons_per_subaperture:g}"
+    return Unit(key, (kind, star, search, slopes), tuning_frames(kind, star, search))
+
+
+def unit_store(
+    folder: Path,
+    name: str,
+    experiment: tuple[LoopConfiguration, Any],
+    units: Sequence[Unit],
+    *,
+    overwrite: bool,
+) -> ZarrStore:
+    """Return where units of an experiment, a configuration and a plan, are kept in its folder.
+
+    Raises
+    ------
+    InputError
+        When the folder holds those of another experiment, or it cannot be written.
+    """
+    configuration, plan = experiment
+    identity = fingerprint_of(configuration.to_text(), str(asdict(plan)))
+    keys = [unit.key for unit in units]
+    return ZarrStore(
+        make_folder(folder / "units") / f"{name}.zarr",
+        "closed-loop experiment",
+        identity,
+        keys,
+        attributes={"name": configuration.name},
+        overwrite=overwrite,
+    )
+
+
+def scored_run(
+    kind: ArmKind,
+    configuration: LoopConfiguration,
+    choice: Choice,
+    realisation: int,
+    advance: Advance,
+) -> dict[str, NDArray[Any]]:
+    """Return what one run of a tuned arm gives, as arrays that can be stored."""
+    arm = kind.arm(configuration, choice)
+    record = simulate_loop(
+        configuration, [arm], realisation=realisation, progress=lambda done, total: advance(done)
+    )
+    return {
+        "strehl": np.asarray(record.mean_strehl()),
+        "centroid_gain": record.centroid_gain[0],
+        "psf": record.psf[0],
+        "settings": np.asarray(record.arm_settings[0]),
+    }
+
+
+def with_flux(configuration: LoopConfiguration, photons: float) -> LoopConfiguration:
+    """Return the configuration with another star."""
+    return configuration.replace("camera", photons_per_subaperture=float(photons), magnitude=None)
+
+
+def quick_run(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration with few and short runs."""
+    run = {name: min(value, getattr(configuration.run, name)) for name, value in _QUICK_RUN.items()}
+    return configuration.replace("run", **run)
+
+
+def checked_arms(names: Sequence[str]) -> list[ArmKind]:
+    """Return arms by their names, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown one, or none.
+    """
+    if not names:
+        raise InputError("arms: expected at least one, got none")
+    return list({kind.name: kind for kind in map(arm_kind, names)}.values())
+
+
+def _default(configuration: LoopConfiguration, quick: bool) -> list[str]:
+    names = default_arms(configuration)
+    return [name for name in names if name in QUICK_ARMS] if quick else names
+
+
+def _checked_fluxes(photons: Sequence[float], quick: bool) -> list[float]:
+    fluxes = sorted(set(numbers_between("photons", photons, 0.0, 1e9, low_open=True).ravel().tolist()))
+    if not fluxes:
+        raise InputError("photons: expected at least one flux, got none: see run.photons_per_subaperture")
+    if quick and len(fluxes) > _QUICK_FLUXES:
+        chosen = np.linspace(0, len(fluxes) - 1, _QUICK_FLUXES).round().astype(int)
+        return [fluxes[place] for place in chosen]
+    return fluxes
+
+
+def _key(kind: ArmKind, flux: float, realisation: int) -> str:
+    return f"{kind.name}-{flux:g}-{realisation}"
+
+
+def _gathered(
+    configuration: LoopConfiguration,
+    kinds: Sequence[ArmKind],
+    fluxes: Sequence[float],
+    choices: Mapping[tuple[str, float], Choice],
+    results: Mapping[str, Arrays],
+) -> MagnitudeResult:
+    runs = range(configuration.run.realisations)
+
+    def of(variable: str) -> NDArray[Any]:
+        return np.array(
+            [
+                [[results[_key(kind, flux, run)][variable] for run in runs] for flux in fluxes]
+                for kind in kinds
+            ]
+        )
+
+    return MagnitudeResult(
+        tuple(kind.name for kind in kinds),
+        tuple(kind.label for kind in kinds),
+        np.array(fluxes),
+        configuration.photometry.magnitude(fluxes),
+        of("strehl"),
+        of("centroid_gain"),
+        of("settings")[:, :, 0],
+        np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
+        of("psf").mean(axis=2),
+        configuration.to_text(),
+    )

@@ -1,0 +1,278 @@
+"""Searches for settings: along each axis in turn, and, in closed loops, from the best of a coarse grid."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.checks import number_between
+from faintspot.control.learning import INTEGRATOR
+from faintspot.experiments.loop_arms import ArmKind, Choice, Tunable
+from faintspot.experiments.running import Advance
+from faintspot.experiments.statistics import slope_statistics
+from faintspot.loop.configuration import LoopConfiguration
+from faintspot.loop.simulation import simulate_loop
+
+_ROUNDS = 2  # of looking along each axis in turn
+
+Axes = Mapping[str, Sequence[Any]]
+"""What each option may be; the usual value is the first."""
+
+
+def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
+    """Look along each axis in turn, from the first values, and again along those for which others changed.
+
+    Parameters
+    ----------
+    axes : mapping
+    badness : callable
+        Called with a choice, the name of an option and values of it; returns how bad the choice is with each
+        of them.
+
+    Returns
+    -------
+    dict
+        The choice where the search ends.
+    """
+    best: Choice = {name: values[0] for name, values in axes.items()}
+    looked: dict[str, Choice] = {}
+    for name in list(axes) * (_ROUNDS if len(axes) > 1 else 1):
+        others = {key: value for key, value in best.items() if key != name}
+        if looked.get(name) != others:  # else nothing has changed since
+            looked[name] = others
+            best = {**best, name: axes[name][int(np.argmin(badness(best, name, axes[name])))]}
+    return best
+
+
+def corrected_badness(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> float:
+    """Return the gain-corrected rms; where nothing is measured, the rms, behind all that measure."""
+    found = slope_statistics(x, y, truth)
+    corrected = found.corrected_rms.value
+    return corrected if math.isfinite(corrected) else 1e6 + found.rms.value
+
+
+FIRST_TUNING_REALISATION = 1000
+"""Realisations of the air from this one on are tuned on; those before are scored."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """How thoroughly settings are sought.
+
+    Parameters
+    ----------
+    coarse_frames : int
+        Of every combination of the coarse values, with one realisation of the air.
+    frames : int
+        Of the settings around the best ones, with every realisation; also of the final choice.
+    settle_frames : int
+        Of these, not scored.
+    realisations : int
+        Of the refined search.
+    finalists : int
+        Coarse combinations that are looked at again.
+    climbs : int
+        Finalists from which steps are taken, the best ones: the best of all may stand on the lower hill.
+    rounds : int
+        Most steps away from each of them; 0: none.
+
+    Raises
+    ------
+    InputError
+        For numbers out of range.
+    """
+
+    coarse_frames: int = 250
+    frames: int = 400
+    settle_frames: int = 60
+    realisations: int = 2
+    finalists: int = 4
+    climbs: int = 2
+    rounds: int = 5
+
+    def __post_init__(self) -> None:
+        lowest = {"coarse_frames": self.settle_frames + 1, "frames": self.settle_frames + 1, "rounds": 0}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            number_between(f"search.{each.name}", value, lowest.get(each.name, 1), 10**6, integer=True)
+
+
+QUICK = Search(coarse_frames=160, frames=160, settle_frames=40, realisations=1, finalists=1, rounds=0)
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What the search found."""
+
+    choice: Choice
+    strehl: float
+    """Mean of the tuning runs; the best of many, so higher than that of other runs."""
+    tried: int
+    """Settings that were looked at."""
+
+
+def tune(
+    kind: ArmKind,
+    configuration: LoopConfiguration,
+    search: Search | None = None,
+    advance: Advance | None = None,
+    *,
+    slopes: Choice | None = None,
+) -> Tuned:
+    """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
+
+    All combinations of a few values of each option first, then steps from the best ones to
+    neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
+    which takes much longer than a run, the estimator's options and the gain at which telemetry is taken are
+    those that are best with the integrator, and only what is the control's own is sought with it. All see
+    the same air and noise; realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
+
+    Parameters
+    ----------
+    kind : ArmKind
+    configuration : LoopConfiguration
+    search : Search, optional
+    advance : callable, optional
+        Told the number of frames simulated, after every run.
+    slopes : mapping, optional
+        For control that learns: what was found for its slopes with the integrator. Default: sought first.
+    """
+    search = Search() if search is None else search
+    tuned = kind.tuned(configuration)
+    if kind.control == INTEGRATOR:
+        return _sought(kind, configuration, search, tuned, advance)
+    if slopes is None:
+        slopes = tune(with_integrator(kind), configuration, search, advance).choice
+    for name, each in tuned.items():
+        if name in slopes:
+            tuned[name] = each.nearest(slopes[name])
+    return _sought(kind, configuration, replace(search, finalists=1), tuned, advance)
+
+
+def with_integrator(kind: ArmKind) -> ArmKind:
+    """Return the arm with the same slopes whose control need not learn."""
+    return replace(kind, control=INTEGRATOR)
+
+
+def _sought(
+    kind: ArmKind,
+    configuration: LoopConfiguration,
+    search: Search,
+    tuned: Mapping[str, Tunable],
+    advance: Advance | None,
+) -> Tuned:
+    """Return the best of the values that are tuned."""
+    trials = _Trials(kind, configuration, search, advance)
+    coarse = [
+        dict(zip(tuned, values, strict=True))
+        for values in itertools.product(*(each.first for each in tuned.values()))
+    ]
+    ranked = sorted(coarse, key=lambda choice: -trials.coarse(choice))
+    if search.rounds == 0:
+        return Tuned(ranked[0], trials.coarse(ranked[0]), trials.tried)
+    finalists = sorted(ranked[: search.finalists], key=trials.fine, reverse=True)
+    tops = [_climbed(start, tuned, trials, search.rounds) for start in finalists[: search.climbs]]
+    best = max(tops, key=trials.fine)
+    return Tuned(best, trials.fine(best), trials.tried)
+
+
+def _climbed(
+    start: dict[str, Any], tuned: Mapping[str, Tunable], trials: _Trials, rounds: int
+) -> dict[str, Any]:
+    """Return where steps to the best neighbour end."""
+    best = start
+    for _ in range(rounds):
+        better = max(_neighbours(best, tuned), key=trials.fine, default=best)
+        if trials.fine(better) <= trials.fine(best):
+            break
+        best = better
+    return best
+
+
+def tuning_unit(
+    kind: ArmKind, configuration: LoopConfiguration, search: Search, slopes: Choice | None, advance: Advance
+) -> dict[str, NDArray[Any]]:
+    """Return what `tune` found, as arrays that can be stored."""
+    tuned = tune(kind, configuration, search, advance, slopes=slopes)
+    return {
+        "choice": np.asarray(json.dumps(dict(tuned.choice))),
+        "strehl": np.asarray(tuned.strehl),
+        "tried": np.asarray(tuned.tried),
+    }
+
+
+def stored_choice(result: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the choice that `tuning_unit` stored."""
+    choice: dict[str, Any] = json.loads(str(result["choice"]))
+    return choice
+
+
+def tuning_frames(kind: ArmKind, configuration: LoopConfiguration, search: Search) -> int:
+    """Return about how many frames tuning an arm simulates, where its slopes are tuned already."""
+    tuned = kind.tuned(configuration)
+    if kind.control != INTEGRATOR:
+        options = with_integrator(kind).tuned(configuration)
+        tuned = {name: each for name, each in tuned.items() if name not in options}
+    combinations = math.prod(len(each.first) for each in tuned.values())
+    climbs = min(search.climbs, search.finalists if kind.control == INTEGRATOR else 1)
+    looks = search.finalists + 2 * len(tuned) * climbs * min(2, search.rounds) if search.rounds else 0
+    return combinations * search.coarse_frames + looks * search.frames * search.realisations
+
+
+class _Trials:
+    """Strehl ratios of the settings that were looked at."""
+
+    def __init__(
+        self, kind: ArmKind, configuration: LoopConfiguration, search: Search, advance: Advance | None
+    ) -> None:
+        self._kind, self._search = kind, search
+        self._advance, self._frames = advance, 0
+        self._configuration = configuration
+        self._coarse: dict[tuple[Any, ...], float] = {}
+        self._fine: dict[tuple[Any, ...], float] = {}
+
+    @property
+    def tried(self) -> int:
+        return len(self._coarse.keys() | self._fine.keys())
+
+    def coarse(self, choice: Choice) -> float:
+        """Return the Strehl ratio in one short run."""
+        key = tuple(choice.values())
+        if key not in self._coarse:
+            self._coarse[key] = self._strehl(choice, self._search.coarse_frames, 1)
+        return self._coarse[key]
+
+    def fine(self, choice: Choice) -> float:
+        """Return the mean Strehl ratio of longer runs."""
+        key = tuple(choice.values())
+        if key not in self._fine:
+            self._fine[key] = self._strehl(choice, self._search.frames, self._search.realisations)
+        return self._fine[key]
+
+    def _strehl(self, choice: Choice, frames: int, realisations: int) -> float:
+        short = self._configuration.replace("run", frames=frames, settle_frames=self._search.settle_frames)
+        arm = self._kind.arm(short, choice)
+        runs = range(FIRST_TUNING_REALISATION, FIRST_TUNING_REALISATION + realisations)
+        strehl = float(np.mean([simulate_loop(short, [arm], realisation=run).mean_strehl() for run in runs]))
+        self._frames += frames * realisations
+        if self._advance is not None:
+            self._advance(self._frames)
+        return strehl
+
+
+def _neighbours(choice: Choice, tuned: Mapping[str, Tunable]) -> list[dict[str, Any]]:
+    """Return the choices one step away in one option."""
+    near = []
+    for name, each in tuned.items():
+        place = each.values.index(choice[name])
+        for other in (place - 1, place + 1):
+            if 0 <= other < len(each.values):
+                near.append({**choice, name: each.values[other]})
+    return near

@@ -1,0 +1,326 @@
+"""Error curves of a study, the kept pixels of figure 5, TV against the other arms, and verdicts on claims."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.errors import InputError
+from faintspot.experiments.arms import TV
+from faintspot.experiments.curves import Curve
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, order=True)
+class Configuration:
+    """All parameters of a cell but its flux; units as in the dataset."""
+
+    profile: str
+    position_range_px: float
+    read_noise_e: float
+    size: float
+    elongation: float
+    pixels: int
+    background_e: float = 0.0
+    em_gain: float = 1.0
+    d_over_r0: float = 0.0
+
+    @property
+    def prior_error_px(self) -> float:
+        """R of an estimator that always answers the centre: half of the range."""
+        return self.position_range_px / 2
+
+    def in_words(self) -> str:
+        """Return the configuration in one line."""
+        words = [
+            f"{self.profile} spot of size {self.size:g}",
+            f"{self.read_noise_e:g} e- read noise",
+            f"{self.pixels} × {self.pixels} px",
+            f"±{self.position_range_px:g} px",
+        ]
+        if self.elongation != 1:
+            words.insert(1, f"elongated {self.elongation:g} times")
+        if self.background_e:
+            words.append(f"background {self.background_e:g} e-/px")
+        if self.em_gain != 1:
+            words.append(f"EM gain {self.em_gain:g}")
+        if self.d_over_r0:
+            words.append(f"d/r0 {self.d_over_r0:g}")
+        return ", ".join(words)
+
+
+def study_curves(dataset: xarray.Dataset, mode: str) -> dict[Configuration, Curve]:
+    """Return the curve of every configuration in a mode, from the finished cells of a study.
+
+    Raises
+    ------
+    InputError
+        For a mode that the study does not have.
+    """
+    modes = [str(name) for name in dataset["mode"].values]
+    if mode not in modes:
+        raise InputError(f"mode {mode!r}: expected one of {', '.join(modes)}")
+    arms = tuple(str(name) for name in dataset["arm"].values)
+    of_mode = dataset[["error", "error_covariance"]].sel(mode=mode)
+    error = of_mode["error"].transpose("cell", "arm").values
+    covariance = of_mode["error_covariance"].transpose("cell", "arm", "arm2").values
+    flux = np.asarray(dataset["flux_e"].values, dtype=np.float64)
+    return {
+        configuration: Curve(flux[cells], arms, error[cells], covariance[cells])
+        for configuration, cells in cells_by_configuration(dataset).items()
+    }
+
+
+def cells_by_configuration(dataset: xarray.Dataset) -> dict[Configuration, NDArray[np.int64]]:
+    """Return the indices of the finished cells of every configuration, by increasing flux."""
+    columns = {field.name: dataset[field.name].values for field in fields(Configuration)}
+    found: dict[Configuration, list[int]] = {}
+    for cell in np.flatnonzero(dataset["done"].values):
+        values: dict[str, Any] = {name: column[cell].item() for name, column in columns.items()}
+        found.setdefault(Configuration(**values), []).append(int(cell))
+    flux = dataset["flux_e"].values
+    return {key: np.array(sorted(cells, key=lambda cell: flux[cell])) for key, cells in found.items()}
+
+
+KEPT_RANGE = (10, 60)
+"""The smallest and largest k between which the dependence is measured."""
+
+# Basden et al.'s text compares read noises at 50 electrons, the lower of the two signals of its first panel.
+_WANTED_SIGNALS_E = (50.0, 200.0)
+_SHOWN_NOISES_E = (0.1, 1.0, 3.0, 16.0)
+
+
+@dataclass(frozen=True)
+class KeptPanel:
+    """The cells of one part of the figure: what varies, and (label, cell index) of each."""
+
+    title: str
+    cells: Sequence[tuple[str, int]]
+
+
+def kept_panels(dataset: xarray.Dataset, profile: str) -> list[KeptPanel]:
+    """Return the three parts of the figure for a spot profile: signals, spot sizes, read noises.
+
+    16 x 16 pixels (or the study's largest), round spots, the smallest position range. Where a study does not
+    have the paper's fluxes, the nearest are taken.
+    """
+    by_configuration = {
+        configuration: cells
+        for configuration, cells in cells_by_configuration(dataset).items()
+        if configuration.profile == profile and configuration.elongation == 1
+    }
+    if not by_configuration:
+        return []
+    reach = min(configuration.position_range_px for configuration in by_configuration)
+    pixels = max(configuration.pixels for configuration in by_configuration)
+    kept = {c: i for c, i in by_configuration.items() if (c.position_range_px, c.pixels) == (reach, pixels)}
+    noise = min(c.read_noise_e for c in kept) if kept else 0.0
+    size = min(c.size for c in kept) if kept else 0.0
+    low, high = _WANTED_SIGNALS_E
+    quiet = [c for c in kept if c.read_noise_e == noise]
+    sharp = [c for c in kept if c.size == size and c.read_noise_e in (*_SHOWN_NOISES_E, noise)]
+    signals = [
+        (f"{flux:g} e-", cell)
+        for c in quiet
+        if c.size == size
+        for flux, cell in dict(_nearest(dataset, kept[c], wanted) for wanted in (low, high)).items()
+    ]
+    fixed = f"{profile}, {pixels} × {pixels} px, ±{reach:g} px"
+    return [
+        KeptPanel(f"signals, size {size:g}, {noise:g} e- read noise; {fixed}", signals),
+        _panel("spot sizes", dataset, kept, sorted(quiet), low, f"{noise:g} e- read noise; {fixed}"),
+        _panel("read noises", dataset, kept, sorted(sharp), low, f"size {size:g}; {fixed}"),
+    ]
+
+
+def spread(dataset: xarray.Dataset, cell: int, arm: str) -> tuple[float, float] | None:
+    """Return ln(largest R / smallest R) for k within KEPT_RANGE, and an upper limit of its standard error.
+
+    The two R are from the same realisations; their correlation, which is not known, would make the error
+    smaller. None when the arm has no k or the cell too few pixels.
+    """
+    part = dataset.sel(arm=arm, k=slice(*KEPT_RANGE)).isel(cell=cell)
+    values, errors = part["error_at_k"].values, part["error_at_k_se"].values
+    if values.size < 2 or not np.all(np.isfinite(values)):
+        return None
+    low, high = int(np.argmin(values)), int(np.argmax(values))
+    relative = np.hypot(errors[low] / values[low], errors[high] / values[high])
+    return float(np.log(values[high] / values[low])), float(relative)
+
+
+def _panel(
+    what: str,
+    dataset: xarray.Dataset,
+    kept: dict[Configuration, np.ndarray],
+    configurations: Sequence[Configuration],
+    wanted_e: float,
+    fixed: str,
+) -> KeptPanel:
+    """Return one cell of each configuration, all of one flux: the nearest to the wanted one they share."""
+    cells = []
+    for configuration in configurations:
+        flux, cell = _nearest(dataset, kept[configuration], wanted_e)
+        value = (
+            f"size {configuration.size:g}" if what == "spot sizes" else f"{configuration.read_noise_e:g} e-"
+        )
+        cells.append((value, cell, flux))
+    fluxes = {flux for _, _, flux in cells}
+    at = f"{fluxes.pop():g} e-" if len(fluxes) == 1 else "signals as named"
+    labelled = [
+        (name if at != "signals as named" else f"{name}, {flux:g} e-", cell) for name, cell, flux in cells
+    ]
+    return KeptPanel(f"{what} at {at}, {fixed}", labelled)
+
+
+def _nearest(dataset: xarray.Dataset, cells: np.ndarray, wanted_e: float) -> tuple[float, int]:
+    flux = dataset["flux_e"].values[cells]
+    best = int(np.argmin(np.abs(np.log(flux / wanted_e))))
+    return float(flux[best]), int(cells[best])
+
+
+_FAMILY_FALSE_ALARM = 0.05
+
+
+@dataclass(frozen=True)
+class AgainstTV:
+    """An arm against TV, over all cells of a spot profile in one mode."""
+
+    arm: str
+    mode: str
+    profile: str
+    smaller: int
+    """Cells in which the arm's R is smaller than TV's; paired, 5 % false alarms for all cells together."""
+    larger: int
+    cells: int
+    mean_ratio: float
+    """Geometric mean of R / R of TV."""
+    smallest: int
+    """Cells in which the arm's R is the smallest of all arms, decided or not."""
+
+
+def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
+    """Return how each arm compares with TV, by spot profile; nothing when TV is not in the study."""
+    from scipy.stats import norm
+
+    curves = study_curves(dataset, mode)
+    rows = []
+    for profile in sorted({key.profile for key in curves}):
+        part = [curve for key, curve in curves.items() if key.profile == profile]
+        arms = part[0].arms
+        if TV not in arms:
+            continue
+        error = np.concatenate([curve.error for curve in part])
+        measured = np.all(np.isfinite(error), axis=1)
+        winner = np.argmin(error[measured], axis=1)
+        for index, arm in enumerate(arms):
+            pairs = [curve.difference(TV, arm) for curve in part]
+            difference, se = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
+            known = np.isfinite(difference)
+            n = int(known.sum())
+            if arm == TV or n == 0:
+                continue
+            limit = float(norm.isf(_FAMILY_FALSE_ALARM / n))
+            ratio = error[known, index] / error[known, arms.index(TV)]
+            rows.append(
+                AgainstTV(
+                    arm,
+                    mode,
+                    profile,
+                    int(np.sum(difference[known] < -limit * se[known])),
+                    int(np.sum(difference[known] > limit * se[known])),
+                    n,
+                    float(np.exp(np.mean(np.log(ratio)))),
+                    int(np.sum(winner == index)),
+                )
+            )
+    return rows
+
+
+class Outcome(StrEnum):
+    """What the numbers say about a claim."""
+
+    HOLDS = "holds"
+    IN_PART = "holds in part"
+    FAILS = "does not hold"
+    NOT_MEASURED = "not measured"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One test of a claim: where, what was found, with errors, and the outcome there."""
+
+    where: str
+    finding: str
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Finding:
+    """All cases of a claim in one mode."""
+
+    mode: str
+    cases: Sequence[Case]
+
+    @property
+    def outcome(self) -> Outcome:
+        """Of all cases together; see `combined`."""
+        return combined([case.outcome for case in self.cases])
+
+    def in_words(self) -> str:
+        """Return how many cases hold."""
+        if not self.cases:
+            return "no finished cells for it"
+        if len(self.cases) == 1:
+            return "one case"
+        counts = [sum(case.outcome is outcome for case in self.cases) for outcome in _COUNTED]
+        named = [f"{n} {outcome.value}" for n, outcome in zip(counts, _COUNTED, strict=True) if n]
+        return f"{len(self.cases)} cases: " + ", ".join(named)
+
+
+_COUNTED = (Outcome.HOLDS, Outcome.IN_PART, Outcome.FAILS)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on one claim."""
+
+    number: int
+    claim: str
+    rule: str
+    best: Finding
+    fixed: Finding
+
+    @property
+    def outcome(self) -> Outcome:
+        """Of both modes together."""
+        measured = [item.outcome for item in (self.best, self.fixed) if item.cases]
+        return combined(measured)
+
+
+def combined(outcomes: Sequence[Outcome]) -> Outcome:
+    """Return the outcome of several: all hold, none does, or anything between."""
+    measured = [outcome for outcome in outcomes if outcome is not Outcome.NOT_MEASURED]
+    if not measured:
+        return Outcome.NOT_MEASURED
+    if all(outcome is Outcome.HOLDS for outcome in measured):
+        return Outcome.HOLDS
+    return Outcome.FAILS if all(outcome is Outcome.FAILS for outcome in measured) else Outcome.IN_PART
+
+
+def judged(holds: bool, in_part: bool) -> Outcome:
+    """Return the outcome of one case."""
+    if holds:
+        return Outcome.HOLDS
+    return Outcome.IN_PART if in_part else Outcome.FAILS
+
+
+def with_error(value: float, error: float) -> str:
+    """Return "0.1327 ± 0.0012"."""
+    return f"{value:.4f} ± {error:.4f}"

@@ -1,0 +1,259 @@
+"""The tables of a study's page: cells in words and numbers, verdicts on claims, baselines, gains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV, label_of
+from faintspot.experiments.claims import BEST_MODE, fixed_mode
+from faintspot.experiments.curves import Gain, gain_at_error
+from faintspot.experiments.judges import LEVEL_PX
+from faintspot.experiments.specification import CORRECTED
+from faintspot.experiments.study_curves import (
+    Configuration,
+    Finding,
+    Outcome,
+    Verdict,
+    against_tv,
+    study_curves,
+)
+from faintspot.experiments.sweep import PARAMETERS
+from faintspot.report.figure_data import csv_text
+from faintspot.report.page import Badge, Cell, Section, Table
+
+if TYPE_CHECKING:
+    import xarray
+
+
+_STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction", "photon_efficiency")
+
+
+def mode_in_words(mode: str) -> str:
+    """Return "best k", "fixed k = 40", or "best gain-corrected rms"."""
+    if mode == CORRECTED:
+        return "best gain-corrected rms"
+    return "best k" if mode == BEST_MODE else f"fixed k = {mode.removeprefix('fixed')}"
+
+
+def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the physical parameters of cells."""
+    columns = {name: dataset[name].values for name in PARAMETERS}
+    return [{name: column[cell].item() for name, column in columns.items()} for cell in cells]
+
+
+def parameter_in_words(name: str, value: Any) -> str:
+    """Return a cell's parameter with its unit."""
+    words = {
+        "flux_e": "{:g} e- signal",
+        "read_noise_e": "{:g} e- read noise",
+        "profile": "{} spots",
+        "size": "size {:g}",
+        "elongation": "elongated {:g} times",
+        "pixels": "{0:g} × {0:g} px",
+        "position_range_px": "positions within ±{:g} px",
+        "background_e": "background {:g} e-/px",
+        "em_gain": "EM gain {:g}",
+        "d_over_r0": "d/r0 {:g}",
+    }
+    without = {
+        ("elongation", 1.0): "round",
+        ("background_e", 0.0): "no background",
+        ("em_gain", 1.0): "no EM gain",
+        ("d_over_r0", 0.0): "no turbulence",
+    }
+    return without.get((name, value)) or words[name].format(value)
+
+
+def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
+    """Return a table of all arms and modes of cells."""
+    header = [
+        *PARAMETERS,
+        "mode",
+        "arm",
+        "R_px",
+        "R_se_px",
+        "chosen_k",
+        "chosen_candidate",
+        "invalid_fraction",
+        *_STATISTICS,
+    ]
+    names = ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)
+    arrays = [dataset[name].transpose("cell", "mode", "arm").values for name in names]
+    rows = []
+    for cell, parameters in zip(cells, parameters_of(dataset, cells), strict=True):
+        for m, mode in enumerate(dataset["mode"].values):
+            for a, arm in enumerate(dataset["arm"].values):
+                values = [float(array[cell, m, a]) for array in arrays]
+                if np.isfinite(values[0]):
+                    rows.append([*parameters.values(), str(mode), str(arm), *(f"{v:.6g}" for v in values)])
+    return header, rows
+
+
+_MOST_CASES_SHOWN = 3  # in the verdict table; the page lists all of them below it
+_CASES = "cases"
+_COLOURS = {Outcome.HOLDS: "good", Outcome.IN_PART: "mixed", Outcome.FAILS: "bad"}
+
+
+def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
+    """Return the section of the verdicts; `fixed` names the mode of a fixed number of pixels."""
+    title = "Verdicts on the claims of Basden et al. 2015"
+    if not judged:
+        return Section("verdicts", title, missing=f"No verdicts: they need the arms “{NO_TV}” and “{TV}”.")
+    text = (
+        f"{_summary(judged, fixed)}. Decided by the rules stated under each claim, from the numbers of this "
+        "study. “Best k”: each arm keeps its own best number of brightest pixels. "
+        f"“{fixed}”: both arms keep the same. A verdict holds when it does so in every case of both modes."
+    )
+    rows = [
+        [
+            Cell(f"{item.number}. {item.claim}", small=item.rule),
+            Cell(badge=_badge(item.outcome)),
+            _cell_of_mode(item.best),
+            _cell_of_mode(item.fixed),
+        ]
+        for item in judged
+    ]
+    header = ["Claim", "Both together", "Best k", fixed.capitalize()]
+    return Section("verdicts", title, [text], tables=[Table(header, rows, prose=True)])
+
+
+def cases_section(judged: list[Verdict]) -> Section:
+    """Return the section of all cases that the verdicts rest on."""
+    title = "All cases behind the verdicts"
+    found = [
+        (item, finding.mode, case)
+        for item in judged
+        for finding in (item.best, item.fixed)
+        for case in finding.cases
+    ]
+    if not found:
+        return Section(_CASES, title, missing="There are none.")
+    data = [
+        [item.number, item.claim, mode, case.where, case.finding, case.outcome.value]
+        for item, mode, case in found
+    ]
+    table = Table(
+        ["Claim", "mode", "where", "finding", "outcome"],
+        [
+            [str(item.number), mode_in_words(mode), case.where, case.finding, case.outcome.value]
+            for item, mode, case in found
+        ],
+        prose=True,
+        csv=("verdicts.csv", csv_text(["number", "claim", "mode", "where", "finding", "outcome"], data)),
+        folded=f"{len(found)} cases",
+    )
+    return Section(_CASES, title, tables=[table])
+
+
+def baselines_section(dataset: xarray.Dataset) -> Section:
+    """Return the section that compares TV with every other arm."""
+    title = "TV and the other methods"
+    modes = [mode for mode in ("best", fixed_mode(dataset)) if mode in dataset["mode"].values]
+    rows = [
+        [
+            label_of(row.arm),
+            row.profile,
+            mode_in_words(mode),
+            str(row.cells),
+            str(row.smaller),
+            str(row.larger),
+            str(row.cells - row.smaller - row.larger),
+            str(row.smallest),
+            f"{row.mean_ratio:.3f}",
+        ]
+        for mode in modes
+        for row in against_tv(dataset, mode)
+    ]
+    if not rows:
+        why = "Nothing to compare: TV or all others are not in this study."
+        return Section("baselines", title, missing=why)
+    caption = (
+        "Cells in which a method’s R is smaller or larger than TV’s: paired differences, 5 % false alarms "
+        "for all cells together. “Smallest of all”: R below that of every other method, decided or not. Last "
+        "column: geometric mean over the cells, above 1 where TV is better."
+    )
+    header = ["Method", "spots", "mode", "cells", "smaller", "larger", "not decided", "smallest of all"]
+    return Section("baselines", title, tables=[Table([*header, "R / R of TV"], rows, caption)])
+
+
+def gains_section(dataset: xarray.Dataset) -> Section:
+    """Return the section of the flux gain, for every way to choose the number of pixels."""
+    title = "Flux gain of TV for every way to choose k"
+    modes = [str(mode) for mode in dataset["mode"].values]
+    rows = [
+        [
+            configuration.in_words(),
+            *("–" if (gain := gains.get(mode)) is None else gain.in_words() for mode in modes),
+        ]
+        for configuration, gains in gains_by_mode(dataset).items()
+    ]
+    if not rows:
+        why = "No configuration of this study has the error 0.15 px within its fluxes."
+        return Section("gains", title, missing=why)
+    caption = (
+        "By how many times less light TV reaches R = 0.15 px than no denoising, with its 95 % interval. "
+        "“Fixed”: both arms keep the same number of pixels. “–”: the error without denoising does not pass "
+        "that level within the study."
+    )
+    header = ["Configuration", *(mode_in_words(mode) for mode in modes)]
+    return Section("gains", title, tables=[Table(header, rows, caption)])
+
+
+def gains_by_mode(
+    dataset: xarray.Dataset, level_px: float = LEVEL_PX
+) -> dict[Configuration, dict[str, Gain | None]]:
+    """Return the flux gain of TV over no denoising at one R, by configuration and mode.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of a study.
+    level_px : float
+        R at which the flux that both arms need is compared, px.
+
+    Returns
+    -------
+    dict
+        Configurations that have a gain in at least one mode; None where a mode has none, as when the error
+        without denoising does not come down to that level.
+    """
+    rng = np.random.default_rng(0)  # of the bootstrap: the same study gives the same page
+    table: dict[Configuration, dict[str, Gain | None]] = {}
+    for mode in dataset["mode"].values:
+        for configuration, curve in study_curves(dataset, str(mode)).items():
+            gain = gain_at_error(curve, level_px, rng, **TV_OVER_NO_TV) if curve.has(TV, NO_TV) else None
+            table.setdefault(configuration, {})[str(mode)] = gain
+    return {key: gains for key, gains in table.items() if any(gain is not None for gain in gains.values())}
+
+
+def _summary(judged: list[Verdict], fixed: str) -> str:
+    def counted(outcomes: list[Outcome]) -> str:
+        counts = [(outcome.value, outcomes.count(outcome)) for outcome in Outcome]
+        return ", ".join(f"{outcome} {n}" for outcome, n in counts if n)
+
+    best, other, both = (
+        counted([getattr(item, name).outcome if name else item.outcome for item in judged])
+        for name in ("best", "fixed", "")
+    )
+    return f"Of {len(judged)} claims: best k: {best}; {fixed}: {other}; both together: {both}"
+
+
+def _badge(outcome: Outcome) -> Badge:
+    return Badge(outcome.value, _COLOURS.get(outcome, "grey"))
+
+
+def _cell_of_mode(finding: Finding) -> Cell:
+    """Return a mode's outcome and its first cases, of different outcomes where there are any."""
+    shown = list({case.outcome: case for case in reversed(finding.cases)}.values())[::-1]
+    shown += [case for case in finding.cases if case not in shown]
+    shown = sorted(shown[:_MOST_CASES_SHOWN], key=list(finding.cases).index)
+    more = len(finding.cases) - len(shown)
+    return Cell(
+        finding.in_words(),
+        _badge(finding.outcome),
+        items=[(f"{case.finding} – {case.outcome.value}", case.where) for case in shown],
+        link=(_CASES, f"and {more} more") if more else None,
+    )

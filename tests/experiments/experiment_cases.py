@@ -1,0 +1,88 @@
+"""A small loop, for the tests of the experiments: a 1.8 m telescope with 4 x 4 sub-apertures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from faintspot.experiments.interleaved import ObservingPlan
+from faintspot.experiments.running import Workplace
+from faintspot.experiments.search import Search
+from faintspot.loop.configuration import LoopConfiguration
+
+SEARCH = Search(
+    coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, climbs=1, rounds=1
+)
+PLAN = ObservingPlan(
+    block_frames=60,
+    settle_in_block=20,
+    strengths=(2, 3),
+    em_fractions=(1.0, 0.75),
+    repeats=(2, 1),
+    kept=(0.25,),
+    gains=(0.3, 0.5),
+    tuning_frames=30,
+)
+HERE = Workplace(workers=0)
+
+
+def small() -> LoopConfiguration:
+    """One layer, 100 photons, 1 electron of read noise."""
+    changes: dict[str, dict[str, Any]] = {
+        "telescope": {"diameter_m": 1.8},
+        "sensor": {"subapertures": 4, "pixels": 8, "samples": 9},
+        "atmosphere": {
+            "outer_scale_m": 5.0,
+            "altitude_m": (0.0,),
+            "fraction": (1.0,),
+            "wind_speed_m_per_s": (8.0,),
+            "wind_direction_deg": (30.0,),
+        },
+        "camera": {"photons_per_subaperture": 100.0, "read_noise_e": 1.0},
+        "run": {"frames": 60, "settle_frames": 20, "realisations": 2},
+    }
+    configuration = LoopConfiguration(name="small")
+    for section, values in changes.items():
+        changed = replace(getattr(configuration, section), **values)
+        configuration = replace(configuration, **{section: changed})
+    return configuration
+
+
+class StopsAfter:
+    """A progress that interrupts after so many calls."""
+
+    def __init__(self, calls: int) -> None:
+        self._calls = calls
+
+    def __call__(self, finished: int, total: int) -> None:
+        self._calls -= 1
+        if self._calls < 0:
+            raise KeyboardInterrupt
+
+
+def assert_same_units(one: Path, other: Path) -> None:
+    """The stores of two folders hold the same results, bit for bit."""
+    zarr = pytest.importorskip("zarr")
+    names = sorted(path.name for path in (one / "units").glob("*.zarr"))
+    assert names
+    assert names == sorted(path.name for path in (other / "units").glob("*.zarr"))
+    for name in names:
+        first, second = (zarr.open_group(str(folder / "units" / name), mode="r") for folder in (one, other))
+        for key, array in first.arrays():
+            np.testing.assert_array_equal(array[:], second[key][:])
+
+
+def assert_same_files(one: Path, other: Path, pattern: str) -> None:
+    """The files of two folders hold the same arrays, bit for bit."""
+    names = sorted(path.name for path in one.glob(pattern))
+    assert names
+    assert names == sorted(path.name for path in other.glob(pattern))
+    for name in names:
+        with np.load(one / name) as first, np.load(other / name) as second:
+            assert first.files == second.files
+            for key in first.files:
+                np.testing.assert_array_equal(first[key], second[key])

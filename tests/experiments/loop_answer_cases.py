@@ -1,0 +1,51 @@
+"""Answers for closed loops that are made up, so that their statistics are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
+from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, arm_kind
+from faintspot.experiments.loop_question import LoopQuestion
+from faintspot.loop.configuration import LoopConfiguration, load_loop
+
+PHOTONS = (5.0, 14.0, 40.0, 100.0, 320.0)
+BRIGHT = 0.8
+SHIFTS = {"brightest": -2.0, "window": 0.0, "trained": 0.01, "map_predicted": 0.2, "window+kalman": 0.5}
+"""Magnitudes by which the curves are fainter than the baseline's."""
+MIDDLE = 13.0
+"""Magnitude at which the baseline has half of what it has with bright stars."""
+_VALUES = {LOOP_GAIN: 0.4, NOISE_SCALE: 0.6, "keep_brightest": 12, "window_fwhm_px": 3.0, "prior_std_px": 0.5}
+
+
+def configuration() -> LoopConfiguration:
+    """Near the diffraction limit, 100 photons."""
+    return load_loop("diffraction_limit")
+
+
+def strehl_of(magnitudes: Any, shift: float) -> Any:
+    """A curve that falls around MIDDLE + shift."""
+    return BRIGHT / (1 + np.exp(2.0 * (np.asarray(magnitudes) - MIDDLE - shift)))
+
+
+def made_up(
+    shifts: Mapping[str, float] = SHIFTS, realisations: int = 4, scatter: float = 1e-3, **asked: Any
+) -> LoopAnswer:
+    """Curves of one shape on air that is the same for all, with a scatter of their own."""
+    question = LoopQuestion(configuration(), arms=tuple(shifts), **asked)
+    rng = np.random.default_rng(5)
+    magnitudes = question.configuration.photometry.magnitude(PHOTONS)
+    air = rng.normal(0.0, 0.02, (len(PHOTONS), realisations))
+    results = []
+    for name, shift in shifts.items():
+        kind = arm_kind(name)
+        strehl = strehl_of(magnitudes, shift)[:, None] + air + rng.normal(0.0, scatter, air.shape)
+        tuned = kind.tuned(question.configuration)
+        choice = {option: _VALUES.get(option, each.first[0]) for option, each in tuned.items()}
+        ends = tuple(("window_fwhm_px",) if name == "window" else () for _ in PHOTONS)
+        gain = np.full(strehl.shape, 0.9)
+        results.append(LoopArmResult(kind, (choice,) * len(PHOTONS), np.maximum(strehl, 0.0), gain, ends))
+    return LoopAnswer(question, tuple(results), np.array(PHOTONS), 300, {"map+kalman": "no time"})

@@ -1,0 +1,182 @@
+"""What the arms do to the images, against the public functions and SciPy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, median_filter
+
+import faintspot as fs
+from faintspot.errors import InputError
+from faintspot.estimators import Estimator, Need, Scene, Sensor, option, registry
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.total_variation import TotalVariation
+from faintspot.experiments import StudySpecification, Sweep
+from faintspot.experiments.arms import (
+    keeps_every_k,
+    kind_of,
+    knows_the_spot,
+    label_of,
+    median_of_nine,
+    style_of,
+)
+from faintspot.experiments.cell import realisations
+from faintspot.experiments.cell_arms import CellArms, error_table, position_table
+
+
+@pytest.fixture(scope="module")
+def simulated() -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    detector = fs.simulate.Detector(read_noise_e=1.0)
+    return fs.simulate.subapertures(
+        60, shape=(10, 10), flux_e=100.0, detector=detector, rng=np.random.default_rng(3)
+    )
+
+
+def errors(positions: NDArray[np.floating], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.abs(positions - truth).mean(axis=1)  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("arm", "options", "rule"),
+    [
+        ("brightest", {}, "subtract_next"),
+        ("threshold", {}, "threshold"),
+        ("tv", {"noise_std": 1.4}, "subtract_next"),
+        ("smoothed", {"smoothing_px": 0.8}, "subtract_next"),
+        ("median", {}, "subtract_next"),
+    ],
+)
+def test_arms_are_what_they_say(
+    simulated: tuple[NDArray[np.float32], NDArray[np.float64]], arm: str, options: dict[str, float], rule: str
+) -> None:
+    images, truth = simulated
+    prepared = {
+        "tv": lambda: fs.tv_denoise(images, 1.4),
+        "smoothed": lambda: np.stack([gaussian_filter(i, 0.8, mode="constant") for i in images]),
+        "median": lambda: np.stack([median_filter(i, 3, mode="nearest") for i in images]),
+    }.get(arm, lambda: images)()
+    table, valid = error_table(kind_of(arm)(**options), images, truth)  # type: ignore[arg-type]
+    assert table.shape == valid.shape == (60, 99)
+    assert valid[:, 6:].all()  # the largest medians often tie, so that few kept pixels may leave nothing
+    for k in (1, 7, 30, 99):
+        kept = fs.brightest_pixels(prepared.astype(np.float64), keep=k, rule=rule)
+        expected = errors(fs.centre_of_gravity(kept), truth)
+        found = valid[:, k - 1]
+        np.testing.assert_allclose(table[found, k - 1], expected[found], rtol=0, atol=1e-5)  # of float32
+
+
+def test_without_light_the_position_is_the_centre() -> None:
+    truth = np.array([[0.5, -0.25]])
+    flat = np.full((1, 10, 10), 0.1, np.float32)
+    table, valid = error_table(TotalVariation(noise_std=1.4), flat, truth)
+    assert not valid.any()
+    np.testing.assert_allclose(table, 0.375, rtol=1e-6)
+    specification = StudySpecification("s", [Sweep("a", pixels=10)], arms=["thresholded"])
+    arms = CellArms(specification.cells()[0], specification)
+    slopes = arms.measure("thresholded", (("threshold_e", 5.0),), flat)
+    assert not slopes.valid.any()
+    assert slopes.x[0] == slopes.y[0] == 0.0
+
+
+@pytest.mark.parametrize("search_range_px", [math.inf, 0.3])
+def test_errors_are_those_of_the_positions(
+    simulated: tuple[NDArray[np.float32], NDArray[np.float64]], search_range_px: float
+) -> None:
+    images, truth = simulated
+    brightest = BrightestPixels()
+    positions, valid = position_table(brightest, images, search_range_px)
+    table, also_valid = error_table(brightest, images, truth, search_range_px)
+    assert np.abs(positions).max() <= search_range_px
+    found = np.abs(positions - truth[:, None]).mean(axis=2).astype(np.float32)
+    np.testing.assert_array_equal(found, table)
+    np.testing.assert_array_equal(valid, also_valid)
+
+
+def test_median_is_exact() -> None:
+    images = np.random.default_rng(5).normal(size=(20, 6, 9)).astype(np.float32)
+    expected = median_filter(images, size=(1, 3, 3), mode="nearest")
+    np.testing.assert_array_equal(median_of_nine(images), expected)
+
+
+def test_names() -> None:
+    for name in ("tvs", 3):
+        with pytest.raises(InputError, match="expected one of 'brightest', 'tv'"):
+            kind_of(name)  # type: ignore[arg-type]
+    assert label_of("median") == "3 × 3 median filter"
+    assert label_of("of another installation") == "of another installation"
+    assert style_of("of another installation") == Estimator.style
+    assert [arm for arm in ("brightest", "median", "weighted", "ml", "nobody's") if knows_the_spot(arm)] == [
+        "weighted",
+        "ml",
+    ]
+    assert keeps_every_k(kind_of("median"))
+    assert not keeps_every_k(kind_of("thresholded"))
+
+
+def test_candidates_in_a_cell() -> None:
+    specification = StudySpecification(
+        "x",
+        [Sweep("a", pixels=16, d_over_r0=[0, 2])],
+        arms=["brightest", "tv", "ml", "matched", "trained", "weighted"],
+        strengths=[0.5, 1.0],
+        blurs=[0.0, 1.0],
+        model_errors=[0.2],
+    )
+    still, speckled = (CellArms(cell, specification) for cell in specification.cells())
+    assert still.candidates("brightest") == [()]
+    assert still.candidates("trained") == [()]
+    assert still.candidates("tv") == [(("noise_std", 0.5),), (("noise_std", 1.0),)]
+    assert still.estimator("tv", (("noise_std", 0.5),)).noise_std == 0.5 * still.cell.pixel_noise_e  # type: ignore[attr-defined]
+    assert still.candidates("ml") == [(("blur_px", 0.0), ("model_error", 0.0))]
+    assert speckled.candidates("matched") == [(("blur_px", 0.0),), (("blur_px", 1.0),)]
+    assert speckled.candidates("ml") == [(("blur_px", blur), ("model_error", 0.2)) for blur in (0.0, 1.0)]
+    assert len(still.candidates("weighted")) > 1
+
+
+def test_an_estimator_of_somebody_else(plugin: type[Estimator]) -> None:
+    """It tunes an option of its own, is told the spot's width, and is measured like any other."""
+    specification = StudySpecification(
+        "s", [Sweep("a", flux_e=1000, pixels=10)], realisations=200, arms=["own"], fixed_k=[]
+    )
+    cell = specification.cells()[0]
+    arms = CellArms(cell, specification)
+    assert arms.candidates("own") == [(("power", 1.0),), (("power", 2.0),)]
+    assert specification.search_range_of(cell) == 1.0
+    ((images, truth),) = realisations(cell, 50, np.random.default_rng(1))
+    slopes = arms.measure("own", (("power", 2.0),), images)
+    found = np.stack([slopes.x, slopes.y], axis=-1)
+    assert np.abs(found - truth).mean() < 0.3
+    measured = fs.experiments.measure_cell(cell, specification)
+    assert measured["chosen_candidate"][0, 0] in (1.0, 2.0)
+    assert measured["error"][0, 0] < 0.3
+
+
+@pytest.fixture
+def plugin(monkeypatch: pytest.MonkeyPatch) -> type[Estimator]:
+    """An estimator in plain NumPy: the centre of gravity of a power of the pixels."""
+
+    @dataclass(frozen=True, eq=False, kw_only=True)
+    class OwnEstimator(Estimator):
+        power: Any = option(1.0, "Of the pixels.", low=0.1, high=10.0, per_subaperture=False)
+
+        name: ClassVar[str] = "own"
+        label: ClassVar[str] = "somebody's own"
+        needs: ClassVar[frozenset[Need]] = frozenset({Need.WIDTH})
+
+        def tuned(self, scene: Scene) -> dict[str, list[float]]:
+            return {"power": [1.0, 2.0]}
+
+        def locate(self, images: Any, sensor: Sensor, prior: Any) -> Any:
+            assert np.isfinite(sensor.spot_fwhm_px).all()
+            light = np.maximum(images, 0.0) ** self.power
+            y, x = (np.arange(size) - (size - 1) / 2 for size in images.shape[1:])
+            total = light.sum(axis=(1, 2))
+            return np.stack([light.sum(axis=1) @ x / total, light.sum(axis=2) @ y / total], axis=1)
+
+    monkeypatch.setattr(registry, "_kinds", {**registry.estimators(), "own": OwnEstimator})
+    return OwnEstimator

@@ -1,0 +1,133 @@
+"""The built-in study of the estimators: its cells, its figures, its tables."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.experiments.study_cases import cells, dataset, power_law
+from tests.shared_data import shared_file
+
+from faintspot.experiments import built_in_studies as estimators
+from faintspot.experiments.efficiency import compares_estimators, enough_photons, findings, markdown
+from faintspot.experiments.estimator_figures import estimator_figures
+from faintspot.experiments.study_page import write_study_report
+from faintspot.experiments.sweep import Cell
+from faintspot.report import drawing
+
+ARMS = ("brightest", "tv", "ml", "map", "weighted")
+
+
+def error(cell: dict[str, Any], arm: str, mode: str) -> float:
+    return power_law(lambda c, a, m: 1.5 if a in ("ml", "map") else 1.0)(cell, arm, mode)
+
+
+def study(**options: Any) -> Any:
+    every = [
+        *cells(),
+        *cells(read_noise_e=3.0),
+        *cells(elongation=3.0),
+        *(row for d in (0.5, 1.0, 3.0) for row in cells(d_over_r0=d, fluxes=(50.0, 200.0))),
+    ]
+    return dataset(every, error, arms=ARMS, **options)
+
+
+def test_full_study_has_the_reference_cases() -> None:
+    text = json.loads(shared_file("reference/slope_error_cases.json").read_text())
+    wanted = set()
+    for case in text.get("cases", text).values():
+        given = case["params"]
+        profile = {"sinc2": "diffraction", "gauss": "gaussian"}[given["psf"]]
+        camera = (given["elong"], given["n"], given["rng_px"], 0.0, 1.0)
+        wanted.add(Cell(float(given["flux"]), given["rn"], profile, given["size"], *camera))
+    assert len(wanted) == 24
+    assert wanted <= set(estimators.estimators_study().cells())
+
+
+def test_cost_is_bounded() -> None:
+    full, quick = estimators.estimators_study().cells(), estimators.estimators_study(quick=True).cells()
+    assert len(full) <= 120
+    assert sum(cell.d_over_r0 > 0 for cell in full) <= 40
+    assert len(quick) <= 15
+    assert {cell.read_noise_e for cell in full} >= {0.1, 1, 3, 16}
+
+
+def test_figures() -> None:
+    made = {figure.name: figure for figure in estimator_figures(study())}
+    kinds = ("error", "efficiency", "gain")
+    spots = ("diffraction", "diffraction-elongation3")
+    assert set(made) == {f"{kind}-{spot}" for kind in kinds for spot in spots} | {"turbulence-diffraction"}
+    first = made["error-diffraction"].figure
+    assert [axes.get_title() for axes in first.axes] == ["0.1 e- read noise", "3 e- read noise"]
+    assert len(first.axes[0].containers) == len(ARMS)
+    turbulence = made["turbulence-diffraction"].figure
+    assert [axes.get_title() for axes in turbulence.axes] == [
+        "0.1 e- read noise, 50 e- signal",
+        "0.1 e- read noise, 200 e- signal",
+    ]
+    rings = [line for line in turbulence.axes[0].lines if line.get_markersize() == 15]
+    np.testing.assert_allclose(np.asarray(rings[0].get_xdata(), float), [0.5, 1, 3])
+    assert all(figure.caption and figure.rows for figure in made.values())
+
+
+def test_unfinished_studies_are_drawn_as_far_as_they_are() -> None:
+    assert list(estimator_figures(study(unfinished=range(21)))) == []
+    names = [figure.name for figure in estimator_figures(study(unfinished=range(3, 21)))]
+    assert names == ["error-diffraction", "efficiency-diffraction", "gain-diffraction"]
+
+
+def test_enough_photons() -> None:
+    given = [
+        (0.1, 30, True),
+        (0.1, 29, False),
+        (3, 120, True),
+        (16, 499, False),
+        (1, 80, True),
+        (1, 50, False),
+    ]
+    for noise, flux, expected in given:
+        assert enough_photons(noise, flux) is expected
+    assert enough_photons(0.0, 30)
+    assert enough_photons(30, 500)
+
+
+def test_findings_count_cells() -> None:
+    found = findings(study())
+    assert found[0].startswith("ml: photon efficiency of at least 0.95 in 0 of 10 cells")
+    assert "map has the smallest R of all arms" in " ".join(found)
+    assert "d/r0 up to 1, 4 cells" in " ".join(found)
+    assert "ml 4 (worst 0 %)" in " ".join(found)
+    assert findings(study(unfinished=range(21))) == []
+
+
+def test_tables() -> None:
+    text = markdown(study(), "faintspot study estimators --table x.md")
+    assert "`faintspot study estimators --table x.md`" in text
+    assert text.count("| 10 e-, diffraction spot of size 1, 0.1 e- read noise, 16 × 16 px, ±1 px |") == 2
+    assert "| 1.00 (1.10) |" in text
+    assert text.count("d/r0 3 |") == 2
+
+
+def test_other_studies_do_not_compare_estimators() -> None:
+    assert compares_estimators(study())
+    assert not compares_estimators(dataset(cells(), error))
+
+
+def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
+    monkeypatch.setattr(drawing, "svg", lambda figure: b"")  # another drawing, as slow
+    specification = estimators.estimators_study(quick=True)
+    quick = [asdict(cell) for cell in specification.cells()]
+    few = [row for row in quick if row["d_over_r0"] > 0 or row["read_noise_e"] == 3]
+    data = dataset(few, error, arms=ARMS)
+    data.attrs["specification"] = specification.to_text()
+    written = write_study_report(data, tmp_path / "study.html")
+    assert (tmp_path / "study-figures" / "turbulence-diffraction.csv") in written
+    html = written[0].read_text(encoding="utf-8")
+    assert "What was found" in html
+    assert 'id="verdicts"' not in html
+    assert html.count("<figcaption>") == 4

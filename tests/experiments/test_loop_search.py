@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.experiments.experiment_cases import SEARCH, small
+
+from faintspot.errors import InputError
+from faintspot.experiments import search as tuning
+from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
+from faintspot.experiments.search import FIRST_TUNING_REALISATION, Search, stored_choice, tune, tuning_unit
+
+BRIGHTEST = arm_kind("brightest")
+KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
+BEST = KEPT.values[2]
+GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
+
+
+class _Record:
+    def __init__(self, strehl: float) -> None:
+        self._strehl = strehl
+
+    def mean_strehl(self) -> float:
+        return self._strehl
+
+
+@pytest.fixture
+def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A loop whose Strehl ratio is highest at gain 0.6 and the best number of pixels; realisations used."""
+    used: list[int] = []
+
+    def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
+        used.append(realisation)
+        kept = arms[0].settings.keep_brightest
+        return _Record(1 - (arms[0].gain - 0.6) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    return used
+
+
+def test_finds_the_top(hill: list[int]) -> None:
+    told: list[int] = []
+    found = tune(BRIGHTEST, small(), Search(rounds=9), told.append)
+    assert found.choice == {LOOP_GAIN: 0.6, "keep_brightest": BEST}
+    assert found.strehl == pytest.approx(1)
+    assert min(hill) >= FIRST_TUNING_REALISATION
+    assert told == sorted(told)
+
+
+def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = dict(zip(GAINS.values, (0.0, 0.1, 0.45, 0.6, 0.49, 0.3, 0.4, 0.5, 0.4, 0.3), strict=True))
+
+    def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
+        kept = arms[0].settings.keep_brightest
+        return _Record(heights[arms[0].gain] - (kept != KEPT.first[0]))
+
+    monkeypatch.setattr(tuning, "simulate_loop", simulate)
+    assert tune(BRIGHTEST, small(), Search(climbs=1)).choice[LOOP_GAIN] == 0.7  # the best of the coarse ones
+    assert tune(BRIGHTEST, small(), Search()).choice[LOOP_GAIN] == 0.3
+
+
+def test_looks_at_no_choice_twice(hill: list[int]) -> None:
+    search = Search(rounds=9, realisations=1)
+    found = tune(BRIGHTEST, small(), search)
+    coarse = np.prod([len(each.first) for each in BRIGHTEST.tuned(small()).values()])
+    assert len(hill) <= found.tried + coarse  # each at most once coarsely and once finely
+
+
+def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
+    found = tune(BRIGHTEST, small(), tuning.QUICK)
+    nearest = min(KEPT.first, key=lambda kept: abs(np.log(kept / BEST)))
+    assert found.choice == {LOOP_GAIN: 0.7, "keep_brightest": nearest}
+    assert found.tried == 9
+
+
+def test_is_repeatable_and_stored() -> None:
+    centroid = arm_kind("centroid")
+    one, other = (tuning_unit(centroid, small(), SEARCH, None, lambda frames: None) for _ in range(2))
+    assert stored_choice(one) == stored_choice(other)
+    np.testing.assert_array_equal(one["strehl"], other["strehl"])
+    assert 0 < one["strehl"] < 1
+
+
+def test_search_is_checked() -> None:
+    with pytest.raises(InputError, match=r"search.frames"):
+        Search(frames=50, settle_frames=60)
+    with pytest.raises(InputError, match=r"search.rounds"):
+        Search(rounds=-1)
+
+
+def test_control_that_learns_takes_the_slopes_that_were_tuned(hill: list[int]) -> None:
+    kind = arm_kind("brightest+modal")
+    found = tune(kind, small(), Search(rounds=9), slopes={LOOP_GAIN: 0.9, "keep_brightest": BEST + 0.1})
+    highest = max(kind.tuned(small())[LOOP_GAIN].values)
+    assert found.choice == {LOOP_GAIN: highest, "keep_brightest": BEST}
+    assert found.tried == 1

@@ -1,0 +1,73 @@
+"""The paper's study: its cells and its report."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from tests.experiments.study_cases import dataset, power_law
+
+from faintspot.errors import InputError
+from faintspot.experiments import built_in_studies as paper
+from faintspot.experiments.study_page import write_study_report
+from faintspot.report import drawing
+
+
+def test_full_study_has_every_figure_of_the_paper() -> None:
+    specification = paper.paper_study()
+    names = {sweep.name.split()[0] for sweep in specification.sweeps}
+    assert names == {"fig2", "fig3", "fig4", "fig5", "fig6", "fig7"}
+    cells = specification.cells()
+    assert {cell.read_noise_e for cell in cells} == {0.1, 0.3, 0.5, 1, 3, 5, 10, 16}
+    assert {cell.pixels for cell in cells} == {8, 10, 12, 14, 16}
+    assert {cell.size for cell in cells} == {1, 1.5, 2}
+    assert {cell.profile for cell in cells} == {"diffraction", "gaussian"}
+    assert {cell.position_range_px for cell in cells} == {1, 4}
+    assert min(cell.flux_e for cell in cells) == 10
+    assert specification.realisations == 10_000
+
+
+def test_cost_is_bounded() -> None:
+    """In cells of 16 x 16 px, on which the time of a study depends."""
+    assert sum(cell.pixels**2 / 256 for cell in paper.paper_study().cells()) <= 350
+    assert len(paper.paper_study(quick=True).cells()) <= 40
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_figure_five_needs_cells_of_its_own_for_faint_spots_at_much_noise_only(quick: bool) -> None:
+    others = [name for name in paper.FIGURES if name != "fig5"]
+    with_it, without = paper.paper_study(quick), paper.paper_study(quick, others)
+    extra = set(with_it.cells()) - set(without.cells())
+    assert {(cell.flux_e, cell.read_noise_e) for cell in extra} == (set() if quick else {(50, 16)})
+
+
+@pytest.mark.parametrize("name", paper.FIGURES)
+@pytest.mark.parametrize("quick", [False, True])
+def test_one_figure(name: str, quick: bool) -> None:
+    sweeps = paper.paper_study(quick, [name]).sweeps
+    assert sweeps
+    assert all(sweep.name.startswith(name) for sweep in sweeps)
+
+
+@pytest.mark.parametrize(
+    ("figures", "message"),
+    [(["fig9"], "figure = 'fig9'"), (["fig1"], "needs no study"), ([], "at least one")],
+)
+def test_bad_figures_are_refused(figures: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        paper.paper_study(figures=figures)
+
+
+def test_report_writes_page_pictures_and_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
+    specification = paper.paper_study(quick=True, figures=["fig3"])
+    data = dataset([asdict(cell) for cell in specification.cells()], power_law(lambda *_: 1.0))
+    data.attrs["specification"] = specification.to_text()
+    written = write_study_report(data, tmp_path / "study.html")
+    names = [path.relative_to(tmp_path).as_posix() for path in written]
+    assert names[0] == "study.html"
+    assert {"study-figures/fig1.png", "study-figures/fig3.svg", "study-figures/fig3.csv"} <= set(names)
+    assert all(path.stat().st_size > 100 for path in written)
+    with pytest.raises(InputError, match="does not exist"):
+        write_study_report(data, tmp_path / "nowhere" / "study.html")

@@ -1,0 +1,140 @@
+"""The store of finished units: whole ones or none, and nobody else's."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from faintspot import InputError
+from faintspot.experiments.store import (
+    MemoryStore,
+    ZarrStore,
+    fingerprint_of,
+    kind_of_store,
+)
+
+pytest.importorskip("zarr")
+
+RESULT = {
+    "number": np.asarray(3.5),
+    "image": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "count": np.asarray(7),
+    "text": np.asarray('keep_brightest = "auto"'),
+    "names": np.array(["a", "bcd"]),
+    "flags": np.array([True, False]),
+}
+
+
+def assert_equal(found: Any, expected: dict[str, NDArray[Any]]) -> None:
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert found[name].shape == values.shape
+        assert found[name].dtype.kind == values.dtype.kind
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    for store in (MemoryStore(), ZarrStore(path, "study", "one", ["a", "b/c"])):
+        assert not store.done("b/c")
+        store.write("b/c", RESULT)
+        assert store.done("b/c")
+        assert not store.done("a")
+        assert_equal(store.read("b/c"), RESULT)
+    again = ZarrStore(path, "study", "one", ["a", "b/c"])
+    assert again.done("b/c")
+    assert_equal(again.read("b/c"), RESULT)
+
+
+def test_more_units_later(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    ZarrStore(path, "study", "one", ["a"]).write("a", RESULT)
+    store = ZarrStore(path, "study", "one", ["b", "a"])
+    assert store.done("a")
+    store.write("b", {**RESULT, "number": np.asarray(1.0)})
+    fewer = ZarrStore(path, "study", "one", ["b"])
+    assert fewer.read("b")["number"] == 1.0
+    assert_equal(fewer.read("a"), RESULT)
+
+
+def test_what_belongs_to_others_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    assert ZarrStore(path, "study", "one", ["a"], attributes={"name": "mine"}).is_empty
+    with pytest.raises(InputError, match=r"belongs to another study \('mine'"):
+        ZarrStore(path, "study", "other", ["a"])
+    with pytest.raises(InputError, match="not the store of a loop"):
+        ZarrStore(path, "loop", "one", ["a"], overwrite=True)
+    ZarrStore(path, "study", "other", ["a"], overwrite=True)
+    assert kind_of_store(path) == "study"
+    assert ZarrStore(path, "study", "other", ["a"]).is_empty
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(InputError, match="not the store of a study"):
+        ZarrStore(folder, "study", "one", ["a"], overwrite=True)
+    with pytest.raises(InputError, match="does not exist"):
+        ZarrStore(tmp_path / "no" / "s.zarr", "study", "one", ["a"])
+
+
+def test_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "s.zarr"
+    store = ZarrStore(path, "study", "one", ["a"])
+    store.write("a", RESULT)
+    for chunk in (path / "image" / "c").rglob("*"):
+        if chunk.is_file():
+            chunk.write_bytes(b"rubbish")
+    with pytest.raises(InputError, match="damaged") as raised:
+        ZarrStore(path, "study", "one", ["a"]).read("a")
+    assert "\n" not in str(raised.value)
+    metadata = json.loads((path / "done" / "zarr.json").read_text())
+    metadata["shape"] = "many"
+    (path / "done" / "zarr.json").write_text(json.dumps(metadata))
+    with pytest.raises(InputError, match="damaged"):
+        ZarrStore(path, "study", "one", ["a"])
+
+
+def test_killed_while_it_writes(tmp_path: Path) -> None:
+    """Whatever is done is whole after SIGKILL; remains are removed."""
+    program = """
+        import sys, numpy as np
+        from faintspot.experiments.store import ZarrStore
+        store = ZarrStore(sys.argv[1], "study", "one", [str(i) for i in range(10_000)])
+        print("ready", flush=True)
+        for i in range(10_000):
+            store.write(str(i), {"a": np.full(500, float(i)), "b": np.asarray(str(i))})
+            print(i, flush=True)
+    """
+    path = tmp_path / "s.zarr"
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(program), str(path)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    while process.stdout.readline() != "5\n":
+        assert process.poll() is None
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    (path / "a" / "c" / "0" / "0.abc.partial").parent.mkdir(parents=True, exist_ok=True)
+    (path / "a" / "c" / "0" / "0.abc.partial").write_bytes(b"half")
+    store = ZarrStore(path, "study", "one", [str(i) for i in range(10_000)])
+    assert not list(path.rglob("*.partial"))
+    done = [i for i in range(10_000) if store.done(str(i))]
+    assert len(done) >= 6
+    for i in done:
+        found = store.read(str(i))
+        np.testing.assert_array_equal(found["a"], float(i))
+        assert str(found["b"]) == str(i)
+
+
+def test_fingerprints_tell_experiments_apart() -> None:
+    assert fingerprint_of("a", "b") == fingerprint_of("a", "b")
+    assert fingerprint_of("a", "b") != fingerprint_of("a", "c")
