@@ -66,12 +66,12 @@ def positions(
 ) -> fs.Slopes:
     """Measure spots; `learnt` holds PSF and background, the latter times `share`."""
     if learnt is None:
-        return fs.estimators.measure(images, settings)
+        return fs.measure_images(images, settings)
     psf, background = learnt
     index = np.tile(np.arange(len(psf.samples)), len(images) // len(psf.samples))
     level = float(np.mean(background)) * share
     calibration = fs.Calibration(dark=level, read_noise_e=read_noise, background_e=max(level, 0.0))
-    return fs.estimators.measure(
+    return fs.measure_images(
         images, settings, calibration=calibration, psf=fs.PSF(psf.samples, psf.oversampling, index)
     )
 

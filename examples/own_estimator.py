@@ -37,5 +37,5 @@ if __name__ == "__main__":
     images, truth = fs.simulate.subapertures(
         2000, flux_e=1000, detector=fs.simulate.Detector(read_noise_e=1.0)
     )
-    found = fs.estimators.measure(images, fs.Settings("power", power=2.0))
+    found = fs.measure_images(images, fs.Settings("power", power=2.0))
     print(f"R = {np.abs(np.column_stack([found.x, found.y]) - truth).mean():.3f} px")

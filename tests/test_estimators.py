@@ -17,7 +17,8 @@ from tests.naive_spots import spots_of
 
 import faintspot as fs
 from faintspot.estimate.bounds import cramer_rao
-from faintspot.estimators import estimators, measure
+from faintspot.estimators import estimators
+from faintspot.estimators.images import measure_images
 from faintspot.kernels.groups import new_scratch
 from faintspot.sensor.psf import PSF
 
@@ -151,7 +152,7 @@ class TestIndependence:
     def test_measure_is_the_pipeline(self, estimator: str) -> None:
         case = random_case(9, estimator, n=5)
         parts: dict[str, Any] = {"psf": case.psf, "score": case.score, "prior": case.prior}
-        slopes = measure(case.images, case.settings, calibration=case.calibration, **parts)
+        slopes = measure_images(case.images, case.settings, calibration=case.calibration, **parts)
         assert_same(slopes, case.measure())
 
     @pytest.mark.parametrize("estimator", ["map", "trained"])
@@ -234,7 +235,7 @@ class TestPhysics:
         psf = one_psf()
         images, places = self.simulated(flux, noise, psf)
         chosen = settings_of(estimator, spot_fwhm_px=1.8, flux_e=flux, prior_std_px=10.0)
-        slopes = measure(images, chosen, calibration=fs.Calibration(dark=0.0, read_noise_e=noise), psf=psf)
+        slopes = measure_images(images, chosen, calibration=fs.Calibration(dark=0.0, read_noise_e=noise), psf=psf)
         assert slopes.valid.all()
         ratio_x = (slopes.x - places[:, 0]) / slopes.standard_error_x
         ratio_y = (slopes.y - places[:, 1]) / slopes.standard_error_y
@@ -263,7 +264,7 @@ class TestPhysics:
                 search_range_px=3.0,
             )
             calibration = fs.Calibration(dark=off_e, read_noise_e=noise)
-            return measure(images, chosen, calibration=calibration, psf=psf)
+            return measure_images(images, chosen, calibration=calibration, psf=psf)
 
         def rms(slopes: fs.Slopes) -> float:
             return float(np.sqrt(np.mean((np.stack([slopes.x, slopes.y], axis=1) - places) ** 2)))
@@ -285,7 +286,7 @@ class TestPhysics:
         places = rng.uniform(-1, 1, (self.N, 2))
         images = fs.simulate.Detector(1.0).expose(psf.images(places, (8, 8), 2000.0).clip(0), rng)
         chosen = fs.Settings("ml", local_background="on", weight_floor=0.0)
-        slopes = measure(images, chosen, calibration=fs.Calibration(dark=5.0, read_noise_e=1.0), psf=psf)
+        slopes = measure_images(images, chosen, calibration=fs.Calibration(dark=5.0, read_noise_e=1.0), psf=psf)
         rms = np.sqrt(np.mean((np.stack([slopes.x, slopes.y], axis=1) - places) ** 2))
         bound = cramer_rao(
             2000.0 * psf.images(np.zeros((1, 2)), (8, 8)).sum(),
@@ -303,7 +304,7 @@ class TestPhysics:
         psf, flux, noise = one_psf(), 300.0, 0.5
         images, places = self.simulated(flux, noise, psf)
         calibration = fs.Calibration(dark=0.0, read_noise_e=noise)
-        slopes = measure(images, fs.Settings(estimator="ml"), calibration=calibration, psf=psf)
+        slopes = measure_images(images, fs.Settings(estimator="ml"), calibration=calibration, psf=psf)
         spot = spots_of(psf)[0]
         task = oracle.Task(spot, variance=noise**2)
         bound = np.mean([oracle.cramer_rao_bound(x, y, flux, (12, 14), task) for x, y in places[:50]])

@@ -23,7 +23,8 @@ from tests.estimator_cases import (
 )
 
 import faintspot as fs
-from faintspot.estimators import estimators, measure
+from faintspot.estimators import estimators
+from faintspot.estimators.images import measure_images
 from faintspot.kernels import groups
 from faintspot.sensor.psf import PSF
 from faintspot.sensor.score import TrainedScore
@@ -302,12 +303,12 @@ class TestRefused:
     )
     def test_what_an_estimator_lacks(self, estimator: str, words: tuple[str, ...]) -> None:
         with refused(words[0], *words[1:]):
-            measure(self.IMAGES, fs.Settings(estimator=estimator), calibration=self.NOISE)
+            measure_images(self.IMAGES, fs.Settings(estimator=estimator), calibration=self.NOISE)
 
     @pytest.mark.parametrize("estimator", ["ml", "map"])
     def test_read_noise_must_be_known(self, estimator: str) -> None:
         with refused("calibration.read_noise_e", estimator):
-            measure(self.IMAGES, fs.Settings(estimator=estimator), psf=one_psf())
+            measure_images(self.IMAGES, fs.Settings(estimator=estimator), psf=one_psf())
 
     @pytest.mark.parametrize("name", ["read_noise_e", "background_e"])
     @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, "low", [1.0, 2.0]])
@@ -319,15 +320,15 @@ class TestRefused:
         ml = fs.Settings(estimator="ml")
         psf = PSF(one_psf().samples, 8, [0, 0])
         with refused("psf.index", "3 numbers", "got 2"):
-            measure(self.IMAGES, ml, calibration=self.NOISE, psf=psf)
+            measure_images(self.IMAGES, ml, calibration=self.NOISE, psf=psf)
         score = random_score(np.random.default_rng(1), 2)
         with refused("score.index", "3 numbers", "got 2"):
-            measure(self.IMAGES, fs.Settings(estimator="trained"), calibration=self.NOISE, score=score)
+            measure_images(self.IMAGES, fs.Settings(estimator="trained"), calibration=self.NOISE, score=score)
         with refused("flux_e", "3 values", "got 2"):
             chosen = fs.Settings(estimator="ml", flux_e=[1.0, 2.0])
-            measure(self.IMAGES, chosen, calibration=self.NOISE, psf=one_psf())
+            measure_images(self.IMAGES, chosen, calibration=self.NOISE, psf=one_psf())
         with refused("keep_brightest = 65"):
-            measure(self.IMAGES, fs.Settings(estimator="smoothed", keep_brightest=65))
+            measure_images(self.IMAGES, fs.Settings(estimator="smoothed", keep_brightest=65))
 
     @EVERY
     @pytest.mark.parametrize("number", [np.nan, np.inf, -1e39, 1e39, 1e6])
@@ -340,7 +341,7 @@ class TestRefused:
         chosen = fs.Settings(estimator="map", flux_e=10.0)
 
         def run(images: Any, prior: Any = None) -> fs.Slopes:
-            return measure(images, chosen, calibration=self.NOISE, psf=one_psf(), prior=prior)
+            return measure_images(images, chosen, calibration=self.NOISE, psf=one_psf(), prior=prior)
 
         for images, words in (
             (np.ones((8, 8)), "(8, 8)"),

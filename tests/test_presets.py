@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from faintspot import Settings
-from faintspot.estimators import measure
+from faintspot.estimators.images import measure_images
 from faintspot.experiments import Cell
 from faintspot.experiments.cell import realisations
 from faintspot.experiments.statistics import slope_error
@@ -27,8 +27,8 @@ def excess(cell: Cell, keep: int, strength: float, **settings: Any) -> float:
     blocks = list(realisations(cell, 8000, np.random.default_rng(7)))
     images, truth = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     usual: dict[str, Any] = {"noise_std": strength * cell.pixel_noise_e, "keep_brightest": keep}
-    converged = measure(images, Settings(**usual, **CONVERGED))
-    slopes = measure(images, Settings(**usual, **settings))
+    converged = measure_images(images, Settings(**usual, **CONVERGED))
+    slopes = measure_images(images, Settings(**usual, **settings))
     ours, theirs = (slope_error(each.x, each.y, truth).value for each in (slopes, converged))
     return ours / theirs - 1
 

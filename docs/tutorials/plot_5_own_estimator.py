@@ -62,7 +62,7 @@ for settings in (
     fs.Settings("brightest", keep_brightest=20),
     *(fs.Settings("power", power=power) for power in (1.5, 2.0, 3.0)),
 ):
-    found = fs.estimators.measure(images, settings)
+    found = fs.measure_images(images, settings)
     name = f"{settings.estimator.label} {getattr(settings.estimator, 'power', '')}".strip()
     errors_px[name] = np.abs(np.column_stack([found.x, found.y]) - truth).mean()
     print(f"{name}: R = {errors_px[name]:.3f} px")

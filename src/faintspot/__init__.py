@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from faintspot.estimate.total_variation import Denoised as Denoised
     from faintspot.estimate.total_variation import tv_denoise as tv_denoise
     from faintspot.experiments import tune as tune
+    from faintspot.estimators.images import measure_images as measure_images
     from faintspot.flags import SubapertureFlag as SubapertureFlag
     from faintspot.light import MeanLight as MeanLight
     from faintspot.pipeline import SlopePipeline as SlopePipeline
@@ -64,6 +65,7 @@ _HOMES = {
     "experiments": "faintspot.experiments",
     "fit_wavefront": "faintspot.wavefront",
     "learn_psf": "faintspot.training",
+    "measure_images": "faintspot.estimators.images",
     "measure_detector": "faintspot.sensor.photon_transfer",
     "photon_efficiency": "faintspot.estimate.bounds",
     "simulate": "faintspot.simulate",

@@ -76,7 +76,7 @@ def test_without_a_prior_map_is_ml(local_background: str) -> None:
     images = 4e5 * spots / spots.sum(axis=(1, 2), keepdims=True)
     psf, camera = fs.PSF.analytic("gaussian", size=5.9, radius_px=20), fs.Calibration(read_noise_e=5.0)
     ml, with_prior = (
-        fs.estimators.measure(
+        fs.measure_images(
             images, Settings(name, local_background=local_background), calibration=camera, psf=psf
         )
         for name in ("ml", "map")

@@ -102,7 +102,7 @@ class TestRegister:
         assert list(estimators())[-1] == "middle"
         settings = fs.Settings("middle", search_range_px=2.0)
         assert isinstance(settings.estimator, kind)
-        slopes = fs.estimators.measure(np.ones((3, 8, 8)), settings)
+        slopes = fs.measure_images(np.ones((3, 8, 8)), settings)
         assert np.array_equal(slopes.vector, np.zeros(6))
 
     def test_twice_the_same(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.estimators import measure
+from faintspot.estimators.images import measure_images
 from faintspot.estimators.window import Window
 from faintspot.sensor.score import load_score
 from faintspot.simulate.spots import spots
@@ -28,7 +28,7 @@ def errors(settings: fs.Settings, seed: int = 5, **parts: Any) -> tuple[float, f
     """Rms error at the best linear scale, so that shrinking wins nothing, and the gain."""
     clean, truth = spots_of_a_loop(20_000, seed)
     noisy = fs.simulate.Detector(NOISE_E).expose(FLUX_E * clean, np.random.default_rng(seed + 1))
-    found = measure(noisy, settings, calibration=fs.Calibration(read_noise_e=NOISE_E), **parts)
+    found = measure_images(noisy, settings, calibration=fs.Calibration(read_noise_e=NOISE_E), **parts)
     slopes = np.stack([found.x, found.y], axis=1)
     assert found.valid.all()
     gain = float((slopes * truth).sum() / (truth**2).sum())
@@ -57,7 +57,7 @@ def test_the_best_linear_weights_beat_every_gaussian_window(learnt: fs.FixedWeig
 def test_weights_equal_a_sum_over_the_pixels(learnt: fs.FixedWeights) -> None:
     clean, _ = spots_of_a_loop(50, 9)
     images = (FLUX_E * clean).astype(np.float32)
-    found = measure(images, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt)
+    found = measure_images(images, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt)
     expected = np.einsum("yx,nyx->n", learnt.x[0], images / FLUX_E - learnt.mean_spot[0])
     np.testing.assert_allclose(found.x, expected, atol=1e-5)  # float32 sums of 144 pixels
 
@@ -66,7 +66,7 @@ def test_stated_errors_are_those_of_the_slopes(learnt: fs.FixedWeights) -> None:
     """Of a spot at the mean position, for which they are meant."""
     clean = np.repeat(spots(np.zeros((1, 2)), shape=(SIDE, SIDE), profile="gaussian", size=1.0), 20_000, 0)
     noisy = fs.simulate.Detector(NOISE_E).expose(FLUX_E * clean, np.random.default_rng(2))
-    found = measure(noisy, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt)
+    found = measure_images(noisy, window(2.0), calibration=fs.Calibration(read_noise_e=NOISE_E), score=learnt)
     # 20,000 slopes: 0.5 %; the mean spot of the training is wider than one spot.
     assert found.x.std() == pytest.approx(float(found.standard_error_x[0]), rel=0.03)
 
@@ -89,7 +89,7 @@ def test_mean_light_needs_the_light() -> None:
 def test_spots_without_light_are_flagged() -> None:
     settings = window(2.0).replace(flux_e=np.array([60.0, 1e-6]))
     clean, _ = spots_of_a_loop(2, 3)
-    found = measure(FLUX_E * clean, settings, calibration=fs.Calibration(read_noise_e=1.0))
+    found = measure_images(FLUX_E * clean, settings, calibration=fs.Calibration(read_noise_e=1.0))
     assert found.valid.tolist() == [True, False]
 
 
@@ -126,7 +126,7 @@ def test_quad_cells() -> None:
     cell = np.array([[-1.0, 1.0], [-1.0, 1.0]])
     weights = fs.FixedWeights(0.5 * cell, 0.5 * cell.T, np.full((2, 2), 0.25))
     images = np.array([[[1.0, 3.0], [1.0, 3.0]], [[4.0, 4.0], [0.0, 0.0]]])
-    found = measure(
+    found = measure_images(
         images, fs.Settings("window"), calibration=fs.Calibration(read_noise_e=0.1), score=weights
     )
     np.testing.assert_allclose(found.vector, [0.25, 0.0, 0.0, -0.5], atol=1e-6)

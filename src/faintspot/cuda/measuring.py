@@ -150,7 +150,7 @@ class DevicePipeline:
         """Measure frames that are in the GPU's memory; the slopes stay there.
 
         Images of a stack (n, ny, nx), each with settings of its own, are sub-apertures of one tall frame
-        (n * ny, nx): see `faintspot.estimators.measure` for its layout.
+        (n * ny, nx): see `faintspot.measure_images` for its layout.
 
         Parameters
         ----------

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from faintspot.estimators.base import Need as Need
     from faintspot.estimators.base import Positions as Positions
     from faintspot.estimators.base import Style as Style
-    from faintspot.estimators.images import measure as measure
     from faintspot.estimators.registry import estimator_named as estimator_named
     from faintspot.estimators.registry import estimators as estimators
     from faintspot.estimators.registry import register as register
@@ -32,7 +31,6 @@ _HOMES = {
     "Style": "faintspot.estimators.base",
     "estimator_named": "faintspot.estimators.registry",
     "estimators": "faintspot.estimators.registry",
-    "measure": "faintspot.estimators.images",
     "option": "faintspot.options",
     "register": "faintspot.estimators.registry",
 }

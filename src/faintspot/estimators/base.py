@@ -97,7 +97,7 @@ class Estimator(Options):
     ...         return np.stack([x - (nx - 1) / 2, y - (ny - 1) / 2], axis=1)
     >>> image = np.zeros((1, 8, 8))
     >>> image[0, 2, 5] = 10.0
-    >>> slopes = fs.estimators.measure(image, BrightestPixel())
+    >>> slopes = fs.measure_images(image, BrightestPixel())
     >>> float(slopes.x[0]), float(slopes.y[0])
     (1.5, -1.5)
     """

@@ -16,7 +16,7 @@ from faintspot.settings import Settings
 from faintspot.slopes import Slopes
 
 
-def measure(
+def measure_images(
     images: ArrayLike,
     settings: Settings | Estimator,
     *,
@@ -55,7 +55,7 @@ def measure(
     >>> import numpy as np, faintspot as fs
     >>> images, truth = fs.simulate.subapertures(2000, flux_e=100.0, rng=np.random.default_rng(1))
     >>> for settings in (fs.Settings("brightest", keep_brightest=12), fs.Settings(noise_std=0.5)):
-    ...     slopes = fs.estimators.measure(images, settings)
+    ...     slopes = fs.measure_images(images, settings)
     ...     error = np.abs(np.stack([slopes.x, slopes.y], axis=1) - truth).mean()
     ...     print(f"{settings.estimator.name}: R = {error:.3f} px")
     brightest: R = 0.077 px

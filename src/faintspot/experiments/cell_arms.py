@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import estimators
+from faintspot.estimators.images import measure_images
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.scene import Scene
@@ -90,11 +90,11 @@ class CellArms:
         """Return the estimator with a candidate's options."""
         return self.kinds[arm](**{name: value * self._unit(name) for name, value in candidate})
 
-    def measure(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
+    def measure_images(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
         """Return the slopes of images (n, side, side) in photo-electrons."""
         output = images * np.float32(self.cell.em_gain)  # as the camera gives it
         made = self._arm(self.estimator(arm, candidate))
-        return estimators.measure(output, made.settings, calibration=self._calibration, **made.parts)
+        return measure_images(output, made.settings, calibration=self._calibration, **made.parts)
 
     def _arm(self, estimator: Estimator) -> Arm:
         """Tell an estimator what it has to know."""

@@ -105,7 +105,7 @@ def test_images_of_a_stack_each_with_its_own_settings() -> None:
     layout = fs.Layout((20, 5), (4, 5), corners)
     work = fs.SlopePipeline(layout, settings, device="cuda")
     measured = work.on_device.measure(cuda.to_device(images.reshape(20, 5)))  # type: ignore[union-attr]
-    expected = fs.estimators.measure(images, settings)
+    expected = fs.measure_images(images, settings)
     assert np.array_equal(measured.flags.copy_to_host()[0], expected.flags)
     assert np.allclose(measured.x.copy_to_host()[0], expected.x, atol=1e-5)
     assert np.allclose(measured.y.copy_to_host()[0], expected.y, atol=1e-5)
