@@ -17,15 +17,15 @@ from benchmarks.measuring import Row, Table
 from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gain
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
 from faintspot.advice.simulated import frames_of_record, seen_in_record
+from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop.calibration import flat_psf, reference_slopes
+from faintspot.ao_loop.camera import camera_calibration
+from faintspot.ao_loop.configuration import ARCSEC
+from faintspot.ao_loop.control import prior_std_px
+from faintspot.ao_loop.observatory import prepare
 from faintspot.experiments.statistics import paired_mean
-from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
-from faintspot.loop.calibration import flat_psf, reference_slopes
-from faintspot.loop.camera import camera_calibration
-from faintspot.loop.configuration import ARCSEC
-from faintspot.loop.control import prior_std_px
-from faintspot.loop.observatory import prepare
-from faintspot.pipeline import SlopePipeline
-from faintspot.settings import Settings
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 
 REALISATIONS, FRAMES, TURN, IMAGES_EVERY = 4, 1600, 100, 20
 PHOTONS = 100.0, 300.0

@@ -33,11 +33,11 @@ from numpy.typing import NDArray
 from benchmarks.live_page import client, page, read
 from benchmarks.measuring import Row, Table
 from benchmarks.realtime_processes import resident_bytes
+from faintspot.ao_loop import LoopConfiguration, load_loop
+from faintspot.ao_loop.camera import camera_calibration, make_detector
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import save_control
-from faintspot.errors import InputError
 from faintspot.live_page.demonstration import LiveDemonstration
-from faintspot.loop import LoopConfiguration, load_loop
-from faintspot.loop.camera import camera_calibration, make_detector
 from faintspot.realtime.camera import Readout, readout_type
 from faintspot.realtime.command_stream import CommandStream
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request

@@ -16,17 +16,17 @@ import numpy as np
 from scipy import sparse
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
+from faintspot.ao_loop import load_loop
+from faintspot.ao_loop.control import slope_turbulence
+from faintspot.ao_loop.observatory import prepare
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.kalman import SlopePredictor
 from faintspot.control.learning import Plant
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
-from faintspot.loop import load_loop
-from faintspot.loop.control import slope_turbulence
-from faintspot.loop.observatory import prepare
 
 _NOISE_PX = 0.5
 _SIZES = (72, 54), (160, 97), (640, 400)
@@ -46,10 +46,10 @@ def small_table() -> Table:
     errors = np.full(len(slopes), _NOISE_PX)
     model, clean = SlopeModel.of_covariances(covariances), optics.reconstructor.clean
 
-    def line() -> CommandLine:
-        return CommandLine(optics.mirror.commands, control.delay_frames)
+    def line() -> CommandDelayLine:
+        return CommandDelayLine(optics.mirror.commands, control.delay_frames)
 
-    def predictive(line: CommandLine, *, steady: bool) -> Controller:
+    def predictive(line: CommandDelayLine, *, steady: bool) -> Controller:
         predictor = SlopePredictor(model, errors**2, steady=steady)
         return Predictive(line, plant.interaction, predictor, clean)
 
@@ -97,7 +97,7 @@ def sizes_table() -> Table:
         alone = np.eye(slopes)[None]
         predictor = SlopePredictor(SlopeModel(1.5 * alone, -0.6 * alone, 0.1 * alone), np.ones(slopes))
         interaction = rng.standard_normal((slopes, commands)) / np.sqrt(slopes)
-        line = CommandLine(commands, 2, 1.0)
+        line = CommandDelayLine(commands, 2, 1.0)
         name = f"{slopes} slopes, {commands} commands"
         of_mirror = interaction, interaction.T
         filtered = CompiledKalman(line, *of_mirror, predictor, interaction.T, 0.3, 0.01)

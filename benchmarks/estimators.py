@@ -18,7 +18,7 @@ from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved
 from faintspot.estimators import estimator_named
 from faintspot.kernels.groups import Source, light_of_groups, new_scratch
 from faintspot.kernels.host import lanes_for
-from faintspot.preparation import packed_calibration
+from faintspot.pipeline.plan import packed_calibration
 
 ITERATIONS, KEEP, NOISE_STD, FLUX_E, READ_NOISE_E = 20, 12, 0.45, 200.0, 0.1
 SHAPES = ((6, 6), (32, 32))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import faintspot as fs
 from benchmarks import rivals
 from benchmarks.measuring import Row, Table, Times, absolute_spread
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 
 N, SENSORS = 4616, 6
 RATE_HZ, SECONDS = 1000.0, 5.0

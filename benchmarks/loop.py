@@ -1,6 +1,6 @@
 """The closed loop: frames per second, where the time goes, and how best to move the air over the pupil.
 
-HCIPy's own layers are timed against the screens of `faintspot.loop.atmosphere`. What the interpolation of
+HCIPy's own layers are timed against the screens of `faintspot.ao_loop.atmosphere`. What the interpolation of
 these does is measured with true slopes, so that nothing but the air differs: steps of whole points keep all
 small structures, but the air stands still for some frames and jumps in others; linear interpolation takes
 structures off, the more the farther from the points.
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 import faintspot as fs
 from benchmarks.measuring import Row, Table, absolute_spread, best, interleaved, pinned
-from faintspot.control.commands import CommandLine
+from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
+from faintspot.ao_loop.calibration import make_pipeline
+from faintspot.ao_loop.camera import make_detector
+from faintspot.ao_loop.observatory import LoopOptics, prepare
+from faintspot.ao_loop.telescope import pupil_grid, require_hcipy
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.integrator import Integrator
-from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
-from faintspot.loop.atmosphere import MovingLayers, make_atmosphere
-from faintspot.loop.calibration import make_pipeline
-from faintspot.loop.camera import make_detector
-from faintspot.loop.observatory import LoopOptics, prepare
-from faintspot.loop.telescope import pupil_grid, require_hcipy
 
 TARGET_FRAMES_PER_S = 80.0
 FRAMES = 400
@@ -78,7 +78,7 @@ def hcipy_layers(configuration: LoopConfiguration, kind: str) -> Any:
 def strehl_with_true_slopes(optics: LoopOptics, air: MovingLayers, configuration: LoopConfiguration) -> float:
     """Return the mean Strehl ratio of a loop without noise, whose slopes are the mean gradients."""
     control = configuration.control
-    line = CommandLine(optics.mirror.commands, control.delay_frames)
+    line = CommandDelayLine(optics.mirror.commands, control.delay_frames)
     integrator = Integrator(line, optics.interaction, optics.reconstructor, 0.5, control.leak)
     errors = np.ones(len(optics.interaction))
     strehl = np.zeros(FRAMES)

@@ -27,16 +27,16 @@ import numpy as np
 
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot import Calibration, Layout, Settings, SlopePipeline
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop.control import slope_turbulence
+from faintspot.ao_loop.engine_files import write_engine_files
+from faintspot.ao_loop.observatory import prepare
 from faintspot.control.compiled import integrate
 from faintspot.control.configuration import Control, ControlOptions, load_control
 from faintspot.control.learnt import CONTROLS, KALMAN, POLC, Model
 from faintspot.control.models import SlopeModel
 from faintspot.kernels.compiling import Direct
-from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
-from faintspot.loop.control import slope_turbulence
-from faintspot.loop.engine_files import write_engine_files
-from faintspot.loop.observatory import prepare
+from faintspot.pipeline import configuration as configuration_file
 from faintspot.realtime.control import request
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.pixel_ring import PixelRing

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
 

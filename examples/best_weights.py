@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.estimators.images import measure_images
 from faintspot.estimators.window import Window
+from faintspot.pipeline.images import measure_images
 
 SIDE, READ_NOISE_E, FWHM_PX, BLOCKS = 16, 3.0, 1.772, 40
 SPOTS = {"near the diffraction limit": 1.14, "speckled": 2.92}
@@ -42,7 +42,9 @@ def slopes_of(images: Floats, flux_e: float, seed: int, options: dict[str, Any],
     """Return slopes (n, 2) of noisy images."""
     noisy = fs.simulate.Detector(READ_NOISE_E).expose(flux_e * images, np.random.default_rng(seed))
     settings = fs.Settings(Window(**options), spot_fwhm_px=FWHM_PX, flux_e=flux_e * images.sum((1, 2)).mean())
-    found = measure_images(noisy, settings, calibration=fs.Calibration(read_noise_e=READ_NOISE_E), score=weights)
+    found = measure_images(
+        noisy, settings, calibration=fs.Calibration(read_noise_e=READ_NOISE_E), score=weights
+    )
     return np.stack([found.x, found.y], axis=1).astype(np.float64)
 
 

@@ -32,14 +32,14 @@ from faintspot.advice.residual import wavefront_modes
 from faintspot.advice.seen import Seen
 from faintspot.advice.simulated import frames_of_record, seen_in_record
 from faintspot.advice.trial import compared
+from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop.calibration import flat_psf, reference_slopes
+from faintspot.ao_loop.camera import camera_calibration
+from faintspot.ao_loop.configuration import ARCSEC
+from faintspot.ao_loop.observatory import prepare
 from faintspot.control.learnt import Plant
 from faintspot.experiments.statistics import mean_by_blocks
-from faintspot.loop import Arm, LoopConfiguration, load_loop, simulate_loop
-from faintspot.loop.calibration import flat_psf, reference_slopes
-from faintspot.loop.camera import camera_calibration
-from faintspot.loop.configuration import ARCSEC
-from faintspot.loop.observatory import prepare
-from faintspot.settings import Settings
+from faintspot.pipeline.settings import Settings
 
 BRIGHTEST_E, FADES_BY = 1600.0, 3.0  # photo-electrons of a sub-aperture in a frame; magnitudes
 SEEING_ARCSEC = 0.6, 1.2

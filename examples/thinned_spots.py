@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.estimate.noise import suggested_strength
+from faintspot.algorithms.noise import suggested_strength
 from faintspot.experiments.statistics import absolute_errors
 from faintspot.io import open_frames
 

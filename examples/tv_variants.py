@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import faintspot as fs
-from faintspot.estimate.automatic import automatic_kept_pixels, automatic_strength
+from faintspot.algorithms.automatic import automatic_kept_pixels, automatic_strength
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.experiments.cell_arms import position_table
 from faintspot.experiments.statistics import slope_statistics

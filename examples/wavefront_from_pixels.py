@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import eigsh
 
+from faintspot.ao_loop import LoopConfiguration, load_loop
+from faintspot.ao_loop.control import learnt_control
+from faintspot.ao_loop.observatory import LoopOptics, TelescopeModel, prepare
+from faintspot.ao_loop.simulation import DisabledErrors, _Loop
 from faintspot.control.kalman import SlopePredictor
 from faintspot.experiments.loop_arms import arm_kind
-from faintspot.loop import LoopConfiguration, load_loop
-from faintspot.loop.control import learnt_control
-from faintspot.loop.observatory import LoopOptics, Observatory, prepare
-from faintspot.loop.simulation import Idealised, _Loop
 from faintspot.turbulence.slope_covariance import phase_covariance_rad2
 
 Floats = NDArray[np.float64]
@@ -189,7 +189,7 @@ def from_slopes(model: Model, noise_px: float) -> tuple[Floats, Floats]:
 
 def open_loop(configuration: LoopConfiguration) -> None:
     """Print the errors of one frame's estimates, without a prediction, and the bound."""
-    model, observatory = Model.of(configuration), Observatory(configuration, 77)
+    model, observatory = Model.of(configuration), TelescopeModel(configuration, 77)
     rng, inverse = np.random.default_rng(3), np.diag(1 / model.power)
     start, rough = from_slopes(model, 0.43)
     perfect, no_noise = from_slopes(model, 0.0)
@@ -266,7 +266,7 @@ def closed_loop(configuration: LoopConfiguration, realisations: int) -> None:
     found = []
     for realisation in range(realisations):
         which = np.zeros(configuration.run.frames, np.int64)
-        what = configuration, [(arm, learnt)], which, configuration.run.seed, realisation, Idealised()
+        what = configuration, [(arm, learnt)], which, configuration.run.seed, realisation, DisabledErrors()
         by_slopes, by_pixels = _Loop(*what), PixelLoop(*what)
         by_pixels.begin(model, learnt.model.predictor())
         found.append([each.run(None).truth[0, settle:].mean() for each in (by_slopes, by_pixels)])

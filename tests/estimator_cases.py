@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 
 NEED_PSF = ("matched", "ml", "map")
 FIELDS = ("x", "y", "flux", "flags", "iterations", "bad_pixels", "standard_error_x", "standard_error_y")

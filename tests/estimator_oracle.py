@@ -25,7 +25,7 @@ from tests.naive_spots import PHASES, Floats, Spot, spots_of
 
 import faintspot as fs
 from faintspot.estimators.spot_tables import posterior_grid
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 
 EPS = float(np.finfo(np.float32).eps)
 ROUNDING = 30.0

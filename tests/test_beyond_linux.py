@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from tests.cli.cli_cases import CONFIGURATION, Commands, assert_equal, expected, simulated
 
-from faintspot import InputError, extras
+from faintspot import InputError
+from faintspot.base import extras
 from faintspot.cli.realtime import command as realtime
 
 SCRIPT = Path(__file__).with_name("beyond_linux.py")

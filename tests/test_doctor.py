@@ -14,8 +14,8 @@ from tests.cli.cli_cases import Commands
 
 import faintspot
 from faintspot import doctor
+from faintspot.base.extras import EXTRAS
 from faintspot.doctor import Finding, examine, file_system
-from faintspot.extras import EXTRAS
 
 NAMES = [
     "faintspot",

@@ -16,11 +16,11 @@ from tests.estimator_oracle import assert_equals_oracle
 from tests.naive_spots import spots_of
 
 import faintspot as fs
-from faintspot.estimate.bounds import cramer_rao
 from faintspot.estimators import estimators
-from faintspot.estimators.images import measure_images
 from faintspot.kernels.groups import new_scratch
-from faintspot.sensor.psf import PSF
+from faintspot.pipeline.images import measure_images
+from faintspot.spots.bounds import cramer_rao
+from faintspot.spots.psf import PSF
 
 SEEDS = st.integers(0, 2**32 - 1)
 EVERY = pytest.mark.parametrize("estimator", list(estimators()))
@@ -235,7 +235,9 @@ class TestPhysics:
         psf = one_psf()
         images, places = self.simulated(flux, noise, psf)
         chosen = settings_of(estimator, spot_fwhm_px=1.8, flux_e=flux, prior_std_px=10.0)
-        slopes = measure_images(images, chosen, calibration=fs.Calibration(dark=0.0, read_noise_e=noise), psf=psf)
+        slopes = measure_images(
+            images, chosen, calibration=fs.Calibration(dark=0.0, read_noise_e=noise), psf=psf
+        )
         assert slopes.valid.all()
         ratio_x = (slopes.x - places[:, 0]) / slopes.standard_error_x
         ratio_y = (slopes.y - places[:, 1]) / slopes.standard_error_y
@@ -286,7 +288,9 @@ class TestPhysics:
         places = rng.uniform(-1, 1, (self.N, 2))
         images = fs.simulate.Detector(1.0).expose(psf.images(places, (8, 8), 2000.0).clip(0), rng)
         chosen = fs.Settings("ml", local_background="on", weight_floor=0.0)
-        slopes = measure_images(images, chosen, calibration=fs.Calibration(dark=5.0, read_noise_e=1.0), psf=psf)
+        slopes = measure_images(
+            images, chosen, calibration=fs.Calibration(dark=5.0, read_noise_e=1.0), psf=psf
+        )
         rms = np.sqrt(np.mean((np.stack([slopes.x, slopes.y], axis=1) - places) ** 2))
         bound = cramer_rao(
             2000.0 * psf.images(np.zeros((1, 2)), (8, 8)).sum(),

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.estimate.image_cases import refused
+from tests.algorithms.image_cases import refused
 from tests.estimator_cases import (
     Case,
     assert_same,
@@ -24,10 +24,10 @@ from tests.estimator_cases import (
 
 import faintspot as fs
 from faintspot.estimators import estimators
-from faintspot.estimators.images import measure_images
 from faintspot.kernels import groups
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.pipeline.images import measure_images
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 
 Flag = fs.SubapertureFlag
 SEEDS = st.integers(0, 2**32 - 1)

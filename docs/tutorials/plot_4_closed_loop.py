@@ -14,7 +14,7 @@ times: same air, same photons, other slopes and other control.
 from matplotlib.figure import Figure
 
 import faintspot as fs
-from faintspot.loop import Arm, load_loop, simulate_loop
+from faintspot.ao_loop import Arm, load_loop, simulate_loop
 
 loop = load_loop("diffraction_limit").replace("camera", photons_per_subaperture=20.0)
 loop = loop.replace("run", frames=400, settle_frames=80).replace("control", telemetry_frames=1000)

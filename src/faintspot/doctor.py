@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from faintspot import __version__
-from faintspot.extras import EXTRAS, SHARED_MEMORY, present
+from faintspot.base.extras import EXTRAS, SHARED_MEMORY, present
 
 _REQUIRED = ("numpy", "scipy", "numba", "llvmlite", "tomlkit", "click", "rich")
 _NETWORK = ("nfs", "cifs", "smb", "lustre", "gpfs", "beegfs", "ceph", "afs", "fuse.sshfs", "9p")
@@ -155,8 +155,8 @@ def _threads() -> Finding:
 
 
 def _gpu() -> Finding:
+    from faintspot.base.errors import InputError, MissingExtraError
     from faintspot.cuda.availability import check_cuda, simulated
-    from faintspot.errors import InputError, MissingExtraError
 
     try:
         check_cuda()

@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.flags import INVALID
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.registry import estimator_named
 from faintspot.estimators.scene import Scene
-from faintspot.flags import INVALID
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
-from faintspot.settings import Settings
-from faintspot.simulate.spots import spots
-from faintspot.slopes import Slopes
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
+from faintspot.spots.shapes import spots
 
 SIDE = 16
 N = 53

@@ -10,7 +10,7 @@ from tests.advice.test_centroid_gain import frames
 
 import faintspot as fs
 from faintspot.advice.known import Known, of_air, of_images
-from faintspot.loop.configuration import ARCSEC
+from faintspot.ao_loop.configuration import ARCSEC
 
 
 def test_images_tell_light_noise_and_width() -> None:
@@ -38,11 +38,11 @@ def test_slopes_tell_r0_and_wind() -> None:
     Two seconds hold few independent wavefronts: r0 to 25 %. Winds three times as fast look so to a factor.
     """
     pytest.importorskip("hcipy")
-    from tests.loop.loop_cases import faint, plain
+    from tests.ao_loop.loop_cases import faint, plain
 
     from faintspot.advice.simulated import seen_in_record
-    from faintspot.loop import simulate_loop
-    from faintspot.loop.observatory import prepare
+    from faintspot.ao_loop import simulate_loop
+    from faintspot.ao_loop.observatory import prepare
 
     run = faint().replace("run", frames=450, settle_frames=50)
     winds = run.atmosphere.wind_speed_m_per_s

@@ -11,7 +11,7 @@ from tests.advice.advice_cases import LAYOUT, seen_with_truth
 import faintspot as fs
 from faintspot.advice.residual import compared_residual, residual_wavefront, wavefront_modes
 from faintspot.advice.seen import Seen
-from faintspot.slopes import RESULT_TYPES
+from faintspot.pipeline.slopes import RESULT_TYPES
 
 MODES, UNIT = wavefront_modes(LAYOUT)
 

@@ -10,8 +10,8 @@ import pytest
 from tests.advice.advice_cases import LAYOUT, RATE_HZ, recording, seen_with_truth
 
 from faintspot.advice.seen import seen_in_telemetry
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, ControlOptions
-from faintspot.errors import InputError
 
 M, COMMANDS = 2 * len(LAYOUT), 5
 RNG = np.random.default_rng(4)

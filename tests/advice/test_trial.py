@@ -25,7 +25,7 @@ from faintspot.advice.advising import Advice, apply, loop_of, write_journal
 from faintspot.advice.known import Known
 from faintspot.advice.proposals import Proposal
 from faintspot.advice.trial import Loop, Verdict, compared, settings_of, try_on
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.statistics import Estimate
 from faintspot.io.telemetry import Telemetry
 from faintspot.realtime.commands import LENGTHY, commands_of

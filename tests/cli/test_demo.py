@@ -12,7 +12,7 @@ from faintspot import SlopePipeline
 from faintspot.cli.demo import comparison_table
 from faintspot.experiments.demonstration import FLUXES_E, Comparison, Scored
 from faintspot.io import read_slopes
-from faintspot.settings import Settings
+from faintspot.pipeline.settings import Settings
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")

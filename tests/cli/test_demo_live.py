@@ -19,8 +19,8 @@ pytest.importorskip("pyshmem")
 pytest.importorskip("tornado")
 pytest.importorskip("zarr")
 
+from faintspot.base.errors import InputError
 from faintspot.cli.demo_live import arms_table, in_words
-from faintspot.errors import InputError
 from faintspot.live_page.demonstration import Shown
 from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_segment import FOLDER

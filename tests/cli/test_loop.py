@@ -7,10 +7,10 @@ from tests.cli.cli_cases import Commands
 from tests.experiments.experiment_cases import PLAN, SEARCH, small
 
 import faintspot.cli
-from faintspot import configuration
+from faintspot.ao_loop.configuration import LoopConfiguration, load_loop, shipped_loops
 from faintspot.control.configuration import load_control
 from faintspot.experiments import budget, interleaved, magnitude
-from faintspot.loop.configuration import LoopConfiguration, load_loop, shipped_loops
+from faintspot.pipeline import configuration
 
 pytest.importorskip("hcipy")
 pytest.importorskip("matplotlib")

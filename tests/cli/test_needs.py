@@ -12,8 +12,8 @@ import click
 import pytest
 from tests.cli.cli_cases import Commands
 
+from faintspot.base.extras import EXTRAS, present, require
 from faintspot.cli import group
-from faintspot.extras import EXTRAS, present, require
 
 OPTIONAL = sorted({package for packages in EXTRAS.values() for package in packages})
 NEEDING = {

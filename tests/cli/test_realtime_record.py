@@ -14,8 +14,8 @@ pytest.importorskip("zarr")
 
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written
 
+from faintspot.base.errors import InputError
 from faintspot.cli.realtime_record import export, record
-from faintspot.errors import InputError
 from faintspot.io import read_telemetry
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.telemetry import TelemetryRing

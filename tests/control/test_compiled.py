@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from tests.control.control_cases import ERRORS, INTERACTION
 
-from faintspot.control.commands import CommandLine
+from faintspot.base.flags import SubapertureFlag
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
 from faintspot.control.integrator import Integrator
 from faintspot.control.reconstructor import make_reconstructor
-from faintspot.flags import SubapertureFlag
 
 pytestmark = pytest.mark.portable
 
@@ -19,7 +19,7 @@ N = 9
 
 def test_it_is_the_plain_integrator() -> None:
     reconstructor = make_reconstructor(INTERACTION)
-    lines = [CommandLine(INTERACTION.shape[1], 2) for _ in range(2)]
+    lines = [CommandDelayLine(INTERACTION.shape[1], 2) for _ in range(2)]
     plain = Integrator(lines[0], INTERACTION, reconstructor, 0.3, 0.02)
     compiled = CompiledIntegrator(lines[1], INTERACTION, reconstructor.matrix, 0.3, 0.02)
     rng = np.random.default_rng(3)
@@ -33,7 +33,7 @@ def test_it_is_the_plain_integrator() -> None:
 
 def test_nothing_winds_up() -> None:
     """After a long time at the stroke it leaves it with the first slope of the other sign."""
-    line = CommandLine(1, 1, 5.0)
+    line = CommandDelayLine(1, 1, 5.0)
     integrator = CompiledIntegrator(line, np.ones((2, 1)), np.full((1, 2), 0.5), 0.5, 0.0)
     for _ in range(1000):
         integrator.update(np.full(2, -1e3), np.ones(2))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.control.control_cases import INTERACTION, LAYERS, MODEL, PLANT, telemetry
 
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import STEPS, CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.kalman import SlopePredictor
@@ -21,18 +21,18 @@ pytestmark = pytest.mark.portable
 
 M, COMMANDS = INTERACTION.shape
 USUAL_PX2, GAIN, FRAMES = 0.25, 0.4, telemetry(500)
-Both = list[tuple[Any, CommandLine]]
+Both = list[tuple[Any, CommandDelayLine]]
 
 
 def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, **options: Any) -> Both:
     """Return the filter in NumPy and the compiled one, each with where its commands go."""
-    lines = [CommandLine(COMMANDS, 2, largest) for _ in range(2)]
+    lines = [CommandDelayLine(COMMANDS, 2, largest) for _ in range(2)]
     matrix, clean = PLANT.reconstructor.matrix, PLANT.reconstructor.clean
 
     def predictor() -> SlopePredictor:
         return SlopePredictor(model, np.full(M, USUAL_PX2))
 
-    def learnt(line: CommandLine) -> Predictive:
+    def learnt(line: CommandDelayLine) -> Predictive:
         return Predictive(line, INTERACTION, predictor(), clean)
 
     plain = partial(PLANT.integrator, GAIN)
@@ -79,7 +79,7 @@ def test_nonsense_is_replaced_by_the_integrator() -> None:
     """A model with the wrong sign: after some frames the mirror has the integrator's commands."""
     wrong = replace(MODEL, first=-MODEL.first)
     (slow, one), (fast, other) = both(wrong, largest=0.8)
-    line = CommandLine(COMMANDS, 2, 0.8)
+    line = CommandDelayLine(COMMANDS, 2, 0.8)
     plain = PLANT.integrator(GAIN, line)
     took_over = 0
     for number, slopes in enumerate(FRAMES.open_loop_px[:300]):

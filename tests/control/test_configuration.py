@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from tests.control.control_cases import INTERACTION
 
-from faintspot import configuration as configuration_file
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, ControlOptions, load_control, save_control
-from faintspot.errors import InputError
 from faintspot.estimators.documentation import option_table
+from faintspot.pipeline import configuration as configuration_file
 from faintspot.sensor.layout import Layout
 
 DOCS = Path(__file__).parents[2] / "docs" / "configuration.md"

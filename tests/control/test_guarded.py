@@ -7,7 +7,7 @@ import pytest
 from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
 
 from faintspot.control.base import Expected
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
 from faintspot.control.predictive import PseudoOpenLoop
@@ -20,7 +20,7 @@ class Runaway:
 
     undoes_prior = True
 
-    def __init__(self, line: CommandLine) -> None:
+    def __init__(self, line: CommandDelayLine) -> None:
         self._line = line
 
     def expected(self) -> Expected:
@@ -30,14 +30,14 @@ class Runaway:
         self._line.put(0.9 * self._line.latest + 0.4 * (PLANT.reconstructor(slopes_px)))
 
 
-def _guarded(line: CommandLine, learnt: object, prior: np.ndarray | None = None) -> Guarded:
+def _guarded(line: CommandDelayLine, learnt: object, prior: np.ndarray | None = None) -> Guarded:
     plain = partial(PLANT.integrator, 0.4)
     return Guarded(line, INTERACTION, PLANT.reconstructor.matrix, learnt, plain, prior_std_px=prior)  # type: ignore[arg-type]
 
 
 def test_nonsense_is_replaced() -> None:
     """A hundred frames after the start the integrator has taken over, as if it had been there always."""
-    lines = [CommandLine(12, 2) for _ in range(2)]
+    lines = [CommandDelayLine(12, 2) for _ in range(2)]
     guarded, alone = _guarded(lines[0], Runaway), PLANT.integrator(0.4, lines[1])
     for number, slopes in enumerate(FRAMES.open_loop_px):
         for controller, line in zip((guarded, alone), lines, strict=True):
@@ -50,7 +50,7 @@ def test_nonsense_is_replaced() -> None:
 @pytest.mark.parametrize("prior", [None, np.full(18, 0.5)])
 def test_alike_nothing_changes(prior: np.ndarray | None) -> None:
     """Two integrators that differ by nothing; posteriors are drawn to what each expects."""
-    lines = [CommandLine(12, 2) for _ in range(2)]
+    lines = [CommandDelayLine(12, 2) for _ in range(2)]
     guarded, alone = (
         _guarded(lines[0], partial(PLANT.integrator, 0.4), prior),
         PLANT.integrator(0.4, lines[1]),
@@ -68,7 +68,7 @@ def test_alike_nothing_changes(prior: np.ndarray | None) -> None:
 
 def test_pseudo_open_loop_control_takes_off_what_does_not_change() -> None:
     """Without noise, all of it that the mirror sees; slopes that were not measured do not matter."""
-    line = CommandLine(12, 2)
+    line = CommandDelayLine(12, 2)
     matrix = PLANT.reconstructor.clean
     control = PseudoOpenLoop(line, INTERACTION, COVARIANCES[0], COVARIANCES[0], matrix, 0.5)
     wavefront = np.random.default_rng(3).standard_normal(12)

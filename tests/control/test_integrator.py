@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.control.control_cases import ERRORS, INTERACTION
 
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.integrator import Integrator
 from faintspot.control.reconstructor import make_reconstructor
 
@@ -16,8 +16,8 @@ ONE = np.ones((2, 1))
 
 def _integrator(
     delay: int = 2, gain: float = 0.5, leak: float = 0.0, *, sees_mirror: bool = True
-) -> tuple[Integrator, CommandLine]:
-    line = CommandLine(1, delay)
+) -> tuple[Integrator, CommandDelayLine]:
+    line = CommandDelayLine(1, delay)
     return Integrator(line, ONE, make_reconstructor(ONE), gain, leak, sees_mirror=sees_mirror), line
 
 
@@ -69,7 +69,7 @@ def test_stability_with_two_frames_of_delay(gain: float, stable: bool) -> None:
 
 def test_equal_gains_of_all_modes_are_one_gain_on_what_is_driven() -> None:
     reconstructor = make_reconstructor(INTERACTION)
-    lines = [CommandLine(INTERACTION.shape[1], 2) for _ in range(2)]
+    lines = [CommandDelayLine(INTERACTION.shape[1], 2) for _ in range(2)]
     equal = np.full(reconstructor.modes.shape[1], 0.4)
     gains: tuple[float | NDArray[np.float64], ...] = (0.4, equal)
     one, several = (

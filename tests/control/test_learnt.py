@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
 
-from faintspot.control.commands import CommandLine
+from faintspot.base.errors import InputError
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import Control, ControlOptions
 from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
 from faintspot.control.learnt import Learnt, Model
-from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
 
 KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
@@ -26,7 +26,7 @@ def learnt() -> dict[str, Learnt]:
     return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES[None]}) for kind in KINDS}
 
 
-def commands(controller: Any, line: CommandLine, frames: int = 60) -> np.ndarray:
+def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:
     sent = []
     for slopes in FRAMES.open_loop_px[:frames]:
         controller.update(slopes + INTERACTION @ line.acting, np.full(18, 0.3))
@@ -38,7 +38,7 @@ def commands(controller: Any, line: CommandLine, frames: int = 60) -> np.ndarray
 def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     learnt[kind].model.save(path)
-    lines = [CommandLine(12, 2) for _ in range(2)]
+    lines = [CommandDelayLine(12, 2) for _ in range(2)]
     again = Learnt(PLANT, Model.load(path, PLANT))
     sent = [
         commands(each.controller(line), line) for each, line in zip((learnt[kind], again), lines, strict=True)
@@ -51,7 +51,7 @@ def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_pa
     engines = commands(control.controller(line), line)
     expected = sent[0]
     if kind == "modal":  # not guarded: the gains are in the compiled integrator's matrix
-        other = CommandLine(12, 2)
+        other = CommandDelayLine(12, 2)
         expected = commands(learnt[kind].model.controller(PLANT, other), other)
     np.testing.assert_allclose(engines, expected, atol=1e-9)
 
@@ -59,7 +59,7 @@ def test_from_a_file_it_is_the_same(kind: str, learnt: dict[str, Learnt], tmp_pa
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_goes_on_from_what_the_mirror_holds(kind: str, learnt: dict[str, Learnt]) -> None:
     """Slopes of a mirror that takes off all there is: the next command is nearly the same."""
-    line = CommandLine(12, 2)
+    line = CommandDelayLine(12, 2)
     controller = learnt[kind].controller(line)
     commands(controller, line)
     held = -PLANT.reconstructor.clean @ COVARIANCES[0] @ np.random.default_rng(2).standard_normal(18)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tests.control.control_cases import INTERACTION
 
+from faintspot.base.errors import InputError
+from faintspot.base.flags import SubapertureFlag
 from faintspot.control.calibration_files import save_calibration, save_picture
 from faintspot.control.configuration import load_control, save_control
 from faintspot.control.mirror_calibration import calibrate_mirror, centroid_gain
-from faintspot.errors import InputError
-from faintspot.flags import SubapertureFlag
 from faintspot.sensor.layout import Layout
 
 REFERENCE = np.linspace(-0.3, 0.4, 18)

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from faintspot.base.errors import InputError
 from faintspot.control.reconstructor import check_controllable, make_reconstructor
-from faintspot.errors import InputError
 
 
 def _matrix(slopes: int = 40, commands: int = 12) -> np.ndarray:

@@ -11,14 +11,14 @@ import pytest
 from click.testing import CliRunner
 from tests.control.control_cases import CELLS, FRAME_S, INTERACTION, telemetry
 
-from faintspot import configuration as configuration_file
+from faintspot.base.errors import InputError
 from faintspot.cli import realtime_learn
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import Control, ControlOptions, load_control, save_control
 from faintspot.control.recording import telemetry_of_recording, theories_of
-from faintspot.errors import InputError
+from faintspot.pipeline import configuration as configuration_file
+from faintspot.pipeline.settings import Settings
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
 
 GAIN = 0.8
 OPTIONS = ControlOptions(gain=0.3, centroid_gain=GAIN)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from faintspot.estimators.documentation import all_tables
-from faintspot.settings import SharedOptions
+from faintspot.pipeline.settings import SharedOptions
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLE = re.compile(r"<!-- options: (\w+) -->\n(.*?)\n<!-- end -->", re.DOTALL)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.experiments.interleaved import ObservingPlan
-from faintspot.experiments.running import Workplace
+from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
-from faintspot.loop.configuration import LoopConfiguration
 
 SEARCH = Search(
     coarse_frames=30, frames=40, settle_frames=10, realisations=1, finalists=2, climbs=1, rounds=1
@@ -27,7 +27,7 @@ PLAN = ObservingPlan(
     gains=(0.3, 0.5),
     tuning_frames=30,
 )
-HERE = Workplace(workers=0)
+HERE = WorkerPool(workers=0)
 
 
 def small() -> LoopConfiguration:

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
 from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
 from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, arm_kind
 from faintspot.experiments.loop_question import LoopQuestion
-from faintspot.loop.configuration import LoopConfiguration, load_loop
 
 PHOTONS = (5.0, 14.0, 40.0, 100.0, 320.0)
 BRIGHT = 0.8

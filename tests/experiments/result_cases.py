@@ -8,10 +8,10 @@ import functools
 import numpy as np
 
 import faintspot as fs
-from faintspot.configuration import to_text
+from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
+from faintspot.ao_loop.configuration import Camera
 from faintspot.experiments.loop_results import BudgetResult, InterleavedResult, MagnitudeResult
-from faintspot.loop import Arm, LoopConfiguration, simulate_loop
-from faintspot.loop.configuration import Camera
+from faintspot.pipeline.configuration import to_text
 
 STRENGTHS = (np.nan, 0.0, 0.8)
 BLOCK = 60

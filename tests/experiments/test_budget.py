@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from tests.experiments.experiment_cases import HERE, SEARCH, StopsAfter, assert_same_files, small
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.files import BUDGET_FILE
+from faintspot.ao_loop.simulation import simulate_loop
+from faintspot.base.errors import InputError
 from faintspot.experiments.budget import TERMS, budget_run, run_budget
 from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
 from faintspot.experiments.loop_results import BudgetResult
-from faintspot.experiments.running import Workplace
-from faintspot.loop.files import BUDGET_FILE
-from faintspot.loop.simulation import simulate_loop
+from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
 KIND = arm_kind("brightest")
@@ -54,7 +54,7 @@ def test_unknown_term() -> None:
 
 
 def test_experiment_and_resume(tmp_path: Path) -> None:
-    def run(folder: Path, place: Workplace) -> BudgetResult:
+    def run(folder: Path, place: WorkerPool) -> BudgetResult:
         return run_budget(small(), folder, ["brightest"], search=SEARCH, place=place)
 
     whole, again = tmp_path / "whole", tmp_path / "again"
@@ -63,7 +63,7 @@ def test_experiment_and_resume(tmp_path: Path) -> None:
     assert result.strehl.shape == result.residual_nm.shape == (1, len(TERMS), 2)
     assert np.isfinite(result.strehl).all()
     with pytest.raises(KeyboardInterrupt):
-        run(again, Workplace(0, progress=StopsAfter(200)))
+        run(again, WorkerPool(0, progress=StopsAfter(200)))
     run(again, HERE)
     assert_same_files(whole, again, BUDGET_FILE)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter
 
 import faintspot as fs
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators import Estimator, Need, Scene, Sensor, option, registry
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation

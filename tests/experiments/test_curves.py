@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.curves import (
     Curve,
     Gain,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from faintspot import Layout, Settings, SlopePipeline
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import CALIBRATION, READ_NOISE_E, choose, compare, simulate
 

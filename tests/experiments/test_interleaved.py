@@ -15,10 +15,10 @@ from tests.experiments.experiment_cases import (
     small,
 )
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.interleaved import QUICK_PLAN, ObservingPlan, run_interleaved
 from faintspot.experiments.loop_results import InterleavedResult
-from faintspot.experiments.running import Workplace
+from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
 CAMERA = small().replace("camera", em_gain=100.0, read_noise_e=20.0)
@@ -60,14 +60,14 @@ def test_strength_zero_changes_nothing(whole: Path) -> None:
 @pytest.mark.parametrize("calls", [2, 300])
 def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) -> None:
     with pytest.raises(KeyboardInterrupt):
-        run_interleaved(CAMERA, tmp_path, plan=PLAN, place=Workplace(0, progress=StopsAfter(calls)))
+        run_interleaved(CAMERA, tmp_path, plan=PLAN, place=WorkerPool(0, progress=StopsAfter(calls)))
     run_interleaved(CAMERA, tmp_path, plan=PLAN, place=HERE)
     assert_same_files(tmp_path, whole, "set-*.npz")
     assert_same_units(tmp_path, whole)
 
 
 def test_nothing_is_done_twice(whole: Path) -> None:
-    run_interleaved(CAMERA, whole, plan=PLAN, place=Workplace(0, progress=StopsAfter(0)))
+    run_interleaved(CAMERA, whole, plan=PLAN, place=WorkerPool(0, progress=StopsAfter(0)))
 
 
 def test_other_plan_is_refused_or_replaces(tmp_path: Path, whole: Path) -> None:

@@ -13,7 +13,7 @@ from tests.experiments.result_cases import (
     small_interleaved,
 )
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_analysis import (
     NO_TV,
     TV,

@@ -17,13 +17,13 @@ from tests.experiments.loop_answer_cases import (
     strehl_of,
 )
 
-from faintspot import configuration as configuration_file
-from faintspot.errors import InputError
+from faintspot.ao_loop.configuration import load_loop
+from faintspot.base.errors import InputError
 from faintspot.experiments import loop_text
 from faintspot.experiments.loop_answer import LoopAnswer
 from faintspot.experiments.loop_question import MODEL_ERROR, sky_coverage
-from faintspot.loop.configuration import load_loop
-from faintspot.settings import Settings
+from faintspot.pipeline import configuration as configuration_file
+from faintspot.pipeline.settings import Settings
 
 PAIR = ("brightest", "window")
 

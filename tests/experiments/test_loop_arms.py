@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from tests.experiments.experiment_cases import small
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.simulation import simulate_loop
+from faintspot.base.errors import InputError
+from faintspot.config.options import option
 from faintspot.estimators import registry
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.registry import estimators, register
 from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind, default_arms
-from faintspot.loop.simulation import simulate_loop
-from faintspot.options import option
 
 NAMES = (*estimators(), "ml_weighted", "map_predicted_weighted", "trained_predicted", "tv_uncorrected")
 

@@ -12,10 +12,10 @@ from tests.experiments.result_cases import (
     small_interleaved,
 )
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.files import MAGNITUDE_FILE
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_page import loop_report, loop_sections, loop_warnings, write_loop_report
 from faintspot.experiments.loop_verdict import NOWHERE, LoopResults
-from faintspot.loop.files import MAGNITUDE_FILE
 
 pytest.importorskip("hcipy")
 

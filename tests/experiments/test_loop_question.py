@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from tests.experiments.loop_answer_cases import configuration
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.configuration import load_loop
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_question import LoopQuestion, isoplanatic_angle_arcsec, magnitudes_apart
-from faintspot.loop.configuration import load_loop
 
 
 def names(question: LoopQuestion) -> list[str]:

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from faintspot.errors import InputError
-from faintspot.experiments.loop_results import (
-    BudgetResult,
-    InterleavedResult,
-    MagnitudeResult,
-)
-from faintspot.loop.files import (
+from faintspot.ao_loop.files import (
     BUDGET_FILE,
     INTERLEAVED_FILE,
     MAGNITUDE_FILE,
     holds_loop_results,
     make_folder,
+)
+from faintspot.base.errors import InputError
+from faintspot.experiments.loop_results import (
+    BudgetResult,
+    InterleavedResult,
+    MagnitudeResult,
 )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.experiments.experiment_cases import SEARCH, small
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments import search as tuning
 from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
 from faintspot.experiments.search import FIRST_TUNING_REALISATION, Search, stored_choice, tune, tuning_unit

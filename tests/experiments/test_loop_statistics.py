@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_results import (
     falling,
     limiting_magnitudes,

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_units, small
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_answer import LoopAnswer
 from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
 from faintspot.experiments.loop_question import LoopQuestion
 from faintspot.experiments.loop_tuning import LoopPlan, tune_loop, values_at_end
-from faintspot.experiments.running import Workplace
+from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
 
 pytest.importorskip("hcipy")
@@ -27,7 +27,7 @@ def question(**asked: Any) -> LoopQuestion:
     return LoopQuestion(loop, magnitudes=(9.0, 11.0), **{"arms": ("window+kalman",), **asked})
 
 
-def tuned(folder: Path, place: Workplace = HERE, **asked: Any) -> LoopAnswer:
+def tuned(folder: Path, place: WorkerPool = HERE, **asked: Any) -> LoopAnswer:
     return tune_loop(question(**asked), folder, plan=PLAN, place=place)
 
 
@@ -54,7 +54,7 @@ def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
 def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[Path, LoopAnswer]) -> None:
     folder, answer = whole
     with pytest.raises(KeyboardInterrupt):
-        tuned(tmp_path, Workplace(0, progress=StopsAfter(60)))
+        tuned(tmp_path, WorkerPool(0, progress=StopsAfter(60)))
     again = tuned(tmp_path)
     assert_same_units(tmp_path, folder)
     np.testing.assert_array_equal(again["window+kalman"].strehl, answer["window+kalman"].strehl)

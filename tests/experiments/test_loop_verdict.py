@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from tests.experiments.result_cases import LABELS, made_up_budget, made_up_interleaved, made_up_magnitude
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.files import BUDGET_FILE, MAGNITUDE_FILE
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_verdict import (
     NOWHERE,
     LoopResults,
@@ -16,7 +17,6 @@ from faintspot.experiments.loop_verdict import (
     reference_arms,
     tv_arm,
 )
-from faintspot.loop.files import BUDGET_FILE, MAGNITUDE_FILE
 
 pytest.importorskip("hcipy")
 

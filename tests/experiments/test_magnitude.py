@@ -14,18 +14,18 @@ from tests.experiments.experiment_cases import (
     small,
 )
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.files import MAGNITUDE_FILE
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_results import MagnitudeResult
 from faintspot.experiments.magnitude import quick_run, run_magnitude
-from faintspot.experiments.running import Workplace
-from faintspot.loop.files import MAGNITUDE_FILE
+from faintspot.experiments.running import WorkerPool
 
 pytest.importorskip("hcipy")
 ARMS = ("centroid", "brightest")
 PHOTONS = (400.0, 40.0)
 
 
-def run(folder: Path, place: Workplace, arms: tuple[str, ...] = ARMS) -> MagnitudeResult:
+def run(folder: Path, place: WorkerPool, arms: tuple[str, ...] = ARMS) -> MagnitudeResult:
     return run_magnitude(small(), folder, arms, PHOTONS, search=SEARCH, place=place)
 
 
@@ -54,7 +54,7 @@ def test_result(whole: Path) -> None:
 @pytest.mark.parametrize("calls", [2, 120])
 def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) -> None:
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, Workplace(0, progress=StopsAfter(calls)))
+        run(tmp_path, WorkerPool(0, progress=StopsAfter(calls)))
     run(tmp_path, HERE)
     assert_same_files(tmp_path, whole, "*.npz")
     assert_same_units(tmp_path, whole)
@@ -62,7 +62,7 @@ def test_interrupted_and_started_again(tmp_path: Path, whole: Path, calls: int) 
 
 def test_arms_can_be_added(tmp_path: Path, whole: Path) -> None:
     folder = shutil.copytree(whole, tmp_path / "copy")
-    one = run(folder, Workplace(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do
+    one = run(folder, WorkerPool(0, progress=StopsAfter(0)), ("centroid",))  # nothing is left to do
     assert one.labels == ("centre of gravity",)
     both = run(folder, HERE)
     np.testing.assert_array_equal(both.strehl, MagnitudeResult.load(whole / MAGNITUDE_FILE).strehl)

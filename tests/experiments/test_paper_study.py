@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.experiments.study_cases import dataset, power_law
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments import built_in_studies as paper
 from faintspot.experiments.study_page import write_study_report
 from faintspot.report import drawing

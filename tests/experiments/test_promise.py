@@ -16,8 +16,8 @@ from faintspot.experiments.answer_text import CONTRADICTED, promise_lines
 from faintspot.experiments.promise import _simulated, _with_unshared
 from faintspot.experiments.statistics import Estimate
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
 from faintspot.simulate import Detector, sensor_frames
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import LearntPSF
 
 LAYOUT = Layout.grid((6, 6), pixels=12)

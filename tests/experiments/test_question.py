@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments import Question
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 
 KNOWN: dict[str, Any] = {"read_noise_e": 3.0, "pixels": 16, "fwhm_px": 2.0, "flux_e": 100.0}
 OPTICS: dict[str, Any] = {"lenslet_m": 0.5, "wavelength_nm": 600.0, "pixel_scale_arcsec": 0.125}

@@ -7,7 +7,7 @@ import pytest
 from tests.experiments.planner_cases import QUICK
 from tests.shared_data import shared_file
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments import question_from_frames, tune
 from faintspot.experiments.answer_text import UNCHECKED, recommendation
 from faintspot.experiments.promise import frames_to_check

@@ -17,9 +17,9 @@ import pytest
 from numpy.typing import NDArray
 
 import faintspot
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.experiments import running
-from faintspot.experiments.running import Unit, Workplace, run_units
+from faintspot.experiments.running import Unit, WorkerPool, run_units
 from faintspot.experiments.store import MemoryStore, ZarrStore
 
 UNITS = [Unit(f"unit {number}", (number,), 10) for number in range(4)]
@@ -93,7 +93,7 @@ def values(results: Any) -> list[int]:
 def test_units_are_run_once(tmp_path: Path) -> None:
     pytest.importorskip("zarr")
     counts: list[tuple[int, int]] = []
-    place = Workplace(workers=0, progress=lambda *count: counts.append(count))
+    place = WorkerPool(workers=0, progress=lambda *count: counts.append(count))
     keys = [unit.key for unit in UNITS]
     assert values(run_units(double, UNITS, ZarrStore(tmp_path / "a", "t", "f", keys), place)) == [0, 2, 4, 6]
     assert counts[:2] == [(0, 40), (5, 40)]
@@ -111,34 +111,34 @@ def test_interrupted_and_started_again() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_units(double, UNITS, store, Workplace(workers=0, progress=stop))
+        run_units(double, UNITS, store, WorkerPool(workers=0, progress=stop))
     assert [store.done(unit.key) for unit in UNITS] == [True, True, False, False]
-    assert values(run_units(double, UNITS, store, Workplace(workers=0))) == [0, 2, 4, 6]
+    assert values(run_units(double, UNITS, store, WorkerPool(workers=0))) == [0, 2, 4, 6]
 
 
 def test_processes_give_the_same() -> None:
     said: list[str] = []
     counts: list[tuple[int, int]] = []
-    place = Workplace(2, None, lambda *count: counts.append(count), said.append)
+    place = WorkerPool(2, None, lambda *count: counts.append(count), said.append)
     assert values(run_units(double, UNITS, MemoryStore(), place)) == [0, 2, 4, 6]
     assert counts[-1] == (40, 40)
     assert said == ["2 processes on this machine"]
     for function, message in ((impossible, "refused"), (without_package, "pip install")):
         with pytest.raises(InputError, match=message):
-            run_units(function, UNITS[:1], MemoryStore(), Workplace(1))
+            run_units(function, UNITS[:1], MemoryStore(), WorkerPool(1))
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="reads /proc")
 def test_nobody_can_reach_the_processes() -> None:
-    result = run_units(sockets_of, UNITS[:1], MemoryStore(), Workplace(1))
+    result = run_units(sockets_of, UNITS[:1], MemoryStore(), WorkerPool(1))
     assert int(result["unit 0"]["listening"]) == 0
 
 
 def test_a_process_dies(tmp_path: Path) -> None:
     units = [Unit(unit.key, (str(tmp_path), *unit.arguments)) for unit in UNITS]
-    assert values(run_units(die_once, units, MemoryStore(), Workplace(1))) == [0, 2, 4, 6]
+    assert values(run_units(die_once, units, MemoryStore(), WorkerPool(1))) == [0, 2, 4, 6]
     with pytest.raises(InputError, match="died repeatedly") as raised:
-        run_units(die, UNITS[:1], MemoryStore(), Workplace(1))
+        run_units(die, UNITS[:1], MemoryStore(), WorkerPool(1))
     assert "\n" not in str(raised.value)
 
 
@@ -151,7 +151,7 @@ def test_interruption_does_not_wait_for_units() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_units(sleep, units, store, Workplace(1, progress=stop))
+        run_units(sleep, units, store, WorkerPool(1, progress=stop))
     assert store.done("short")
     process = int(store.read("short")["process"])
     assert not Path(f"/proc/{process}").exists() or not Path("/proc").exists()
@@ -159,7 +159,7 @@ def test_interruption_does_not_wait_for_units() -> None:
 
 def test_number_of_workers_is_checked() -> None:
     with pytest.raises(InputError, match="workers"):
-        Workplace(workers=-1)
+        WorkerPool(workers=-1)
 
 
 # A Dask cluster ----------------------------------------------------------------------------------------
@@ -206,13 +206,13 @@ def test_one_of_two_dask_workers_is_killed(
         if done == 10:
             os.kill(two_workers[0].pid, signal.SIGKILL)
 
-    place = Workplace(None, scheduler, kill_one, said.append)
+    place = WorkerPool(None, scheduler, kill_one, said.append)
     assert values(run_units(double, UNITS, MemoryStore(), place)) == [0, 2, 4, 6]
     assert two_workers[0].wait() == -signal.SIGKILL
     assert counts[-1] == 40
     assert scheduler in said[0]
     with pytest.raises(InputError, match="refused"):
-        run_units(impossible, UNITS[:1], MemoryStore(), Workplace(scheduler=scheduler))
+        run_units(impossible, UNITS[:1], MemoryStore(), WorkerPool(scheduler=scheduler))
 
 
 def test_workers_of_another_version_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +226,7 @@ def test_schedulers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running, "_CONNECT_TIMEOUT_S", 0.3)
     for address in ("nowhere", "tcp://127.0.0.1:1", "xyz://127.0.0.1:1"):
         with pytest.raises(InputError, match=r"scheduler = .*cannot be reached") as raised:
-            run_units(double, UNITS, MemoryStore(), Workplace(scheduler=address))
+            run_units(double, UNITS, MemoryStore(), WorkerPool(scheduler=address))
         assert "\n" not in str(raised.value)
     with pytest.raises(InputError, match="expected certificates"):
-        run_units(double, UNITS, MemoryStore(), Workplace(scheduler="tls://127.0.0.1:1"))
+        run_units(double, UNITS, MemoryStore(), WorkerPool(scheduler="tls://127.0.0.1:1"))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from faintspot.experiments.search_range import Images, SpotRange, spot_range
-from faintspot.sensor.psf import PSF
 from faintspot.simulate import Detector, subapertures
+from faintspot.spots.psf import PSF
 
 SHAPE, SPOTS = (12, 12), 600
 ANYWHERE = 4.0  # px: as far as spots of this window can be told

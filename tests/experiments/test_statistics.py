@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.statistics import (
     Estimate,
     absolute_errors,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.experiments.study_cases import cells, dataset, power_law
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.arms import TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, gain_at_error, gain_at_flux
 from faintspot.experiments.study_curves import Configuration, study_curves

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from tests.experiments.study_cases import dataset, power_law
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments import built_in_studies as paper
 from faintspot.experiments.specification import StudySpecification, Sweep
 from faintspot.experiments.study_page import report_of_study, study_report

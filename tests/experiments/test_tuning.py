@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.experiments.planner_cases import CAMERA, QUICK, answered
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators import Estimator, Scene, estimators, option, registry
 from faintspot.experiments import Question, tune
 from faintspot.experiments.tuning import _ranked

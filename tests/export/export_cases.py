@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot import configuration
+from faintspot.pipeline import configuration
 from faintspot.simulate import sensor_frames
 
 LAYOUT = fs.Layout((30, 41), (8, 8), np.array([[2, 3], [2, 21], [12, 12], [22, 33]]))

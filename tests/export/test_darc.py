@@ -13,12 +13,12 @@ from tests.cli.cli_cases import Commands
 from tests.export.export_cases import CALIBRATION, LAYOUT, OFF_CENTRE, frames, other_weights, written
 
 import faintspot as fs
-from faintspot import configuration
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import ControlOptions, load_control, save_control
 from faintspot.export import export_darc
 from faintspot.export.darc import interleaved
+from faintspot.pipeline import configuration
 
 N = len(LAYOUT)
 REFERENCE = np.random.default_rng(6).uniform(-0.3, 0.3, (N, 2))
@@ -128,7 +128,7 @@ def test_commands(tmp_path: Path, name: str) -> None:
     assert values["rmx"].shape == (3, 2 * N)
     control = load_control(path)
     assert control is not None
-    line = CommandLine(3, 1, 1e9)
+    line = CommandDelayLine(3, 1, 1e9)
     integrator = CompiledIntegrator(line, interaction, control.reconstructor.matrix, 0.3, 0.02)
     pipeline = fs.SlopePipeline(LAYOUT, SETTINGS[name], CALIBRATION, REFERENCE)
     theirs = np.zeros(3)

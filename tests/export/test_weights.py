@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tests.export.export_cases import CALIBRATION, LAYOUT, OFF_CENTRE, frames, other_weights, written
 
 import faintspot as fs
-from faintspot import configuration
 from faintspot.export import export_weights
+from faintspot.pipeline import configuration
 
 RNG = np.random.default_rng(5)
 REFERENCE = RNG.uniform(-0.3, 0.3, (len(LAYOUT), 2))

@@ -19,14 +19,14 @@ from PIL import Image
 from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
-from faintspot import configuration
+from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
 from faintspot.experiments.question import read_camera
 from faintspot.experiments.specification import StudySpecification
 from faintspot.io import open_frames, read_array, read_slopes
 from faintspot.io.references import read_reference
-from faintspot.loop.configuration import LoopConfiguration, load_loop
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.pipeline import configuration
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 
 _NUMBER = re.compile(rb"\d+(\.\d*)?([eE][-+]?\d+)?")
 _WORDS = (b"1e300", b"-1", b"nan", b"-inf", b"0", b"0.5", b"9" * 30, b'"x"', b"[]", b"{}", b"true", b"null")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 
 def refused_in_one_line(call: Callable[[], Any]) -> Any:

@@ -16,7 +16,7 @@ from tests.fuzz.refused import refused_in_one_line
 
 import faintspot as fs
 from faintspot.estimators import estimators
-from faintspot.settings import option_names
+from faintspot.pipeline.settings import option_names
 
 _EXAMPLES = 100
 

@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 fits = pytest.importorskip("astropy.io.fits")
 tifffile = pytest.importorskip("tifffile")

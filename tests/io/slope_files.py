@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import SlopeWriter, create_writer, read_slopes
 from faintspot.io.slopes_format import VARIABLES
 

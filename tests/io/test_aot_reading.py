@@ -15,9 +15,9 @@ from tests.cli.cli_cases import Commands
 from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, N, images_of, records_of
 
 import faintspot as fs
-from faintspot import configuration
 from faintspot.io import open_frames, read_aot, read_slopes, read_telemetry, write_aot
 from faintspot.io.telemetry import TelemetryStore
+from faintspot.pipeline import configuration
 from faintspot.recorded import measure_recorded
 
 aotpy: Any = pytest.importorskip("aotpy")

@@ -19,13 +19,13 @@ import scipy.io
 from tests.io.frame_files import cube, save, tifffile, zarr
 from tests.io.slope_files import result, write
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays
 from faintspot.io import inflation, open_frames, raw, read_array, read_slopes, slopes_format
 from faintspot.io.references import read_reference
-from faintspot.npz import read_arrays
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 
 h5py: Any = pytest.importorskip("h5py")
 MIB = 1 << 20

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.io.frame_files import FORMATS, assert_message, cube, save
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import open_frames
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tests.io.frame_files import FORMATS, assert_message, cube, save
 from tests.shared_data import shared_file
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.io import open_frames, read_array
 
 fits = pytest.importorskip("astropy.io.fits")

@@ -12,7 +12,7 @@ import scipy.io
 from PIL import Image
 from tests.io.frame_files import assert_message, cube, save
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import open_frames, read_array
 
 h5py: Any = pytest.importorskip("h5py")

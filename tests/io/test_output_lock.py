@@ -20,7 +20,7 @@ from tests.io.slope_files import (
     writer_for,
 )
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import read_slopes, slopes_zarr
 from faintspot.io.output_lock import OutputLock
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.io.slope_files import ATTRIBUTES, NAMES, part, result, write, writer_for
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.references import read_reference
 
 fits = pytest.importorskip("astropy.io.fits")

@@ -22,7 +22,7 @@ from tests.io.slope_files import (
     writer_for,
 )
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.io import csv_files, open_frames, read_slopes, slopes_zarr
 from faintspot.io.slopes_format import VARIABLES
 

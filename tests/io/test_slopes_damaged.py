@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.io.slope_files import assert_stored, part, result, write, writer_for
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_store
 
 fits = pytest.importorskip("astropy.io.fits")

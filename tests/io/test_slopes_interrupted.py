@@ -14,7 +14,7 @@ import pytest
 from tests.io.slope_files import NAMES, assert_stored, part, result, write, writer_for
 
 import faintspot
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr, zarr_store
 
 pytest.importorskip("astropy")

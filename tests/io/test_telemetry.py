@@ -24,7 +24,7 @@ from tests.io.telemetry_files import (
     records_of,
 )
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import Telemetry, read_telemetry, write_aot
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.sensor.layout import Layout

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import DTypeLike
 from tests.io.frame_files import assert_message, cube, save, tifffile
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import open_frames, read_array
 
 

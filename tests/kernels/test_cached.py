@@ -10,7 +10,7 @@ import numba
 import pytest
 from numba.core.caching import CacheImpl
 
-from faintspot.errors import CacheWarning
+from faintspot.base.errors import CacheWarning
 from faintspot.kernels import cached
 from faintspot.kernels.cached import cache_folder, kernel_cache
 

@@ -21,7 +21,7 @@ pytest.importorskip("zarr")
 from playwright.sync_api import sync_playwright
 from tests.realtime.bench import Bench, simulated
 
-from faintspot.checks import number_between
+from faintspot.base.checks import number_between
 from faintspot.io.telemetry import read_telemetry
 from faintspot.live_page.server import LiveServer
 from faintspot.live_page.serving import serve_engine, serve_recording

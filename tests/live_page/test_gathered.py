@@ -7,7 +7,7 @@ pytest.importorskip("zarr")
 
 from tests.live_page.cases import records
 
-from faintspot.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag
 from faintspot.live_page import gathered as gathered_module
 from faintspot.live_page.batch import Batch
 from faintspot.live_page.gathered import Gathered, flag_names

@@ -10,7 +10,7 @@ pytest.importorskip("zarr")
 
 from tests.live_page.cases import LAYOUT, N, records
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page import recording_source

@@ -14,7 +14,7 @@ pytest.importorskip("zarr")
 from tests.live_page.cases import LAYOUT, Client, Noted, Played, Refused, asked, connected, next_of, served
 from tornado.httpclient import AsyncHTTPClient
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.live_page import server as server_module
 from faintspot.live_page.access import Access
 from faintspot.live_page.server import LARGEST_REQUEST, MOST_CLIENTS, LiveServer

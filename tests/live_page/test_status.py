@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import faintspot as fs
 from faintspot.live_page.status import settings_rows
-from faintspot.settings import SharedOptions
+from faintspot.pipeline.settings import SharedOptions
 
 
 def test_every_setting_is_a_row_of_the_form() -> None:
@@ -34,7 +34,7 @@ def test_values_of_subapertures_are_told_by_their_ends() -> None:
 
 def test_what_an_engine_answers_can_be_set_again() -> None:
     """The form's texts, parsed as `realtime set` parses them, are the settings."""
-    from faintspot.written_changes import parse_changes
+    from faintspot.config.written_changes import parse_changes
 
     settings = fs.Settings(estimator="ml", search_range_px=2.5)
     names = [*settings.estimator.declared(), *SharedOptions.declared()]

@@ -12,7 +12,7 @@ pytest.importorskip("zarr")
 
 from tests.realtime.telemetry_cases import LAYOUT, Engine
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.telemetry import read_telemetry
 from faintspot.live_page.wishes import EngineWishes, answered
 from faintspot.realtime.control import ControlServer

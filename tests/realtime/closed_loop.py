@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 import pyshmem
-from tests.loop.loop_cases import faint
+from tests.ao_loop.loop_cases import faint
 
 import faintspot as fs
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop.engine_files import write_engine_files
 from faintspot.control.configuration import Control, load_control
 from faintspot.control.learnt import INTEGRATOR
-from faintspot.loop.engine_files import write_engine_files
+from faintspot.pipeline import configuration as configuration_file
 from faintspot.realtime.control_loop import ControlLoop
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.pixel_segment import FOLDER

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import RESULT_TYPES, Slopes
 
 LAYOUT = Layout.grid((3, 3), pixels=8, inner_radius=0.5)
 SETTINGS = '[estimator]\nname = "tv"\nnoise_std = 1.5\n'

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import faintspot
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime import bridge as bridge_module
 from faintspot.realtime.bridge import BridgeCounters, StreamBridge
 from faintspot.realtime.pixel_ring import PixelRing

@@ -20,14 +20,14 @@ from click.testing import CliRunner
 
 import faintspot
 from faintspot import Calibration, Layout
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
 from faintspot.cli.realtime_camera import camera
-from faintspot.errors import InputError
 from faintspot.realtime import camera as camera_module
 from faintspot.realtime.camera import Camera, SpotMotion, readout_type
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.simulate import Detector, sensor_frames
-from faintspot.simulate.generators import spawn
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
 

@@ -12,7 +12,7 @@ from uuid import uuid4
 
 import pytest
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.child_processes import ChildProcesses
 
 pytest.importorskip("pyshmem")

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import faintspot
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop import Arm, simulate_loop
+from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.base.errors import InputError
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import Control
-from faintspot.errors import InputError
-from faintspot.loop import Arm, simulate_loop
-from faintspot.loop.observatory import Observatory
+from faintspot.pipeline import configuration as configuration_file
 from faintspot.realtime.commands import commands_of, loop_command
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
@@ -154,8 +154,8 @@ def test_the_guard_opens_a_loop_that_has_lost_its_star(
     sky.start(make_engine(sky.name, path, with_options(control, guard_frames=5, most_invalid=0.3)))
     sky.loop.close()
     sky.frames(12)
-    seen = Observatory.frame
-    monkeypatch.setattr(Observatory, "frame", lambda *args: np.full_like(seen(*args), np.nan))
+    seen = TelescopeModel.frame
+    monkeypatch.setattr(TelescopeModel, "frame", lambda *args: np.full_like(seen(*args), np.nan))
     for _ in range(30):
         sky.frame()
         if not sky.loop.closed:

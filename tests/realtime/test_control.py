@@ -21,7 +21,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime import control
 from faintspot.realtime.control import LARGEST_REQUEST, ControlServer, request
 from faintspot.realtime.private_socket import socket_path
@@ -335,7 +335,7 @@ def test_only_the_user_can_open_the_socket(server: ControlServer) -> None:
 STRANGER = """
 import os, socket, sys
 sys.path.insert(0, sys.argv[2])
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.control import request
 os.seteuid(65534)
 connection = socket.socket(socket.AF_UNIX)

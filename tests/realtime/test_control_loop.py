@@ -10,18 +10,18 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
 
+from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.configuration import Control, ControlOptions
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
 from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, learn
 from faintspot.control.learnt import Model
-from faintspot.errors import InputError
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.control_loop import ControlLoop
 from faintspot.realtime.prior import Prior
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import RESULT_TYPES, Slopes
 
 LAYOUT = Layout.grid((3, 3), pixels=8)
 N, COMMANDS = len(LAYOUT), INTERACTION.shape[1]
@@ -32,7 +32,7 @@ EXTREMES = (0.0, 5e-324, 1e-160, 1e-30, 1e-8, 1e-3, 0.1, 2.0, 1e3, 1e6, 1e12, 1e
 class PlainControl(Control):
     """With the controllers that are written in NumPy."""
 
-    def controller(self, line: CommandLine) -> Controller:
+    def controller(self, line: CommandDelayLine) -> Controller:
         """See `Control`."""
         plant, kind, gain = self.plant, self.options.controller, self.options.gain
         if kind == INTEGRATOR:

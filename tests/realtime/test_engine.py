@@ -17,8 +17,8 @@ from tests.realtime.bench import CALIBRATION, SETTINGS, Bench, make, simulated
 
 import faintspot as fs
 from faintspot.cli import realtime_control
-from faintspot.configuration import unpacked
 from faintspot.io import open_frames
+from faintspot.pipeline.configuration import unpacked
 from faintspot.realtime.bridge import StreamBridge
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.interleaving import Interleaving

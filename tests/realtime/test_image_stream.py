@@ -19,9 +19,9 @@ from tests.patience import LIMIT_S
 from tests.realtime.image_files import DaoFile, IsioFile
 
 import faintspot
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.bridge import StreamBridge
-from faintspot.realtime.image_layout import Unfit
+from faintspot.realtime.image_layout import IncompatibleStreamError
 from faintspot.realtime.image_stream import ImageStream, ImageStreamWriter
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
@@ -171,7 +171,7 @@ def test_a_file_that_is_cut_or_replaced(folder: Path) -> None:
 )
 def test_other_metadata_are_refused(folder: Path, changes: dict[str, Any], naming: str) -> None:
     isio(folder, **changes)
-    with pytest.raises(Unfit, match=naming):
+    with pytest.raises(IncompatibleStreamError, match=naming):
         open_stream("isio:cam")
 
 
@@ -179,17 +179,17 @@ def test_what_is_no_stream_is_refused(folder: Path) -> None:
     with pytest.raises(FileNotFoundError):
         open_stream("isio:cam")
     (folder / "cam.im.shm").write_bytes(b"text")
-    with pytest.raises(Unfit, match="is no stream"):
+    with pytest.raises(IncompatibleStreamError, match="is no stream"):
         open_stream("isio:cam")
     os.mkfifo(folder / "pipe.im.shm")
-    with pytest.raises(Unfit, match="is no stream"):
+    with pytest.raises(IncompatibleStreamError, match="is no stream"):
         open_stream("isio:pipe")
     (folder / "sub.im.shm").mkdir()
-    with pytest.raises(Unfit, match="directory"):
+    with pytest.raises(IncompatibleStreamError, match="directory"):
         open_stream("isio:sub")
     content = DaoFile(folder / "dao.im.shm", (4, 2), "f4").memory[:]
     (folder / "dao.im.shm").write_bytes(content + b"more")
-    with pytest.raises(Unfit, match="it is of another version"):
+    with pytest.raises(IncompatibleStreamError, match="it is of another version"):
         open_stream("dao:./dao.im.shm")
     for bad in ("isio:a/b", "isio:", "dao:x y", f"dao:/{'x' * 90}"):
         with pytest.raises(InputError, match="expected"):
@@ -207,7 +207,7 @@ def test_random_metadata_never_end_the_process(folder: Path) -> None:
         (folder / "bad.im.shm").write_bytes(content)
         try:
             stream = open_stream("isio:bad")
-        except Unfit:
+        except IncompatibleStreamError:
             continue
         stream.read(None, 0.0)
         stream.close()

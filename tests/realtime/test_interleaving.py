@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.estimate.image_cases import refused
+from tests.algorithms.image_cases import refused
 from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
 import faintspot as fs
+from faintspot.pipeline.settings import without_denoising
 from faintspot.realtime.commands import commands_of
 from faintspot.realtime.interleaving import Interleaving, arms_after
-from faintspot.settings import without_denoising
 
 
 def test_texts() -> None:

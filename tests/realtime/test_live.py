@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.live import LiveSettings
 
 LAYOUT = fs.Layout.grid((2, 3), pixels=8)

@@ -21,7 +21,7 @@ import pytest
 from tests.patience import LIMIT_S
 
 import faintspot
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.pixel_ring import ARRIVALS, CLOSED, FRAME, ROWS, PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 

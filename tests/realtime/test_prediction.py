@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop import Arm, simulate_loop
+from faintspot.ao_loop.control import learnt_control
 from faintspot.control.configuration import Control
-from faintspot.loop import Arm, simulate_loop
-from faintspot.loop.control import learnt_control
+from faintspot.pipeline import configuration as configuration_file
 from faintspot.realtime.prediction_stream import PredictionStream
 from faintspot.realtime.prior import Prior
 

@@ -15,8 +15,8 @@ import pytest
 from tests.realtime.bench import LAYOUT, SETTINGS, make, simulated
 
 import faintspot as fs
+from faintspot.base.flags import INVALID
 from faintspot.estimators import Estimator, Positions
-from faintspot.flags import INVALID
 from faintspot.realtime.frame_path import Progress
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.python_path import PythonPath, tried

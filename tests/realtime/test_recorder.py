@@ -21,7 +21,7 @@ pytest.importorskip("zarr")
 
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import read_telemetry
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.realtime import recorder

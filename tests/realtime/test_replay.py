@@ -19,9 +19,9 @@ import pytest
 from click.testing import CliRunner
 
 import faintspot
+from faintspot.base.errors import InputError
 from faintspot.cli import realtime_sources
 from faintspot.cli.realtime_sources import replay
-from faintspot.errors import InputError
 from faintspot.io import FrameSource, open_frames
 from faintspot.realtime import replay as replay_module
 from faintspot.realtime.pixel_ring import PixelRing

@@ -20,7 +20,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime import shared_streams
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.shared_streams import create_stream, lock_file, pyshmem_module

@@ -17,7 +17,7 @@ import pytest
 from tests.patience import LIMIT_S
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes_of, write, write_images
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.telemetry import TelemetryReader, TelemetryRing

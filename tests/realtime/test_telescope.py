@@ -21,18 +21,18 @@ from uuid import uuid4
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.loop.loop_cases import faint, plain
+from tests.ao_loop.loop_cases import faint, plain
 
 import faintspot
 import faintspot as fs
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop import LoopRecord, simulate_loop
+from faintspot.ao_loop.calibration import make_pipeline
+from faintspot.ao_loop.engine_files import write_engine_files
+from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.base.errors import InputError
 from faintspot.cli.realtime_telescope import telescope_set, telescope_status
 from faintspot.control.reconstructor import make_reconstructor
-from faintspot.errors import InputError
-from faintspot.loop import LoopRecord, simulate_loop
-from faintspot.loop.calibration import make_pipeline
-from faintspot.loop.engine_files import write_engine_files
-from faintspot.loop.observatory import Observatory
+from faintspot.pipeline import configuration as configuration_file
 from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
@@ -124,7 +124,7 @@ def test_frames_and_truth_are_the_simulated_loops(record: LoopRecord, name: str,
 
 def test_realisations_differ(name: str) -> None:
     watched = Watched(name, realisation=1, seed=5)
-    observatory = Observatory(CONFIGURATION, 5, 1)
+    observatory = TelescopeModel(CONFIGURATION, 5, 1)
     seen = observatory.wavefronts(0.5e-3, np.zeros(COMMANDS))[1]
     np.testing.assert_array_equal(watched.frame(), observatory.frame(0, seen))
     watched.close()
@@ -149,7 +149,7 @@ def test_commands_act_on_the_next_exposure_but_one(watched: Watched, commands: A
 
 
 def test_a_missing_stream_leaves_the_mirror_flat_and_is_said_once(watched: Watched, name: str) -> None:
-    flat = Observatory(CONFIGURATION, CONFIGURATION.run.seed)
+    flat = TelescopeModel(CONFIGURATION, CONFIGURATION.run.seed)
     for number in range(3):
         after, _ = flat.wavefronts((number + 0.5) / 1000.0, np.zeros(COMMANDS))
         watched.frame()
@@ -254,7 +254,7 @@ def test_orders_take_effect_with_an_exposure(watched: Watched) -> None:
         "r0_m": (0.05, 0.05),
         "wind_factor": 2.0,
     }
-    expected = 2 * Observatory(CONFIGURATION, CONFIGURATION.run.seed).air.velocity
+    expected = 2 * TelescopeModel(CONFIGURATION, CONFIGURATION.run.seed).air.velocity
     np.testing.assert_array_equal(watched.telescope.observatory.air.velocity, expected)
 
 
@@ -330,13 +330,13 @@ def test_a_pace_that_cannot_be_kept_is_counted_and_said(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every exposure takes 5 frame times at least, whatever else the machine does."""
-    simulated = Observatory.frame
+    simulated = TelescopeModel.frame
 
-    def slow(self: Observatory, *arguments: Any) -> np.ndarray:
+    def slow(self: TelescopeModel, *arguments: Any) -> np.ndarray:
         time.sleep(0.005)
         return simulated(self, *arguments)
 
-    monkeypatch.setattr(Observatory, "frame", slow)
+    monkeypatch.setattr(TelescopeModel, "frame", slow)
     report = watched.telescope.run(6)
     assert report.frames == 6
     assert report.overruns >= 4 * 5
@@ -449,8 +449,8 @@ def test_files_keep_what_else_there_is(tmp_path: Path) -> None:
     assert (len(known.layout), known.calibration.read_noise_e) == (36, 1.0)
     reference = np.load(tmp_path / "reference_slopes.npy")
     assert reference.shape == (72,)
-    arm = faintspot.loop.Arm("-", known.settings)
-    sensor = Observatory(CONFIGURATION, 1).optics.sensor
+    arm = faintspot.ao_loop.Arm("-", known.settings)
+    sensor = TelescopeModel(CONFIGURATION, 1).optics.sensor
     frame = sensor.frame(sensor.spots(np.zeros((sensor.points,) * 2, np.float32))) * 1e6
     plain_slopes = fs.SlopePipeline(known.layout, known.settings, fs.Calibration(0.0), reference)(frame)
     np.testing.assert_allclose(plain_slopes.vector, 0, atol=1e-5)

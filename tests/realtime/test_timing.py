@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.timing import RESOLUTION, Counters, Latencies
 
 # From nothing to 130 s, each order of magnitude as likely as the others.

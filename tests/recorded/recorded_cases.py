@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Stages
 from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
 from faintspot.simulate import sensor_frames
-from faintspot.slopes import Stages
 
 SETTINGS = Settings(noise_std=0.3, keep_brightest=10)
 VOID = {"meta", "img", "br", "hr", "link", "input"}

@@ -7,7 +7,7 @@ import numpy as np
 from tests.recorded.recorded_cases import SETTINGS, sensor, simulated
 
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.recorded.frame_pictures import (
     Example,
     assembled,

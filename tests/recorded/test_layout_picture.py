@@ -9,7 +9,7 @@ import pytest
 from tests.recorded.recorded_cases import sensor, simulated
 from tests.shared_data import shared_file
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.recorded.layout_picture import layout_picture
 from faintspot.sensor.layout import Layout
 

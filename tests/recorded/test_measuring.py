@@ -162,10 +162,10 @@ def test_mean_light_of_the_recording(files: tuple[Path, Path, Path]) -> None:
     with pytest.raises(Stopped):
         measure_recorded([frames], configuration, output, **told, block_frames=8, progress=stop_after(8))
     assert measure_recorded([frames], configuration, output, **told).resumed_at == 8
-    layout, settings, calibration, _, _ = faintspot.configuration.load_all(configuration)
+    layout, settings, calibration, _, _ = faintspot.pipeline.configuration.load_all(configuration)
     pipeline = faintspot.SlopePipeline(layout, settings.replace(**changes), calibration)
-    light = faintspot.MeanLight(pipeline(simulated()).flux)
-    expected_slopes = pipeline.with_light(light)(simulated())
+    light = faintspot.MeanFlux(pipeline(simulated()).flux)
+    expected_slopes = pipeline.with_flux(light)(simulated())
     np.testing.assert_array_equal(read_slopes(output).variables["x"], expected_slopes.x)
     assert np.ptp(expected_slopes.flux / light.flux_e) > 0.01  # the light of frames differs
 

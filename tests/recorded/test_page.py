@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated, two_arms
 
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.pipeline import SlopePipeline
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.recorded.page import slopes_report
 from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.sensor.layout import Layout

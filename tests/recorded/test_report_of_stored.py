@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
 
-from faintspot import configuration
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io import create_writer
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline import configuration
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded, slopes_as_variables
 from faintspot.recorded.report_of_stored import report_of_stored
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.settings import Settings
 from faintspot.simulate import Detector
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 from faintspot.training import train_estimator
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")

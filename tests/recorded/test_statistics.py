@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintspot.errors import InputError
-from faintspot.flags import SubapertureFlag
+from faintspot.base.errors import InputError
+from faintspot.base.flags import SubapertureFlag
 from faintspot.recorded import statistics
 from faintspot.recorded.statistics import MeasuredSlopes
 

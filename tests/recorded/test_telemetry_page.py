@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.recorded.recorded_cases import Page
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.telemetry import Telemetry, TelemetryStore, read_telemetry
 from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
 from faintspot.recorded.telemetry_figures import latency_figure

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from faintspot.errors import MissingExtraError
+from faintspot.base.errors import MissingExtraError
 from faintspot.report.drawing import limits_of, new_figure, plain_ticks, png, subaperture_shapes, svg
 from faintspot.sensor.layout import Layout
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.recorded.recorded_cases import Page as Reader
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.report.drawing import new_figure
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import (

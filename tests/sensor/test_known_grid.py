@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import Layout
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.sensor.known_grid import find_illuminated
 from faintspot.simulate import Detector, sensor_frames
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 from tests.shared_data import shared_file
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.sensor.lenslets import LensletGrid, find_lenslets
 
 RATIOS = {"square": 1j, "hexagonal": np.exp(1j * np.pi / 3)}

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.shared_data import shared_file
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.photon_transfer import measure_detector
 from faintspot.simulate import Detector, sensor_frames

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.shared_data import shared_file
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, sensor_frames, spots, subapertures
 
 QUIET = Detector(0.0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.simulate.photometry import ZERO_POINTS, Photometry
 
 LIGHT = Photometry(area_m2=0.36, frame_time_s=0.004)

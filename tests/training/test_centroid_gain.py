@@ -9,7 +9,7 @@ import pytest
 
 import faintspot as fs
 from faintspot.estimators.window import Window
-from faintspot.simulate.spots import spots
+from faintspot.spots.shapes import spots
 from faintspot.training import measure_centroid_gain
 
 FRAMES = 2000

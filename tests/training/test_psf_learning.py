@@ -9,10 +9,10 @@ import pytest
 from tests.shared_data import shared_file
 from tests.training.psf_cases import simulated, slope_error, true_psf
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import image_stack, learn_psf, learn_psf_from_images
 from faintspot.training.registration import Tables, register
 from faintspot.training.registration import start as first_positions

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import Calibration, Layout
-from faintspot.errors import InputError
-from faintspot.sensor.score import TrainedScore
+from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, subapertures
+from faintspot.spots.score import TrainedScore
 from faintspot.training import train_estimator, train_from_frames
 from faintspot.training.recorded import _Splitter
 

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.errors import InputError
-from faintspot.sensor.score import TrainedScore
+from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, subapertures
+from faintspot.spots.score import TrainedScore
 from faintspot.training import train_estimator
 from faintspot.training.simulation import flux_classes
 

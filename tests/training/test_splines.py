@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from faintspot.sensor.score import table_sums
+from faintspot.spots.score import table_sums
 from faintspot.training.splines import STEPS_PER_PX, SYMMETRIES, SplineTables, cubic_b_spline, splines_for
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faintspot.errors import InputError
-from faintspot.sensor.psf import PSF
+from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, subapertures
-from faintspot.simulate.turbulence import speckled_spots
+from faintspot.spots.psf import PSF
+from faintspot.spots.speckled import speckled_spots
 from faintspot.training.psf_learning import fit_spots
 from faintspot.training.spot_transfer import measure_on_spots, variance_over_expected
 

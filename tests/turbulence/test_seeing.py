@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from tests.loop.loop_cases import faint, plain
+from tests.ao_loop.loop_cases import faint, plain
 
-from faintspot.errors import InputError
-from faintspot.loop import LoopRecord, simulate_loop
-from faintspot.loop.pseudo_open_loop import r0_of_record
+from faintspot.ao_loop import LoopRecord, simulate_loop
+from faintspot.ao_loop.pseudo_open_loop import r0_of_record
+from faintspot.base.errors import InputError
 from faintspot.turbulence.seeing import KOLMOGOROV, Seeing, estimate_r0, mean_r0, slope_variance
 
 SIDE = 0.6

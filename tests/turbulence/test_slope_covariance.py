@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from tests.control.control_cases import COVARIANCES, TURBULENCE
 
-from faintspot.loop import LoopConfiguration
-from faintspot.loop.atmosphere import make_atmosphere
-from faintspot.loop.control import slope_turbulence
+from faintspot.ao_loop import LoopConfiguration
+from faintspot.ao_loop.atmosphere import make_atmosphere
+from faintspot.ao_loop.control import slope_turbulence
 from faintspot.turbulence.seeing import slope_variance
 from faintspot.turbulence.slope_covariance import SlopeTurbulence, phase_covariance_rad2
 

@@ -10,20 +10,20 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot import configuration
-from faintspot.checks import finite_array, number_between
-from faintspot.errors import InputError
-from faintspot.light import MeanLight
-from faintspot.pipeline import SlopePipeline
+from faintspot.base.checks import finite_array, number_between
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_keys, checked_table
+from faintspot.config.tables import read_tables
+from faintspot.pipeline import configuration
+from faintspot.pipeline.mean_flux import MeanFlux
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
-from faintspot.settings import Settings
-from faintspot.slopes import Slopes
-from faintspot.tables import read_tables
-from faintspot.toml_files import check_keys, checked_table
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
 
 CALIBRATION_LIGHT_E = 1000.0
 """Light (electrons) of a sub-aperture at which frames without noise are measured."""
@@ -196,7 +196,7 @@ class ToolSlopes:
         follows = light_frames is not None and settings.estimator.uses_light and not known
         self._light_frames = light_frames if follows else None
         self._first_light: list[NDArray[np.float32]] = []
-        self._light: MeanLight | None = None
+        self._light: MeanFlux | None = None
         self._frames = 0
         self.noise_free = False
         """Whether frames are a calibration's, without noise, as in `calibrating`."""
@@ -269,7 +269,7 @@ class ToolSlopes:
         return in_px * np.abs(self.unit_per_px)
 
     @property
-    def light(self) -> MeanLight | None:
+    def light(self) -> MeanFlux | None:
         """The running mean of the light, once there is one."""
         return self._light
 
@@ -282,10 +282,10 @@ class ToolSlopes:
         elif self._frames < _FIRST_FRAMES:
             self._first_light.append(flux_e)
         else:
-            self._light = MeanLight(np.array([*self._first_light, flux_e]), self._light_frames)
+            self._light = MeanFlux(np.array([*self._first_light, flux_e]), self._light_frames)
             self._first_light.clear()
         if self._light is not None and self._frames % _FOLLOW_EVERY == 0:
-            self.pipeline = self.pipeline.with_light(self._light)
+            self.pipeline = self.pipeline.with_flux(self._light)
 
     def _calibrated(self, frame: Any) -> Slopes:
         """Measure a frame without noise at the light of calibrations."""
@@ -308,7 +308,7 @@ class ToolSlopes:
             bright = settings.replace(estimator=settings.estimator.for_bright_light(), flux_e=None)
             self._bright = pipeline.with_settings(bright).for_images()
         if self._bright.settings.estimator.uses_light:
-            self._bright = self._bright.with_light(np.maximum(light * factor, _LEAST_LIGHT_E))
+            self._bright = self._bright.with_flux(np.maximum(light * factor, _LEAST_LIGHT_E))
         slopes = self._bright((images * factor).reshape(-1, layout.window[1]))
         found = int(np.count_nonzero(slopes.valid))
         if 2 * found < len(layout):

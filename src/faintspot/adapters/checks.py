@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import real_array
-from faintspot.errors import InputError
+from faintspot.base.checks import real_array
+from faintspot.base.errors import InputError
 
 
 class UntestedVersionWarning(UserWarning):

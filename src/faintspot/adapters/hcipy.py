@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.adapters.base import Options, ToolSlopes, largest_window, layout_around, on_detector
 from faintspot.adapters.checks import check_version, predicted
-from faintspot.checks import finite_array, number_between
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.pipeline import SlopePipeline
+from faintspot.base.checks import finite_array, number_between
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
-from faintspot.settings import Settings
-from faintspot.slopes import Slopes
 
 try:
     import hcipy

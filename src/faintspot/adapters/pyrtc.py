@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, ToolSlopes, layout_around, parts_of
 from faintspot.adapters.checks import check_version
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.realtime.stream import Follower
 
 TESTED = "2.1.0", "2.1.0"

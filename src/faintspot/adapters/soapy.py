@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from faintspot.adapters.base import Options, ToolSlopes
 from faintspot.adapters.checks import check_version
 from faintspot.adapters.spots import Spots
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.pipeline.settings import Settings
 from faintspot.sensor.calibration import Calibration
-from faintspot.settings import Settings
 
 TESTED = "0.15.0", "0.15.0"
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from faintspot.adapters.base import Options, ToolSlopes
 from faintspot.adapters.checks import predicted
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.pipeline.settings import Settings
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
 
 
 class Spots:

@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import configuration
 from faintspot.advice.centroid_gain import electrons_of
 from faintspot.advice.known import Known, of_air, of_images
 from faintspot.advice.proposals import Progress, Proposal, Sensor, new_estimators, new_gain, new_light
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
 from faintspot.advice.seen import seen_in_telemetry
 from faintspot.advice.trial import Loop, Verdict, try_on
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived, parse_json, write_atomically
 from faintspot.control.configuration import load_control
 from faintspot.control.learnt import INTEGRATOR
-from faintspot.errors import InputError
 from faintspot.experiments.statistics import Estimate, mean_by_blocks
-from faintspot.files import derived, parse_json, write_atomically
 from faintspot.io.telemetry import Telemetry
-from faintspot.settings import Settings
+from faintspot.pipeline import configuration
+from faintspot.pipeline.settings import Settings
 
 Floats = NDArray[np.float64]
 JOURNAL = ".advice.json"

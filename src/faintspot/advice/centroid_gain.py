@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintspot.control.telemetry import without_prior
 from faintspot.experiments.statistics import Estimate
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 
 Floats = NDArray[np.float64]

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import calibration_of_electrons
 from faintspot.advice.seen import Seen
-from faintspot.errors import InputError
-from faintspot.estimate.noise import pixel_noise
-from faintspot.loop.configuration import ARCSEC
+from faintspot.algorithms.noise import pixel_noise
+from faintspot.ao_loop.configuration import ARCSEC
+from faintspot.base.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import learn_psf_from_images
 from faintspot.turbulence.seeing import estimate_r0
 from faintspot.turbulence.slope_covariance import SlopeTurbulence

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gain
 from faintspot.advice.seen import Seen
+from faintspot.base.errors import InputError
 from faintspot.control.learnt import Plant
 from faintspot.control.telemetry import Telemetry, replayed
-from faintspot.errors import InputError
 from faintspot.estimators.base import Need
 from faintspot.estimators.window import Window
 from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate, paired_mean
 from faintspot.experiments.tuning import tune
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
-from faintspot.settings import Settings
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from faintspot.advice.seen import Seen
 from faintspot.experiments.loop_results import neighbour_differences
 from faintspot.experiments.statistics import Estimate, paired_mean
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import RESULT_TYPES, Slopes
 from faintspot.wavefront.fit import fit_wavefront
 
 Floats = NDArray[np.float64]

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, MODAL
 from faintspot.control.recording import check_commands, recorded_slopes
 from faintspot.control.telemetry import without_prior
-from faintspot.errors import InputError
 from faintspot.io.telemetry import Telemetry
 
 Floats = NDArray[np.float64]

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import electrons_of
 from faintspot.advice.seen import Seen, without_priors
-from faintspot.loop.arms import Arm
-from faintspot.loop.camera import camera_calibration
-from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.control import prior_std_px
-from faintspot.loop.observatory import Observatory
-from faintspot.loop.record import LoopRecord
+from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.camera import camera_calibration
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.control import prior_std_px
+from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.ao_loop.record import LoopRecord
 
 
 def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> Seen:
@@ -37,7 +37,7 @@ def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> Seen:
 def frames_of_record(record: LoopRecord, numbers: Sequence[int]) -> NDArray[np.float32]:
     """Return some frames of a run, (images, h, w) electrons, made anew from what the mirror held."""
     configuration = LoopConfiguration.from_text(record.configuration)
-    observatory = Observatory(configuration, record.seed, record.realisation)
+    observatory = TelescopeModel(configuration, record.seed, record.realisation)
     frames = []
     for number in numbers:
         time_s = (number + 0.5) / record.frame_rate_hz

@@ -16,14 +16,14 @@ from faintspot.advice.proposals import Proposal, Sensor
 from faintspot.advice.residual import compared_residual, residual_wavefront
 from faintspot.advice.seen import Seen, seen_in_telemetry
 from faintspot.advice.watching import watch
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, prior_std_px
-from faintspot.errors import InputError
 from faintspot.experiments.statistics import Estimate
 from faintspot.io.telemetry import Telemetry
+from faintspot.pipeline.settings import Settings
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.control_loop import BY_REQUEST, CLOSED
 from faintspot.realtime.private_socket import socket_path
-from faintspot.settings import Settings
 
 Floats = NDArray[np.float64]
 _TURN_FRAMES = 100

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry import Telemetry, stored_names
+from faintspot.pipeline.settings import Settings, option_names
 from faintspot.realtime.interleaving import arms_after
 from faintspot.realtime.telemetry import TelemetryReader
-from faintspot.settings import Settings, option_names
-from faintspot.toml_files import parse_text
 
 _LOOK_S = 0.05
 _MOST_IMAGES = 400

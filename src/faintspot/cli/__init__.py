@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from faintspot import __version__
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",

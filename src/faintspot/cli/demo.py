@@ -13,16 +13,16 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from faintspot import configuration
+from faintspot.base.errors import InputError
+from faintspot.base.files import write_atomically
 from faintspot.cli import demo_live
 from faintspot.cli.needs import can_make
 from faintspot.cli.progress import progress_bar
-from faintspot.errors import InputError
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import Comparison
-from faintspot.files import write_atomically
 from faintspot.io.slopes import read_slopes
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline import configuration
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from faintspot.base.errors import MissingExtraError
+from faintspot.base.extras import present, require_linux
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.errors import MissingExtraError
-from faintspot.extras import present, require_linux
 
 if TYPE_CHECKING:
     from faintspot.experiments.statistics import Estimate

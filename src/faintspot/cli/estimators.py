@@ -22,7 +22,7 @@ def command(name: str | None, markdown: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from faintspot.settings import SharedOptions
+    from faintspot.pipeline.settings import SharedOptions
 
     if markdown:
         for title, text in all_tables(SharedOptions).items():

@@ -11,20 +11,20 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import configuration
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
 from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
-from faintspot.errors import InputError
 from faintspot.experiments.first_settings import FirstSettings, first_settings
-from faintspot.files import derived
 from faintspot.io.frames import FrameSource, open_frames
+from faintspot.pipeline import configuration
+from faintspot.pipeline.settings import Settings
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.found_layout import FoundLayout, find_layout
 from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.known_grid import KnownGrid
 from faintspot.sensor.layout import GEOMETRIES, Layout
-from faintspot.settings import Settings
 
 _MOST_FRAMES = 200  # averaged to find the spots
 _MOST_NAMED = 12  # sub-apertures in one line

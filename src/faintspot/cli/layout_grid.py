@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.errors import InputError
 from faintspot.cli import layout_options
-from faintspot.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.known_grid import KnownGrid, find_illuminated
 from faintspot.sensor.layout import Layout

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import configuration
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.config.tables import read_tables
+from faintspot.pipeline import configuration
 from faintspot.sensor.calibration import Calibration, read_map
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW
-from faintspot.tables import read_tables
 
 
 def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: str) -> list[float] | None:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+from faintspot.base.extras import require, require_linux
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import ENGINE_NAME
-from faintspot.extras import require, require_linux
 
 if TYPE_CHECKING:
     from faintspot.live_page.server import LiveServer

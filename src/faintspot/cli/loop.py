@@ -16,7 +16,7 @@ from faintspot.cli.progress import progress_bar
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from faintspot.experiments.running import Workplace
+    from faintspot.experiments.running import WorkerPool
 
 
 _needs_loop = needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
@@ -67,7 +67,7 @@ def command() -> None:
 @command.command(name="list", short_help="List the shipped configurations.")
 def list_shipped() -> None:
     """List the shipped configurations."""
-    from faintspot.loop.configuration import load_loop, shipped_loops
+    from faintspot.ao_loop.configuration import load_loop, shipped_loops
 
     for name in shipped_loops():
         loop = load_loop(name)
@@ -84,7 +84,7 @@ def list_shipped() -> None:
 @click.argument("name", metavar="CONFIG")
 def show(name: str) -> None:
     """Print a configuration, shipped or of a file, as TOML with every value written out."""
-    from faintspot.loop.configuration import load_loop
+    from faintspot.ao_loop.configuration import load_loop
 
     click.echo(load_loop(name).to_text(), nl=False)
 
@@ -103,9 +103,9 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
       faintspot loop run --quick
       faintspot loop run mine.toml -o mine
     """
+    from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.interleaved import run_interleaved
     from faintspot.experiments.loop_verdict import interleaved_summary
-    from faintspot.loop.configuration import load_loop
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
@@ -145,9 +145,9 @@ def magnitude(
       faintspot loop magnitude diffraction_limit --arms map_predicted,map+kalman --photons 20
       faintspot loop magnitude camera_3e --arms brightest,smoothed,tv,ml --photons 60,200,640
     """
+    from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.loop_verdict import magnitude_summary
     from faintspot.experiments.magnitude import run_magnitude
-    from faintspot.loop.configuration import load_loop
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
@@ -176,9 +176,9 @@ def budget(
     Examples:
       faintspot loop budget camera_3e --quick
     """
+    from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.budget import run_budget
     from faintspot.experiments.loop_verdict import budget_summary
-    from faintspot.loop.configuration import load_loop
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
@@ -220,8 +220,8 @@ def engine(configuration: str, folder: str, control: str, rate: float | None) ->
       faintspot loop engine canary -o bench
       faintspot loop engine faintspot-loop.toml --control kalman
     """
-    from faintspot.loop.configuration import load_loop
-    from faintspot.loop.engine_files import write_engine_files
+    from faintspot.ao_loop.configuration import load_loop
+    from faintspot.ao_loop.engine_files import write_engine_files
 
     loop = load_loop(configuration)
     if rate is not None:
@@ -231,12 +231,12 @@ def engine(configuration: str, folder: str, control: str, rate: float | None) ->
 
 
 @contextmanager
-def _workplace(workers: int | None, scheduler: str | None) -> Iterator[Workplace]:
+def _workplace(workers: int | None, scheduler: str | None) -> Iterator[WorkerPool]:
     """Yield where the work is done, with a progress bar."""
-    from faintspot.experiments.running import Workplace
+    from faintspot.experiments.running import WorkerPool
 
     with progress_bar("loop") as advance:
-        yield Workplace(workers, scheduler, advance, lambda text: click.echo(text, err=True))
+        yield WorkerPool(workers, scheduler, advance, lambda text: click.echo(text, err=True))
 
 
 def _folder(name: str, quick: bool) -> str:
@@ -262,7 +262,7 @@ def _arms(text: str) -> list[str]:
 
 
 def _number(text: str) -> float:
-    from faintspot.errors import InputError
+    from faintspot.base.errors import InputError
 
     try:
         return float(text)

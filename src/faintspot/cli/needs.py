@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from faintspot.errors import MissingExtraError
-from faintspot.extras import present, require, require_linux
+from faintspot.base.errors import MissingExtraError
+from faintspot.base.extras import present, require, require_linux
 
 
 def needs(extra: str, *packages: str) -> Callable[[click.Command], click.Command]:

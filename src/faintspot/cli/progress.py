@@ -17,7 +17,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from faintspot.extras import present
+from faintspot.base.extras import present
 
 
 class _Rate(ProgressColumn):

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.base.errors import InputError
+from faintspot.base.extras import require_linux
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.shared_options import ENGINE_NAME, configuration_option
-from faintspot.errors import InputError
-from faintspot.extras import require_linux
 
 if TYPE_CHECKING:
     from faintspot.advice.advising import Advice
     from faintspot.advice.trial import Loop
-    from faintspot.settings import Settings
+    from faintspot.pipeline.settings import Settings
 
 
 @needs("realtime", "pyshmem", "zarr")

@@ -6,10 +6,10 @@ from typing import Any
 
 import click
 
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import derived
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import configuration_option, name_option
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import derived
 
 
 @needs("realtime", "pyshmem")

@@ -51,7 +51,7 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
     Example:
       faintspot realtime set noise_std=2.5 keep_brightest=20 --subapertures 4,5,10-20
     """
-    from faintspot.written_changes import parse_changes, parse_subapertures
+    from faintspot.config.written_changes import parse_changes, parse_subapertures
 
     where = None if subapertures is None else parse_subapertures(subapertures)
     wanted = {"changes": parse_changes(changes), "where": where}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import click
 
+from faintspot.base.errors import InputError
 from faintspot.cli.engine_requests import asked_at_length
 from faintspot.cli.realtime_control import since
 from faintspot.cli.shared_options import ENGINE_NAME
-from faintspot.errors import InputError
 
 _FILE = click.argument("file", metavar="FILE", type=click.Path(dir_okay=False, resolve_path=True))
 _USE = click.option("--use", is_flag=True, help="Measure with it from now on, as set estimator=NAME does.")

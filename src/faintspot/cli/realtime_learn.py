@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import configuration_option
-from faintspot.errors import InputError
-from faintspot.files import derived
 
 
 @needs("realtime", "zarr")
@@ -58,8 +58,8 @@ def learn(
     from faintspot.control.learning import learn as learnt_by
     from faintspot.control.recording import telemetry_of_recording, theories_of
     from faintspot.io import read_telemetry
+    from faintspot.pipeline.settings import Settings
     from faintspot.sensor.layout import Layout
-    from faintspot.settings import Settings
 
     control = load_control(config)
     if control is None:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.base.errors import InputError
+from faintspot.base.extras import require
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import ENGINE_NAME
-from faintspot.errors import InputError
-from faintspot.extras import require
 
 if TYPE_CHECKING:
     from faintspot.realtime.recorder import RecordingReport

@@ -93,15 +93,15 @@ def run(
       faintspot realtime run --interleave none,tv --every 50
       faintspot realtime run --close-loop --interleave window+integrator,map+kalman --every 250
     """
-    from faintspot import configuration
+    from faintspot.base.errors import InputError
+    from faintspot.config.written_changes import parse_subapertures
     from faintspot.control.configuration import load_control
-    from faintspot.errors import InputError
+    from faintspot.pipeline import configuration
     from faintspot.realtime.commands import LENGTHY, commands_of
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.engine import Engine
     from faintspot.realtime.interleaving import Interleaving
     from faintspot.realtime.scheduling import real_time
-    from faintspot.written_changes import parse_subapertures
 
     layout, settings, calibration, psf, score = configuration.load_all(config)
     control = None if no_control else load_control(config)
@@ -142,7 +142,7 @@ def run(
 
 def _pipeline(layout: Any, calibration: Any, psf: Any, score: Any, reference: Any, settings: Any) -> Any:
     """The pipeline of the configuration with other settings; a function that other processes can be given."""
-    from faintspot.pipeline import SlopePipeline
+    from faintspot.pipeline.slope_pipeline import SlopePipeline
 
     return SlopePipeline(layout, settings, calibration, reference, psf=psf, score=score)
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from faintspot.base.errors import InputError
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.shared_options import name_option
-from faintspot.errors import InputError
 
 if TYPE_CHECKING:
     from faintspot.realtime.bridge import BridgeCounters

@@ -71,8 +71,8 @@ def telescope(
       faintspot realtime run --config bench/faintspot.toml
       faintspot realtime telescope-set photons=50 seeing_arcsec=1.2
     """
-    from faintspot.loop.configuration import load_loop
-    from faintspot.loop.engine_files import write_engine_files
+    from faintspot.ao_loop.configuration import load_loop
+    from faintspot.ao_loop.engine_files import write_engine_files
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.scheduling import real_time
     from faintspot.realtime.telescope import SimulatedTelescope
@@ -118,7 +118,7 @@ def telescope_set(name: str, changes: tuple[str, ...]) -> None:
     Example:
       faintspot realtime telescope-set magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
     """
-    from faintspot.written_changes import parse_changes
+    from faintspot.config.written_changes import parse_changes
 
     reply = request(socket_path(name, TELESCOPE), "set", changes=parse_changes(changes))
     frame, conditions = reply["frame"], reply["conditions"]

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
+from faintspot.ao_loop.files import holds_loop_results
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
 from faintspot.cli.needs import needs
-from faintspot.errors import InputError
 from faintspot.experiments.store import kind_of_store
-from faintspot.files import derived
 from faintspot.io.locations import split_location
 from faintspot.io.zarr_store import holds_telemetry
-from faintspot.loop.files import holds_loop_results
 
 
 @needs("web", "matplotlib", "jinja2")

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import click
 
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.flags import SubapertureFlag
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.shared_options import REFERENCE, configuration_option
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.flags import SubapertureFlag
+from faintspot.config.presets import PRESETS
+from faintspot.config.written_changes import parse_changes
 from faintspot.io.formats import slope_format
 from faintspot.io.slopes_format import UNITS
-from faintspot.presets import PRESETS
 from faintspot.recorded import Summary, measure_recorded
-from faintspot.written_changes import parse_changes
 
 
 @click.command(short_help="Turn recorded frames into slopes.")

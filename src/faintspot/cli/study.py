@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.base.files import derived, write_atomically
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
-from faintspot.files import derived, write_atomically
 
 if TYPE_CHECKING:
     import xarray

@@ -14,16 +14,16 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from faintspot import configuration
+from faintspot.base.errors import InputError
 from faintspot.cli import tune_loop
 from faintspot.cli.layout_options import grid_shape
 from faintspot.cli.needs import suggested_slopes
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
-from faintspot.errors import InputError
 from faintspot.experiments import answer_text
 from faintspot.experiments.question import PROFILES, TABLES, read_camera
 from faintspot.io.frames import open_frames
+from faintspot.pipeline import configuration
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.simulate.photometry import (

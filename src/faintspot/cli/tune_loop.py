@@ -12,9 +12,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from faintspot.base.errors import InputError
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
-from faintspot.errors import InputError
 
 if TYPE_CHECKING:
     from faintspot.experiments.loop_answer import LoopAnswer
@@ -70,13 +70,13 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
     check_target(target, options["overwrite"])
     picture = picture_file(target, options["picture"])
     question = _question(config, options)
+    from faintspot.ao_loop.engine_files import CONFIGURATION as ENGINE_FILE
     from faintspot.experiments.loop_tuning import tune_loop
-    from faintspot.experiments.running import Workplace
-    from faintspot.loop.engine_files import CONFIGURATION as ENGINE_FILE
+    from faintspot.experiments.running import WorkerPool
 
     folder = options["folder"] or f"{question.configuration.name}-tune"
     with progress_bar("loop") as advance:
-        place = Workplace(options["workers"], progress=advance)
+        place = WorkerPool(options["workers"], progress=advance)
         answer = tune_loop(question, folder, place=place, overwrite=options["overwrite"])
     show(answer)
     loop = answer.save(target)
@@ -170,8 +170,8 @@ def _table() -> Table:
 
 
 def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
+    from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.loop_question import LoopQuestion
-    from faintspot.loop.configuration import load_loop
 
     loop = load_loop(config)
     if options["magnitude"] is not None and options["flux_e"] is not None:

@@ -9,9 +9,9 @@ from typing import Any
 import click
 from rich.console import Console
 
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived, write_atomically
 from faintspot.cli.needs import can_make
-from faintspot.errors import InputError
-from faintspot.files import derived, write_atomically
 
 _WIDEST_TEXT = 110
 

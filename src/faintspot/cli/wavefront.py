@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
+from faintspot.base.errors import InputError
+from faintspot.base.extras import require
 from faintspot.cli.needs import can_make
-from faintspot.errors import InputError
-from faintspot.extras import require
 from faintspot.recorded.stored_run import open_run
 from faintspot.sensor.layout import Layout
 from faintspot.wavefront import Wavefront, fit_wavefront, save_wavefront
@@ -104,7 +104,7 @@ def _print(wavefront: Wavefront) -> None:
 
 def _draw(wavefront: Wavefront, layout: Layout, slopes: Path, picture: str | None) -> str:
     """Draw it and say where."""
-    from faintspot.files import derived, write_atomically
+    from faintspot.base.files import derived, write_atomically
     from faintspot.report.drawing import png
     from faintspot.wavefront.figure import wavefront_figure
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.files import derived, write_atomically
+from faintspot.base.npz import save_arrays
 from faintspot.control.configuration import INTERACTION, REFERENCE, save_control
 from faintspot.control.mirror_calibration import MirrorCalibration
-from faintspot.files import derived, write_atomically
-from faintspot.npz import save_arrays
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]

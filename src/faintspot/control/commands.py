@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-class CommandLine:
+class CommandDelayLine:
     """Commands that act some frames after they were computed; all controllers of a mirror share it.
 
     Its memory is made once: what `acting` and `latest` return is good until the next command is sent.

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.flags import INVALID
 from faintspot.control.base import Expected
-from faintspot.control.commands import CommandLine
-from faintspot.flags import INVALID
+from faintspot.control.commands import CommandDelayLine
 from faintspot.kernels.compiling import Direct, compiled_with
 
 Floats = NDArray[np.float64]
@@ -95,7 +95,7 @@ def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, row
         The reconstructor, transposed, see `add_products`.
     gain, keep, largest : float
     rows : (delay + 1, commands) float64 array
-        Of a `CommandLine`.
+        Of a `CommandDelayLine`.
     place : int
         Which row to write; the latest command is in the one before.
     """
@@ -119,7 +119,7 @@ class CompiledIntegrator:
 
     Parameters
     ----------
-    line : CommandLine
+    line : CommandDelayLine
     interaction : (m, commands) array
         Slopes in px that a unit of each command adds.
     reconstruct : (commands, m) array
@@ -133,7 +133,7 @@ class CompiledIntegrator:
     undoes_prior = False
 
     def __init__(
-        self, line: CommandLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
+        self, line: CommandDelayLine, interaction: Floats, reconstruct: Floats, gain: float, leak: float
     ) -> None:
         self._line, self._interaction = line, interaction
         self._columns = np.ascontiguousarray(reconstruct.T, np.float64)

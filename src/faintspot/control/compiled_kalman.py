@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Expected
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.kalman import SlopePredictor, shares
 from faintspot.control.kalman_kernels import (
     CHOSEN,
@@ -42,7 +42,7 @@ class CompiledKalman:
 
     Parameters
     ----------
-    line : CommandLine
+    line : CommandDelayLine
         To the mirror.
     interaction : (m, commands) array
     reconstruct : (commands, m) array
@@ -66,7 +66,7 @@ class CompiledKalman:
 
     def __init__(
         self,
-        line: CommandLine,
+        line: CommandDelayLine,
         interaction: Floats,
         reconstruct: Floats,
         predictor: SlopePredictor,
@@ -81,7 +81,9 @@ class CompiledKalman:
     ) -> None:
         self._line, self._interaction = line, interaction
         slopes, commands = interaction.shape
-        self._learnt, self._plain = (CommandLine(commands, line.delay_frames, line.largest) for _ in range(2))
+        self._learnt, self._plain = (
+            CommandDelayLine(commands, line.delay_frames, line.largest) for _ in range(2)
+        )
         self.prior_std_px = prior_std_px
         ahead = -clean @ predictor.model.ahead(line.delay_frames)
         usual = predictor.usual_px2

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import finite_array
+from faintspot.base.checks import finite_array
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_keys
+from faintspot.config.options import Options, option
+from faintspot.config.tables import errors_of_table, read_tables, save_tables
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, POLC, Learnt, Model, Plant
 from faintspot.control.reconstructor import Reconstructor, make_reconstructor
-from faintspot.errors import InputError
 from faintspot.io.frames import read_array
-from faintspot.options import Options, option
+from faintspot.pipeline.settings import Settings
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
-from faintspot.tables import errors_of_table, read_tables, save_tables
-from faintspot.toml_files import check_keys
 
 Floats = NDArray[np.float64]
 
@@ -249,12 +249,12 @@ class Control:
                 "camera's read noise: calibration.read_noise_e"
             )
 
-    def line(self) -> CommandLine:
+    def line(self) -> CommandDelayLine:
         """Return the way of commands to a mirror that is flat."""
         options = self.options
-        return CommandLine(self.commands, options.delay_frames, options.largest_command or _BEYOND_ALL)
+        return CommandDelayLine(self.commands, options.delay_frames, options.largest_command or _BEYOND_ALL)
 
-    def controller(self, line: CommandLine) -> Controller:
+    def controller(self, line: CommandDelayLine) -> Controller:
         """Return the controller, which sends its commands along `line`."""
         options, matrix = self.options, self.reconstructor.matrix
         if options.controller == INTEGRATOR:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Controller, Expected
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ class Guarded:
 
     Parameters
     ----------
-    line : CommandLine
+    line : CommandDelayLine
         To the true mirror.
     interaction : (m, commands) array
     reconstruct : (commands, m) array
@@ -48,11 +48,11 @@ class Guarded:
 
     def __init__(
         self,
-        line: CommandLine,
+        line: CommandDelayLine,
         interaction: Floats,
         reconstruct: Floats,
-        learnt: Callable[[CommandLine], Controller],
-        plain: Callable[[CommandLine], Controller],
+        learnt: Callable[[CommandDelayLine], Controller],
+        plain: Callable[[CommandDelayLine], Controller],
         *,
         prior_std_px: Floats | None = None,
         noise_factor: float = 1.0,
@@ -60,7 +60,7 @@ class Guarded:
     ) -> None:
         self._line, self._interaction, self._reconstruct = line, interaction, reconstruct
         of_both = interaction.shape[1], line.delay_frames, line.largest
-        self._lines = [CommandLine(*of_both) for _ in range(2)]
+        self._lines = [CommandDelayLine(*of_both) for _ in range(2)]
         makers = (learnt, plain)
         self.controllers = [make(own) for make, own in zip(makers, self._lines, strict=True)]
         self.prior_std_px, self._noise_factor = prior_std_px, noise_factor

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Expected
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.reconstructor import Reconstructor
 
 Floats = NDArray[np.float64]
@@ -17,7 +17,7 @@ class Integrator:
 
     Parameters
     ----------
-    line : CommandLine
+    line : CommandDelayLine
     interaction : (2 n, commands) array
         Slopes in px that a unit of each command adds.
     reconstructor : Reconstructor
@@ -36,7 +36,7 @@ class Integrator:
 
     def __init__(
         self,
-        line: CommandLine,
+        line: CommandDelayLine,
         interaction: Floats,
         reconstructor: Reconstructor,
         gain: float | Floats,

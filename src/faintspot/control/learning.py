@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.identification import Strengths, identify
 from faintspot.control.kalman import SlopePredictor
 from faintspot.control.learnt import (
@@ -66,7 +66,7 @@ def learn(
         return Learnt(plant, _pseudo_open_loop(plant, telemetry, *of_all))
     clean = plant.reconstructor.clean
 
-    def predictive(model: SlopeModel, variance_px2: Floats, line: CommandLine) -> Controller:
+    def predictive(model: SlopeModel, variance_px2: Floats, line: CommandDelayLine) -> Controller:
         return Predictive(line, plant.interaction, SlopePredictor(model, variance_px2), clean)
 
     def score(model: SlopeModel, frames: Telemetry) -> float:

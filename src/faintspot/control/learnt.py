@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import numbers_between, one_of
+from faintspot.base.checks import numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays, save_arrays
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.guarded import Guarded
 from faintspot.control.integrator import Integrator
@@ -22,11 +24,9 @@ from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
 from faintspot.control.telemetry import Telemetry, replayed
-from faintspot.errors import InputError
-from faintspot.npz import read_arrays, save_arrays
 
 Floats = NDArray[np.float64]
-Make = Callable[[CommandLine], Controller]
+Make = Callable[[CommandDelayLine], Controller]
 
 INTEGRATOR, MODAL, POLC, KALMAN = "integrator", "modal", "polc", "kalman"
 CONTROLS = {
@@ -72,7 +72,7 @@ class Plant:
     delay_frames: int
     leak: float
 
-    def integrator(self, gain: float | Floats, line: CommandLine) -> Controller:
+    def integrator(self, gain: float | Floats, line: CommandDelayLine) -> Controller:
         """Return an integrator of this loop."""
         return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
 
@@ -99,7 +99,7 @@ class Model:
     that it has not learnt from."""
     description: str = ""
 
-    def controller(self, plant: Plant, line: CommandLine) -> Controller:
+    def controller(self, plant: Plant, line: CommandDelayLine) -> Controller:
         """Return the controller that has learnt."""
         arrays = self.arrays
         if self.kind == MODAL:
@@ -210,7 +210,9 @@ class Learnt:
         """(m,): how sure it is of the slopes that it expects; None: it does not know."""
         return self.model.expected_std_px
 
-    def controller(self, line: CommandLine, prior_std_px: Floats | None = None) -> Guarded | CompiledKalman:
+    def controller(
+        self, line: CommandDelayLine, prior_std_px: Floats | None = None
+    ) -> Guarded | CompiledKalman:
         """Return the controller; with the estimator's prior where it has one."""
         plant, model = self.plant, self.model
         if model.kind == KALMAN:

@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
-from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.base.flags import INVALID, SubapertureFlag
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Expected
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.kalman import LARGEST_VARIANCE_PX2, SlopePredictor
 
 Floats = NDArray[np.float64]
@@ -20,7 +20,7 @@ class PseudoOpenLoop:
 
     Parameters
     ----------
-    line : CommandLine
+    line : CommandDelayLine
     interaction : (m, commands) array
     now_px2 : (m, m) array
         Covariance of open-loop slopes.
@@ -36,7 +36,7 @@ class PseudoOpenLoop:
 
     def __init__(
         self,
-        line: CommandLine,
+        line: CommandDelayLine,
         interaction: Floats,
         now_px2: Floats,
         ahead_px2: Floats,
@@ -68,7 +68,7 @@ class Predictive:
 
     Parameters
     ----------
-    line : CommandLine
+    line : CommandDelayLine
     interaction : (m, commands) array
     predictor : SlopePredictor
     reconstruct : (commands, m) array
@@ -78,7 +78,7 @@ class Predictive:
     undoes_prior = True
 
     def __init__(
-        self, line: CommandLine, interaction: Floats, predictor: SlopePredictor, reconstruct: Floats
+        self, line: CommandDelayLine, interaction: Floats, predictor: SlopePredictor, reconstruct: Floats
     ) -> None:
         self._line, self._interaction, self.predictor = line, interaction, predictor
         self._command = -reconstruct @ predictor.model.ahead(line.delay_frames)

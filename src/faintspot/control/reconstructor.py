@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between
+from faintspot.base.errors import InputError
 
 Floats = NDArray[np.float64]
 

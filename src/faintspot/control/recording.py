@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import numbers_between
+from faintspot.base.checks import numbers_between
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
 from faintspot.control.telemetry import Telemetry, make_telemetry
-from faintspot.errors import InputError
 from faintspot.sensor.layout import Layout
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def lagged_covariance(telemetry: Telemetry, lag: int) -> Floats:
 
 
 def replayed(
-    make: Callable[[CommandLine], Controller],
+    make: Callable[[CommandDelayLine], Controller],
     telemetry: Telemetry,
     interaction: Floats,
     reconstruct: Floats,
@@ -124,7 +124,7 @@ def replayed(
     delay_frames, settle_frames : int
         Frames at the start that are not scored.
     """
-    line = CommandLine(interaction.shape[1], delay_frames)
+    line = CommandDelayLine(interaction.shape[1], delay_frames)
     controller = make(line)
     error = np.sqrt(telemetry.variance_px2)
     left = np.zeros_like(telemetry.open_loop_px)

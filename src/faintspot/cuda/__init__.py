@@ -14,17 +14,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.lazy import lazy_attributes
+from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
-    from faintspot.cuda.measuring import DevicePipeline as DevicePipeline
-    from faintspot.cuda.measuring import DeviceSlopes as DeviceSlopes
-    from faintspot.cuda.streams import FrameStream as FrameStream
+    from faintspot.pipeline.device import DevicePipeline as DevicePipeline
+    from faintspot.pipeline.device import DeviceSlopes as DeviceSlopes
+    from faintspot.pipeline.device_stream import FrameStream as FrameStream
 
 _HOMES = {
-    "DevicePipeline": "faintspot.cuda.measuring",
-    "DeviceSlopes": "faintspot.cuda.measuring",
-    "FrameStream": "faintspot.cuda.streams",
+    "DevicePipeline": "faintspot.pipeline.device",
+    "DeviceSlopes": "faintspot.pipeline.device",
+    "FrameStream": "faintspot.pipeline.device_stream",
 }
 
 __all__ = ["DevicePipeline", "DeviceSlopes", "FrameStream"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 
 _PURPOSE = 'device="cuda"'
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from numba import float32, uint32
 
-from faintspot.checks import LARGEST_FLOAT32
+from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.cuda import warp
 from faintspot.cuda.compiling import device
 from faintspot.cuda.strips import WARP, Strips

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 WARP = 32  # threads
 MOST_PIXELS = 1024  # a thread then holds 32 pixels: beyond, no GPU has the registers

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from faintspot.lazy import lazy_attributes
+from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
+    from faintspot.config.options import option as option
     from faintspot.estimators.base import Estimator as Estimator
     from faintspot.estimators.base import Need as Need
     from faintspot.estimators.base import Positions as Positions
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from faintspot.estimators.registry import register as register
     from faintspot.estimators.scene import Scene as Scene
     from faintspot.estimators.sensor import Sensor as Sensor
-    from faintspot.options import option as option
 
 _HOMES = {
     "Estimator": "faintspot.estimators.base",
@@ -31,7 +31,7 @@ _HOMES = {
     "Style": "faintspot.estimators.base",
     "estimator_named": "faintspot.estimators.registry",
     "estimators": "faintspot.estimators.registry",
-    "option": "faintspot.options",
+    "option": "faintspot.config.options",
     "register": "faintspot.estimators.registry",
 }
 

@@ -14,12 +14,12 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.config.options import Options, is_auto
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels.groups import COMMON_ROWS, light_of_groups
-from faintspot.options import Options, is_auto
-from faintspot.sensor.score import TrainedScore
+from faintspot.spots.score import TrainedScore
 
 Floats = NDArray[np.float64]
 
@@ -78,9 +78,9 @@ class Estimator(Options):
     """A way to find the position of a spot in a sub-aperture's image.
 
     A subclass is a frozen dataclass (`@dataclass(frozen=True, eq=False, kw_only=True)`) whose fields are its
-    options, declared by `faintspot.options.option`. It either overrides `locate`, in NumPy, or `prepared`,
-    with a compiled kernel. `faintspot.estimators.register` makes it known by its name, as does the entry
-    point group `faintspot.estimators` of an installed package.
+    options, declared by `faintspot.config.options.option`. It either overrides `locate`, in NumPy, or
+    `prepared`, with a compiled kernel. `faintspot.estimators.register` makes it known by its name, as does
+    the entry point group `faintspot.estimators` of an installed package.
 
     Examples
     --------
@@ -127,7 +127,7 @@ class Estimator(Options):
 
     @property
     def uses_light(self) -> bool:
-        """Whether it is better for knowing the mean light, as `faintspot.MeanLight` finds it."""
+        """Whether it is better for knowing the mean light, as `faintspot.MeanFlux` finds it."""
         return False
 
     @property

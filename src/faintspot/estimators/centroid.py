@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from faintspot.estimators.base import CALIBRATED, RAW, Style
-from faintspot.estimators.gravity import Gravity, GravityPrepared
+from faintspot.estimators.gravity import Centroid, GravityPrepared
 from faintspot.estimators.registry import register
 from faintspot.estimators.sensor import Sensor
 
 
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CentreOfGravity(Gravity):
+class CentreOfGravity(Centroid):
     """Centre of gravity of the whole window, nothing subtracted."""
 
     name = "centroid"

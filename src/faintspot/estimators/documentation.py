@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from faintspot.config.options import Option, Options
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.registry import estimators
-from faintspot.options import Option, Options
 
 _NEEDS = {
     Need.READ_NOISE: "read noise",

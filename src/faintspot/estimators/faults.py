@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 _LONGEST = 300
 

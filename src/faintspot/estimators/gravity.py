@@ -10,15 +10,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import LARGEST_FLOAT32
-from faintspot.errors import InputError
-from faintspot.estimate.automatic import automatic_kept_pixels
-from faintspot.estimate.brightest import RULES, most_kept, threshold_rank
+from faintspot.algorithms.automatic import automatic_kept_pixels
+from faintspot.algorithms.brightest import RULES, most_kept, threshold_rank
+from faintspot.base.checks import LARGEST_FLOAT32
+from faintspot.base.errors import InputError
+from faintspot.config.options import is_auto, option
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Need, Prepared, Step
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
-from faintspot.options import is_auto, option
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ _USUAL_RANGE_PX = 1.0  # of positions, where no search range is set
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Gravity(Estimator):
+class Centroid(Estimator):
     """A centre of gravity."""
 
     flux_floor: Any = option(
@@ -46,13 +46,13 @@ class Gravity(Estimator):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class KeepingBrightest(Gravity):
+class KeepingBrightest(Centroid):
     """A centre of gravity of the brightest pixels."""
 
     keep_brightest: Any = option(
         None,
         "Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at "
-        'least 5. "auto": by `faintspot.estimate.automatic.automatic_kept_pixels`.',
+        'least 5. "auto": by `faintspot.algorithms.automatic.automatic_kept_pixels`.',
         low=1,
         high=2**24,
         whole=True,
@@ -120,9 +120,9 @@ class GravityPrepared(Prepared):
     setting_rows = gravity.SETTING_ROWS
     fewer_lanes_are_faster = True
 
-    estimator: Gravity
+    estimator: Centroid
 
-    def __init__(self, estimator: Gravity, sensor: Sensor) -> None:
+    def __init__(self, estimator: Centroid, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
         automatic = self._keeping is not None and self._keeping.is_automatic

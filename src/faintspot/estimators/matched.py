@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from faintspot.config.options import option
 from faintspot.estimators.base import Need, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spots import BLURS, PSFPrepared
 from faintspot.estimators.stepping import Stepping
-from faintspot.options import option
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

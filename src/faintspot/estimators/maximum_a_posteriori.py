@@ -11,6 +11,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.sizes import MOST_NUMBERS, check_size
+from faintspot.config.options import option
+from faintspot.config.presets import PRESETS
 from faintspot.estimators import spot_tables
 from faintspot.estimators.base import Style
 from faintspot.estimators.maximum_likelihood import Likelihood, LikelihoodPrepared
@@ -20,9 +23,6 @@ from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid
 from faintspot.kernels import located
 from faintspot.kernels.groups import RANGE, light_above_edges
-from faintspot.options import option
-from faintspot.presets import PRESETS
-from faintspot.sizes import MOST_NUMBERS, check_size
 
 Floats = NDArray[np.float64]
 

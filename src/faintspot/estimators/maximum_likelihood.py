@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.config.options import option
 from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.matched import Fitted
 from faintspot.estimators.registry import register
@@ -17,7 +18,6 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spots import PSFPrepared
 from faintspot.kernels import located
-from faintspot.options import option
 
 _MODEL_ERRORS = (0.3, 0.0, 1.0)  # of speckled spots
 _LEARNT_WEIGHT_FLOOR = 1e-3

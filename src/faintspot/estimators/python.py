@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import LARGEST_FLOAT32
-from faintspot.errors import InputError
+from faintspot.base.checks import LARGEST_FLOAT32
+from faintspot.base.errors import InputError
+from faintspot.base.flags import INVALID, SubapertureFlag
 from faintspot.estimators.base import Estimator, Positions, Prepared
 from faintspot.estimators.faults import faults_of
 from faintspot.estimators.gravity import keep_all
 from faintspot.estimators.sensor import Sensor
-from faintspot.flags import INVALID, SubapertureFlag
 from faintspot.kernels import gravity, groups
 from faintspot.kernels.groups import SlopeArrays
 

@@ -10,7 +10,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, TypeVar
 from unittest import mock
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators.faults import faults_of
 
 if TYPE_CHECKING:

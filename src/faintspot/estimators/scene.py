@@ -85,7 +85,7 @@ class Scene:
 
     @property
     def rule_arguments(self) -> dict[str, Any]:
-        """Arguments of the automatic rules, see `faintspot.estimate.automatic`."""
+        """Arguments of the automatic rules, see `faintspot.algorithms.automatic`."""
         return {
             "flux_e": self.flux_e,
             "read_noise_e": self.read_noise_e,

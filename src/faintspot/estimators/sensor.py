@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.estimate.automatic import automatic_smoothing
+from faintspot.algorithms.automatic import automatic_smoothing
+from faintspot.config.options import option
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import GravityPrepared, KeepingBrightest
@@ -19,7 +20,6 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spot_tables import gaussian_taps
 from faintspot.kernels import gravity
-from faintspot.options import option
 
 _USUAL_PX = 0.7
 _WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # times the automatic width

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.sizes import check_size
 from faintspot.kernels.located import SMALLEST_VARIANCE
 from faintspot.kernels.profiles import MARGIN, PHASES
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.sizes import check_size
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 
 Floats = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from faintspot.config.options import option
 from faintspot.estimators.base import Estimator
-from faintspot.options import option
 
 _STEPS_IN_BRIGHT_LIGHT = 12
 

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.config.options import option
 from faintspot.estimators.base import Style
-from faintspot.estimators.gravity import Floats, Gravity, GravityPrepared
+from faintspot.estimators.gravity import Centroid, Floats, GravityPrepared
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.thresholded import RowTables, thresholded_in_rows
-from faintspot.options import option
 
 _OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # times that of a dark pixel
 _OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # where a spot is bright
@@ -28,7 +28,7 @@ _SMALLEST_E = 0.01
 
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Thresholded(Gravity):
+class Thresholded(Centroid):
     """Centre of gravity of every pixel less a threshold; what is negative then counts as 0."""
 
     threshold_e: Any = option(None, "What is taken off every pixel.", unit="e-", low=0.0, high=1e12)

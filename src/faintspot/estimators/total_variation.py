@@ -10,10 +10,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.estimate.automatic import automatic_strength
-from faintspot.estimate.noise import suggested_strength
-from faintspot.estimate.total_variation import ALGORITHMS, tv_denoise
+from faintspot.algorithms.automatic import automatic_strength
+from faintspot.algorithms.noise import suggested_strength
+from faintspot.algorithms.total_variation import ALGORITHMS, tv_denoise
+from faintspot.base.errors import InputError
+from faintspot.config.options import PerSubaperture, is_auto, option
+from faintspot.config.presets import PRESETS, of_denoising
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import Floats, GravityPrepared, KeepingBrightest
@@ -22,8 +24,6 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
 from faintspot.kernels.flat_start import flat_start_table
-from faintspot.options import PerSubaperture, is_auto, option
-from faintspot.presets import PRESETS, of_denoising
 
 _STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # times the automatic strength
 _LEAST_STRENGTH_E = 1e-3
@@ -37,7 +37,7 @@ class TotalVariation(KeepingBrightest):
     noise_std: Any = option(
         None,
         'Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from '
-        "read noise, light and spot, by `faintspot.estimate.automatic.automatic_strength`. 0: not denoised. "
+        "read noise, flux and spot, by `faintspot.algorithms.automatic.automatic_strength`. 0: not denoised. "
         "Lowered where it is too strong for an image: above 0.9 of the image's own rms it becomes 0.6 of it.",
         unit="e-",
         low=0.0,

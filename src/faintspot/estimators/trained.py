@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators import spot_tables
 from faintspot.estimators.base import Estimator, Need, Prepared, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import located
-from faintspot.sensor.score import TrainedScore
+from faintspot.spots.score import TrainedScore
 
 Floats = NDArray[np.float64]
 _LEAST_SMOOTHING_PX = 0.1

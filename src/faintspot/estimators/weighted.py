@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from faintspot.config.options import option
+from faintspot.config.presets import PRESETS
 from faintspot.estimators import spot_tables
 from faintspot.estimators.base import Need, Style
 from faintspot.estimators.registry import register
@@ -18,8 +20,6 @@ from faintspot.estimators.spot_tables import SpotModel
 from faintspot.estimators.spots import SpotPrepared
 from faintspot.estimators.stepping import Stepping
 from faintspot.kernels import located
-from faintspot.options import option
-from faintspot.presets import PRESETS
 
 _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # times the spot's
 

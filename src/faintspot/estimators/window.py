@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.config.options import option
 from faintspot.estimators.base import Estimator, Need, Prepared, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
@@ -18,8 +19,7 @@ from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spot_tables import FWHM_TO_STD, gaussian_psf
 from faintspot.kernels import window
 from faintspot.kernels.host import WIDTHS, lanes_for
-from faintspot.options import option
-from faintspot.sensor.fixed_weights import FixedWeights
+from faintspot.spots.fixed_weights import FixedWeights
 
 Floats = NDArray[np.float64]
 

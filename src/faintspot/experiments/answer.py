@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot import configuration
-from faintspot.errors import InputError
+from faintspot.ao_loop.arms import Arm
+from faintspot.base.errors import InputError
+from faintspot.base.notebook import table
+from faintspot.config.tables import save_tables
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.curves import Curve
 from faintspot.experiments.promise import Promise
 from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate, SlopeStatistics
-from faintspot.loop.arms import Arm
-from faintspot.notebook import table
+from faintspot.pipeline import configuration
+from faintspot.pipeline.settings import Settings
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score
-from faintspot.settings import Settings
-from faintspot.tables import save_tables
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

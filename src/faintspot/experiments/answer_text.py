@@ -10,7 +10,7 @@ from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.answer import Answer, ArmResult
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.statistics import Estimate
-from faintspot.settings import Settings
+from faintspot.pipeline.settings import Settings
 
 BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
 

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.estimate.brightest import RULES
+from faintspot.algorithms.brightest import RULES
+from faintspot.ao_loop.arms import Arm
+from faintspot.base.errors import InputError
+from faintspot.config.options import AUTO, option
 from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import KeepingBrightest
@@ -21,13 +23,11 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.thresholded import Thresholded
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.loop.arms import Arm
-from faintspot.options import AUTO, option
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score, TrainedScore
-from faintspot.settings import Settings
-from faintspot.simulate.detector import Detector
-from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
+from faintspot.pipeline.settings import Settings
+from faintspot.sensor.detector import Detector
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score, TrainedScore
+from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 
 
 class Knowledge(IntEnum):

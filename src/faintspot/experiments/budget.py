@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import one_of
-from faintspot.errors import InputError
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.files import BUDGET_FILE, make_folder
+from faintspot.ao_loop.simulation import DisabledErrors, simulate_loop
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.loop_arms import ArmKind, Choice
 from faintspot.experiments.loop_results import BudgetResult
 from faintspot.experiments.magnitude import checked_arms, quick_run, tuned_choices, unit_store
-from faintspot.experiments.running import Advance, Unit, Workplace, run_units
+from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.search import QUICK, Search
-from faintspot.loop.configuration import CLOSED, LoopConfiguration
-from faintspot.loop.files import BUDGET_FILE, make_folder
-from faintspot.loop.simulation import Idealised, simulate_loop
 
 KIND = "budget"
 DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation))
@@ -37,32 +37,34 @@ class Term:
     name: str
     meaning: str
     """What is done to switch it off."""
-    off: Idealised
+    off: DisabledErrors
     """A loop without it."""
 
 
 TERMS = {
     term.name: term
     for term in (
-        Term(_NOTHING, "the loop as it is", Idealised()),
-        Term("photon and read noise", "mean light in every pixel", Idealised(noiseless=True)),
+        Term(_NOTHING, "the loop as it is", DisabledErrors()),
+        Term("photon and read noise", "mean light in every pixel", DisabledErrors(noiseless=True)),
         Term(
             "servo lag",
             "ten times the frame rate, as much light in every frame, in stretches over the same time",
-            Idealised(faster=_FASTER),
+            DisabledErrors(faster=_FASTER),
         ),
         Term(
             "fitting and aliasing",
             "the wavefront is only what the mirror can make",
-            Idealised(correctable=True),
+            DisabledErrors(correctable=True),
         ),
         Term(
             "centroid gain error",
             "slopes are divided by the gain that they had in the run",
-            Idealised(exact_gain=True),
+            DisabledErrors(exact_gain=True),
         ),
-        Term("slope error", "slopes are the mean gradients of the wavefront", Idealised(true_slopes=True)),
-        Term("slope error and servo lag", "both", Idealised(true_slopes=True, faster=_FASTER)),
+        Term(
+            "slope error", "slopes are the mean gradients of the wavefront", DisabledErrors(true_slopes=True)
+        ),
+        Term("slope error and servo lag", "both", DisabledErrors(true_slopes=True, faster=_FASTER)),
     )
 }
 """What is switched off, by name; the first is nothing."""
@@ -77,7 +79,7 @@ def run_budget(
     *,
     quick: bool = False,
     search: Search | None = None,
-    place: Workplace | None = None,
+    place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> BudgetResult:
     """Measure the Strehl ratio of arms with each of `TERMS` switched off, or what is left of it.
@@ -105,14 +107,14 @@ def run_budget(
     Examples
     --------
     >>> from faintspot.experiments import run_budget
-    >>> from faintspot.loop import load_loop
+    >>> from faintspot.ao_loop import load_loop
     >>> result = run_budget(load_loop("canary"), "budget", quick=True)  # doctest: +SKIP
     """
     if configuration.control.mode != CLOSED:
         raise InputError(
             f"control.mode = {configuration.control.mode!r}: expected 'closed' for an error budget"
         )
-    place = Workplace() if place is None else place
+    place = WorkerPool() if place is None else place
     configuration = quick_run(configuration) if quick else configuration
     search = search or (QUICK if quick else Search())
     kinds = checked_arms(DEFAULT_ARMS if arms is None else arms)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from faintspot.checks import one_of
-from faintspot.errors import InputError
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
 from faintspot.estimators.matched import Matched
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 from faintspot.experiments.arms import keeps_every_k, knows_the_spot
 from faintspot.experiments.cell_arms import (
     Candidate,
@@ -31,6 +30,7 @@ from faintspot.experiments.specification import BEST, CORRECTED, StudySpecificat
 from faintspot.experiments.statistics import OUTLIER_PX, slope_statistics
 from faintspot.experiments.sweep import Cell
 from faintspot.simulate import subapertures
+from faintspot.spots.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 
 
 @dataclass(frozen=True)

@@ -12,20 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.estimators.images import measure_images
+from faintspot.ao_loop.arms import Arm
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.scene import Scene
 from faintspot.experiments.arms import Kind, keeps_every_k, kind_of, score_for_scene
 from faintspot.kernels import scoring
-from faintspot.loop.arms import Arm
+from faintspot.pipeline.images import measure_images
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.settings import Settings
 from faintspot.simulate import Detector
-from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
-from faintspot.slopes import Slopes
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
+from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
     from faintspot.experiments.specification import StudySpecification
@@ -90,7 +90,7 @@ class CellArms:
         """Return the estimator with a candidate's options."""
         return self.kinds[arm](**{name: value * self._unit(name) for name, value in candidate})
 
-    def measure_images(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
+    def measure(self, arm: str, candidate: Candidate, images: Images) -> Slopes:
         """Return the slopes of images (n, side, side) in photo-electrons."""
         output = images * np.float32(self.cell.em_gain)  # as the camera gives it
         made = self._arm(self.estimator(arm, candidate))

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between, numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
 from faintspot.experiments.statistics import Estimate, magnitudes
 
 Floats = NDArray[np.float64]

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.estimate.noise import suggested_strength
+from faintspot.algorithms.noise import suggested_strength
+from faintspot.base.checks import number_between
 from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_flux
 from faintspot.experiments.statistics import Estimate, absolute_errors
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
 from faintspot.simulate import Detector, sensor_frames
 
 FLUXES_E = (15.0, 30.0, 60.0, 120.0, 240.0, 480.0)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.estimate.automatic import automatic_kept_pixels, automatic_smoothing, is_lost
-from faintspot.estimate.noise import pixel_noise
-from faintspot.estimate.spot_width import SeenSpots, seen_spots
-from faintspot.pipeline import SlopePipeline
+from faintspot.algorithms.automatic import automatic_kept_pixels, automatic_smoothing, is_lost
+from faintspot.algorithms.noise import pixel_noise
+from faintspot.algorithms.spot_width import SeenSpots, seen_spots
+from faintspot.base.errors import InputError
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings
 
 _PIXEL_BLUR_PX2 = 0.46  # that a pixel adds to the square of a spot's full width at half maximum
 _LEAST_RANGE_PX = 1.0
@@ -52,7 +52,7 @@ class FirstSettings:
 def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any]) -> FirstSettings:
     """Choose settings from a few frames of typical flux; they follow the unit of the frames.
 
-    Gaussian smoothing and brightest pixels by the rules of `faintspot.estimate.automatic`, with the noise
+    Gaussian smoothing and brightest pixels by the rules of `faintspot.algorithms.automatic`, with the noise
     that the frames show far from the spots. Photon noise is left out, because it depends on the gain. A fixed
     Gaussian window over their mean flux where spots are lost in the noise; the centre of gravity in windows
     narrower than 4 px.

@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between, numbers_between
-from faintspot.errors import InputError
-from faintspot.estimate.noise import suggested_strength
+from faintspot.algorithms.noise import suggested_strength
+from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.files import make_folder
+from faintspot.ao_loop.record import LoopRecord
+from faintspot.ao_loop.simulation import simulate_loop
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.base.npz import read_arrays, save_arrays
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.loop_results import InterleavedResult, set_file
 from faintspot.experiments.magnitude import unit_store
-from faintspot.experiments.running import Advance, Unit, Workplace, run_units
+from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.search import FIRST_TUNING_REALISATION
 from faintspot.experiments.store import Arrays
-from faintspot.loop.arms import Arm
-from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.files import make_folder
-from faintspot.loop.record import LoopRecord
-from faintspot.loop.simulation import simulate_loop
-from faintspot.npz import read_arrays, save_arrays
-from faintspot.settings import Settings
+from faintspot.pipeline.settings import Settings
 
 KIND = "interleaved"
 _MOST_ITERATIONS = 100  # near infeasible strengths the denoising is far from done after ten
@@ -104,7 +104,7 @@ def run_interleaved(
     *,
     quick: bool = False,
     plan: ObservingPlan | None = None,
-    place: Workplace | None = None,
+    place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> InterleavedResult:
     """Observe in four sets, two at full and two at 75 % of the multiplication gain, or what is left of them.
@@ -122,7 +122,7 @@ def run_interleaved(
     quick : bool
         Fewer and shorter measurements.
     plan : ObservingPlan, optional
-    place : Workplace, optional
+    place : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
         Whether another experiment in the folder is replaced.
@@ -137,10 +137,10 @@ def run_interleaved(
     Examples
     --------
     >>> from faintspot.experiments import run_interleaved
-    >>> from faintspot.loop import load_loop
+    >>> from faintspot.ao_loop import load_loop
     >>> result = run_interleaved(load_loop("canary"), "interleaved", quick=True)  # doctest: +SKIP
     """
-    place = Workplace() if place is None else place
+    place = WorkerPool() if place is None else place
     plan = plan or (QUICK_PLAN if quick else ObservingPlan())
     folder = make_folder(folder)
     best = _tuned(configuration, plan, folder, place, overwrite=overwrite)
@@ -210,7 +210,7 @@ def _tuned(
     configuration: LoopConfiguration,
     plan: ObservingPlan,
     folder: Path,
-    place: Workplace,
+    place: WorkerPool,
     *,
     overwrite: bool,
 ) -> dict[float, tuple[float, float]]:

@@ -9,7 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.pseudo_open_loop import r0_of_record
+from faintspot.ao_loop.record import LoopRecord
+from faintspot.base.errors import InputError
 from faintspot.experiments.loop_results import (
     InterleavedResult,
     MagnitudeGain,
@@ -20,8 +22,6 @@ from faintspot.experiments.loop_results import (
     regression_line,
 )
 from faintspot.experiments.statistics import Estimate, mean_by_blocks, paired_mean
-from faintspot.loop.pseudo_open_loop import r0_of_record
-from faintspot.loop.record import LoopRecord
 from faintspot.turbulence.seeing import Seeing, mean_r0
 
 Floats = NDArray[np.float64]

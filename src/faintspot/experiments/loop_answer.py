@@ -11,9 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.camera import camera_calibration
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived, write_atomically
+from faintspot.config.tables import save_tables
 from faintspot.control.learning import INTEGRATOR
-from faintspot.errors import InputError
 from faintspot.estimators.base import Need
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice
@@ -29,12 +33,8 @@ from faintspot.experiments.loop_question import (
 from faintspot.experiments.loop_results import falling, limiting_magnitudes, magnitude_gain
 from faintspot.experiments.magnitude import with_flux
 from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
-from faintspot.files import derived, write_atomically
-from faintspot.loop.arms import Arm
-from faintspot.loop.camera import camera_calibration
-from faintspot.loop.configuration import LoopConfiguration
-from faintspot.sensor.psf import PSF
-from faintspot.tables import save_tables
+from faintspot.pipeline import configuration as configuration_file
+from faintspot.spots.psf import PSF
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +102,7 @@ class LoopAnswer:
 
     Examples
     --------
-    >>> from faintspot.loop import load_loop
+    >>> from faintspot.ao_loop import load_loop
     >>> from faintspot.experiments import LoopQuestion, tune_loop
     >>> answer = tune_loop(LoopQuestion(load_loop("canary")), "loop-tune")  # doctest: +SKIP
     >>> answer.best.name  # doctest: +SKIP

@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.checks import one_of
+from faintspot.ao_loop.arms import PRIOR, Arm
+from faintspot.ao_loop.camera import make_detector
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, Run
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
+from faintspot.config.options import AUTO, Option
 from faintspot.control.learning import CONTROLS, INTEGRATOR, KALMAN, MODAL
-from faintspot.errors import InputError
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.registry import estimator_named, estimators
 from faintspot.estimators.window import Window
 from faintspot.experiments.arms import score_for_scene
-from faintspot.loop.arms import PRIOR, Arm
-from faintspot.loop.camera import make_detector
-from faintspot.loop.configuration import CLOSED, LoopConfiguration, Run
-from faintspot.options import AUTO, Option
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.settings import Settings
+from faintspot.pipeline.settings import Settings
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 
 Choice = Mapping[str, Any]
 """Values of what is tuned, by name: `LOOP_GAIN` and options of the estimator."""

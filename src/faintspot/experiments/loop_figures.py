@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.ao_loop.telescope import PSF_SAMPLING
 from faintspot.estimators.base import Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
@@ -26,7 +27,6 @@ from faintspot.experiments.loop_analysis import (
 from faintspot.experiments.loop_arms import CONTROL_SIGN, VARIANTS
 from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.statistics import paired_mean
-from faintspot.loop.telescope import PSF_SAMPLING
 from faintspot.report.drawing import GREY, LIGHT_GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 

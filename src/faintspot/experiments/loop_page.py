@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.base.errors import InputError
 from faintspot.experiments.budget import TERMS
 from faintspot.experiments.loop_analysis import (
     NO_TV,
@@ -45,7 +46,6 @@ from faintspot.experiments.loop_verdict import (
     tv_arm,
 )
 from faintspot.experiments.statistics import paired_mean
-from faintspot.loop.configuration import LoopConfiguration
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of, write_page
 

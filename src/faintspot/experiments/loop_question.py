@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between, numbers_between, one_of
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.base.checks import number_between, numbers_between, one_of
+from faintspot.base.errors import InputError
 from faintspot.control.learning import INTEGRATOR, KALMAN
-from faintspot.errors import InputError
 from faintspot.experiments.loop_arms import ArmKind, arm_kind
-from faintspot.loop.configuration import CLOSED, LoopConfiguration
 
 Floats = NDArray[np.float64]
 
@@ -186,7 +186,7 @@ class LoopQuestion:
 
     Examples
     --------
-    >>> from faintspot.loop import load_loop
+    >>> from faintspot.ao_loop import load_loop
     >>> from faintspot.experiments import LoopQuestion
     >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0), arms=["window", "map"])
     >>> [round(photons) for photons in question.photons(3)]
@@ -204,7 +204,7 @@ class LoopQuestion:
         loop: Any = self.configuration
         if not isinstance(loop, LoopConfiguration):
             got = type(loop).__name__
-            raise InputError(f"configuration: expected a faintspot.loop.LoopConfiguration, got {got}")
+            raise InputError(f"configuration: expected a faintspot.ao_loop.LoopConfiguration, got {got}")
         if self.magnitudes is not None:
             ends = numbers_between("magnitudes", self.magnitudes, -30.0, 60.0)
             if ends.shape != (2,) or ends[0] == ends[1]:

@@ -11,12 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array
-from faintspot.errors import InputError
+from faintspot.ao_loop.files import INTERLEAVED_FILE, Stored, make_folder
+from faintspot.ao_loop.record import LoopRecord
+from faintspot.base.checks import finite_array
+from faintspot.base.errors import InputError
+from faintspot.base.files import parse_json, write_atomically
 from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, student
-from faintspot.files import parse_json, write_atomically
-from faintspot.loop.files import INTERLEAVED_FILE, Stored, make_folder
-from faintspot.loop.record import LoopRecord
 
 Floats = NDArray[np.float64]
 _FORMAT = 1

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from faintspot.checks import number_between
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.control.learning import INTEGRATOR
-from faintspot.errors import InputError
 from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
 from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind
 from faintspot.experiments.loop_question import LoopQuestion
 from faintspot.experiments.loop_results import MagnitudeResult
 from faintspot.experiments.magnitude import run_magnitude, with_flux
-from faintspot.experiments.running import Workplace
+from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
-from faintspot.loop.configuration import LoopConfiguration
 
 _SEARCH = Search(
     coarse_frames=120, frames=120, settle_frames=40, realisations=1, finalists=1, climbs=1, rounds=1
@@ -63,12 +63,12 @@ def tune_loop(
     folder: str | Path,
     *,
     plan: LoopPlan | None = None,
-    place: Workplace | None = None,
+    place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> LoopAnswer:
     """Find out which estimator and control suit a closed loop, and with which settings.
 
-    Candidates are tuned and scored as by `faintspot.loop.run_magnitude`, with short runs and a short search.
+    Candidates are tuned and scored as by `run_magnitude`, with short runs and a short search.
     Of the default candidates those whose control learns are measured only while there is time.
 
     Parameters
@@ -77,7 +77,7 @@ def tune_loop(
     folder : path
         Where finished units are remembered; made where it is not there. Interrupted, the same call goes on.
     plan : LoopPlan, optional
-    place : Workplace, optional
+    place : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
         Whether another question's units in the folder are replaced.
@@ -91,7 +91,7 @@ def tune_loop(
 
     Examples
     --------
-    >>> from faintspot.loop import load_loop
+    >>> from faintspot.ao_loop import load_loop
     >>> from faintspot.experiments import LoopQuestion, tune_loop
     >>> question = LoopQuestion(load_loop("canary"), magnitudes=(10.0, 13.0))
     >>> answer = tune_loop(question, "loop-tune")  # doctest: +SKIP

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.ao_loop.files import BUDGET_FILE, INTERLEAVED_FILE, MAGNITUDE_FILE
+from faintspot.base.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.window import Window
@@ -36,7 +37,6 @@ from faintspot.experiments.loop_results import (
     with_error,
 )
 from faintspot.experiments.statistics import Estimate, paired_mean
-from faintspot.loop.files import BUDGET_FILE, INTERLEAVED_FILE, MAGNITUDE_FILE
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 REFERENCES = (Window.name, BrightestPixels.name)

@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import numbers_between
-from faintspot.errors import InputError
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.files import MAGNITUDE_FILE, make_folder
+from faintspot.ao_loop.simulation import simulate_loop
+from faintspot.base.checks import numbers_between
+from faintspot.base.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
@@ -20,7 +23,7 @@ from faintspot.estimators.trained import Trained
 from faintspot.estimators.window import Window
 from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind, default_arms
 from faintspot.experiments.loop_results import MagnitudeResult
-from faintspot.experiments.running import Advance, Unit, Workplace, run_units
+from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.search import (
     QUICK,
     Search,
@@ -30,9 +33,6 @@ from faintspot.experiments.search import (
     with_integrator,
 )
 from faintspot.experiments.store import Arrays, ZarrStore, fingerprint_of
-from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.files import MAGNITUDE_FILE, make_folder
-from faintspot.loop.simulation import simulate_loop
 
 KIND = "magnitude"
 QUICK_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation, Window, Trained))
@@ -48,7 +48,7 @@ def run_magnitude(
     *,
     quick: bool = False,
     search: Search | None = None,
-    place: Workplace | None = None,
+    place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> MagnitudeResult:
     """Measure the Strehl ratio of arms against the star's light, or what is left of it.
@@ -69,7 +69,7 @@ def run_magnitude(
         Few fluxes, short runs, a coarse search.
     search : Search, optional
         How settings are sought.
-    place : Workplace, optional
+    place : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
         Whether another experiment in the folder is replaced.
@@ -84,10 +84,10 @@ def run_magnitude(
     Examples
     --------
     >>> from faintspot.experiments import run_magnitude
-    >>> from faintspot.loop import load_loop
+    >>> from faintspot.ao_loop import load_loop
     >>> result = run_magnitude(load_loop("canary"), "magnitude", quick=True)  # doctest: +SKIP
     """
-    place = Workplace() if place is None else place
+    place = WorkerPool() if place is None else place
     configuration = quick_run(configuration) if quick else configuration
     search = search or (QUICK if quick else Search())
     kinds = checked_arms(arms if arms is not None else _default(configuration, quick))
@@ -120,7 +120,7 @@ def tuned_choices(
     search: Search,
     folder: Path,
     experiment: str,
-    place: Workplace,
+    place: WorkerPool,
     *,
     overwrite: bool,
 ) -> dict[tuple[str, float], dict[str, Any]]:

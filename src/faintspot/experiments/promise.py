@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.ao_loop.arms import Arm
+from faintspot.base.generators import spawn
 from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate
-from faintspot.loop.arms import Arm
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.simulate.generators import spawn
-from faintspot.slopes import Slopes
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import LearntPSF, fit_spots
 from faintspot.training.spot_transfer import variance_over_expected
 

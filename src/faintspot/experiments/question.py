@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between, one_of
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_keys, checked_table, parse_file
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.detector import Detector
 from faintspot.sensor.layout import GRID_KEYS, Layout
-from faintspot.sensor.psf import PSF
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
-from faintspot.simulate.detector import Detector
 from faintspot.simulate.photometry import (
     DEFAULT_BAND,
     DEFAULT_QUANTUM_EFFICIENCY,
@@ -26,9 +26,9 @@ from faintspot.simulate.photometry import (
     ZERO_POINTS,
     Photometry,
 )
-from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
-from faintspot.simulate.turbulence import LARGEST_D_OVER_R0
-from faintspot.toml_files import check_keys, checked_table, parse_file
+from faintspot.spots.psf import PSF
+from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
+from faintspot.spots.speckled import LARGEST_D_OVER_R0
 
 PROFILES = tuple(FWHM_OF_SIZE_1_PX)
 SPECKLED_ABOVE = 0.7
@@ -183,7 +183,7 @@ class Question:
 
     @property
     def size(self) -> float:
-        """Size of the profile, see `faintspot.simulate.spots`."""
+        """Size of the profile, see `faintspot.spots.shapes`."""
         return float(self.fwhm_px / FWHM_OF_SIZE_1_PX[self.profile])
 
     @property

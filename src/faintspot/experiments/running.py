@@ -22,8 +22,8 @@ from queue import SimpleQueue
 from typing import Any
 
 from faintspot import __version__
-from faintspot.checks import number_between
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.experiments.store import Arrays, UnitStore
 from faintspot.kernels.parallel import available_cpus
 
@@ -57,7 +57,7 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class Workplace:
+class WorkerPool:
     """Where units are run.
 
     Parameters
@@ -96,7 +96,7 @@ class Workplace:
 
 
 def run_units(
-    function: Callable[..., Arrays], units: list[Unit], store: UnitStore, place: Workplace
+    function: Callable[..., Arrays], units: list[Unit], store: UnitStore, place: WorkerPool
 ) -> Mapping[str, Arrays]:
     """Run the units whose results are not stored yet, store each as it finishes; return all results, by key.
 
@@ -110,7 +110,7 @@ def run_units(
     units : list of Unit
         Larger ones are begun first, so that no worker is left with one.
     store : UnitStore
-    place : Workplace
+    place : WorkerPool
 
     Raises
     ------
@@ -167,7 +167,7 @@ class _Count:
 
 
 def _finished(
-    function: Callable[..., Arrays], units: list[Unit], place: Workplace, count: _Count
+    function: Callable[..., Arrays], units: list[Unit], place: WorkerPool, count: _Count
 ) -> Finished:
     """Yield every unit and its result as it finishes."""
     if place.scheduler is not None:
@@ -287,7 +287,7 @@ def _seldom(tell: Advance) -> Advance:
 
 
 def _by_dask(
-    function: Callable[..., Arrays], units: list[Unit], place: Workplace, scheduler: str, count: _Count
+    function: Callable[..., Arrays], units: list[Unit], place: WorkerPool, scheduler: str, count: _Count
 ) -> Finished:
     """Let a running cluster do the units."""
     distributed = _distributed()
@@ -363,4 +363,4 @@ def _dashboard(client: Any) -> str:
     return f", dashboard {link}" if link and importlib.util.find_spec("bokeh") else ""
 
 
-__all__ = ["Advance", "Progress", "Unit", "Workplace", "run_units"]
+__all__ = ["Advance", "Progress", "Unit", "WorkerPool", "run_units"]

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.simulation import simulate_loop
+from faintspot.base.checks import number_between
 from faintspot.control.learning import INTEGRATOR
 from faintspot.experiments.loop_arms import ArmKind, Choice, Tunable
 from faintspot.experiments.running import Advance
 from faintspot.experiments.statistics import slope_statistics
-from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.simulation import simulate_loop
 
 _ROUNDS = 2  # of looking along each axis in turn
 

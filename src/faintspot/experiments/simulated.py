@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.ao_loop.arms import Arm
+from faintspot.base.generators import spawn
 from faintspot.experiments.question import Question
-from faintspot.loop.arms import Arm
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.simulate.generators import spawn
-from faintspot.simulate.spots import spots
-from faintspot.simulate.turbulence import speckled_spots
-from faintspot.slopes import Slopes
+from faintspot.spots.shapes import spots
+from faintspot.spots.speckled import speckled_spots
 
 Floats = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 import tomlkit
 
-from faintspot.checks import number_between, one_of
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_size
+from faintspot.base.toml_files import check_keys, checked_table, parse_text, read_text
 from faintspot.experiments.arms import DEFAULT_ARMS, kind_of, knows_the_spot
 from faintspot.experiments.store import fingerprint_of
 from faintspot.experiments.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
-from faintspot.sizes import check_size
-from faintspot.toml_files import check_keys, checked_table, parse_text, read_text
 
 __all__ = ["BEST", "CORRECTED", "PROFILES", "StudySpecification", "Sweep"]
 

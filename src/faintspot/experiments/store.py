@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot import __version__
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import output_errors, parse_json
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import output_errors, parse_json
 from faintspot.io.locations import one_line
 
 if TYPE_CHECKING:

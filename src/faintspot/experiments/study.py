@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot import __version__
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.experiments.cell import measure_cell
-from faintspot.experiments.running import Advance, Unit, Workplace, run_units
+from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.specification import StudySpecification
 from faintspot.experiments.statistics import OUTLIER_PX
 from faintspot.experiments.store import (
@@ -239,7 +239,7 @@ def run(
     """
     if not isinstance(specification, StudySpecification):
         raise InputError(f"specification: expected a StudySpecification, got {type(specification).__name__}")
-    place = Workplace(workers, scheduler, progress, announce)
+    place = WorkerPool(workers, scheduler, progress, announce)
     units = [Unit(str(index), (cell, specification)) for index, cell in enumerate(specification.cells())]
     if store is None:
         memory = MemoryStore()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.estimate.noise import suggested_strength
-from faintspot.estimate.total_variation import tv_denoise
+from faintspot.algorithms.noise import suggested_strength
+from faintspot.algorithms.total_variation import tv_denoise
 from faintspot.experiments.arms import NO_TV, TV, knows_the_spot, label_of, style_of
 from faintspot.experiments.claims import BEST_MODE, fixed_mode
 from faintspot.experiments.study_curves import kept_panels

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.claims import fixed_mode, guidance, verdicts
 from faintspot.experiments.efficiency import compares_estimators, findings
 from faintspot.experiments.estimator_figures import estimator_figures
@@ -27,7 +27,7 @@ from faintspot.experiments.study_tables import (
 from faintspot.experiments.sweep import PARAMETERS
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Page, Section, configuration_section, html_of, write_page
-from faintspot.simulate.spots import FWHM_OF_SIZE_1_PX
+from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
     import xarray

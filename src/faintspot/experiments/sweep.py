@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.checks import one_of, real_array
-from faintspot.errors import InputError
+from faintspot.base.checks import one_of, real_array
+from faintspot.base.errors import InputError
 
 PROFILES = ("diffraction", "gaussian")
 
@@ -53,7 +53,7 @@ class Cell:
         Standard deviation of the read noise, in photo-electrons (after multiplication: divided by its gain).
     profile : {"diffraction", "gaussian"}
     size : float
-        Width of the spot in units of 2 px, see `faintspot.simulate.spots`.
+        Width of the spot in units of 2 px, see `faintspot.spots.shapes`.
     elongation : float
         Factor on the width along x.
     pixels : int

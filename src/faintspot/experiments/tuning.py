@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
-from faintspot.estimate.bounds import MEAN_ABSOLUTE, cramer_rao
+from faintspot.ao_loop.arms import Arm
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.registry import estimators
@@ -33,11 +34,10 @@ from faintspot.experiments.statistics import (
     absolute_errors,
     slope_statistics,
 )
-from faintspot.loop.arms import Arm
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import TrainedScore
-from faintspot.simulate.generators import spawn
-from faintspot.slopes import Slopes
+from faintspot.pipeline.slopes import Slopes
+from faintspot.spots.bounds import MEAN_ABSOLUTE, cramer_rao
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import TrainedScore
 from faintspot.training.simulation import CLASS_WIDTH
 
 Floats = NDArray[np.float64]

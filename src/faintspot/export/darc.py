@@ -14,19 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import one_of
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
+from faintspot.base.files import output_errors, write_atomically
 from faintspot.control.configuration import Control
-from faintspot.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.centroid import CentreOfGravity
 from faintspot.estimators.thresholded import Thresholded
 from faintspot.estimators.window import Window
 from faintspot.export.sensor import centre_of, control_of, fixed_weights, pipeline_of
-from faintspot.files import output_errors, write_atomically
 from faintspot.io.optional_packages import load_fits
 from faintspot.kernels import gravity
-from faintspot.pipeline import SlopePipeline
-from faintspot.sensor.fixed_weights import WeightedCentre
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.spots.fixed_weights import WeightedCentre
 
 FORMATS = ("fits", "npy")
 LIST = "parameters.txt"

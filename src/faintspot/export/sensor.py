@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot import configuration
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, load_control
-from faintspot.errors import InputError
 from faintspot.estimators.window import NONE, Window
 from faintspot.io.references import read_reference
-from faintspot.pipeline import SlopePipeline
-from faintspot.sensor.fixed_weights import FixedWeights, WeightedCentre
+from faintspot.pipeline import configuration
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.spots.fixed_weights import FixedWeights, WeightedCentre
 
 Floats = NDArray[np.float64]
 

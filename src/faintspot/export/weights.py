@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.base.files import write_atomically
 from faintspot.export.sensor import centre_of, fixed_weights, offsets_of, pipeline_of
-from faintspot.files import write_atomically
 from faintspot.io.optional_packages import load_fits
 
 

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING
 
+from faintspot.base.lazy import lazy_attributes
 from faintspot.io.frames import FrameSource, open_frames, read_array
 from faintspot.io.slopes import create_writer, read_slopes
 from faintspot.io.slopes_format import SlopeWriter, StoredSlopes
-from faintspot.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.io.aot import write_aot as write_aot

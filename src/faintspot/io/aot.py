@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import one_of
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import write_atomically
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import write_atomically
+from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry import Telemetry
-from faintspot.toml_files import parse_text
 
 # The standard wants both, and a sensor alone has neither.
 _EXPECTED = r".AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"

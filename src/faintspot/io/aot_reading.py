@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import finite_array
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import parse_json
+from faintspot.base.checks import finite_array
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import parse_json
+from faintspot.base.sizes import check_bytes, memory_bytes
 from faintspot.io.fits_files import AOT_VERSION, units_of, whole_units
 from faintspot.io.locations import one_line
 from faintspot.sensor.layout import Layout
-from faintspot.sizes import check_bytes, memory_bytes
 
 _PIXELS = ("pix", "pixel", "px")
 
@@ -46,7 +46,7 @@ class AotSensor:
     tables: Mapping[str, Any]
     """[estimator] and [settings] of a faintspot.toml, in files that faintspot has written."""
     parts: Mapping[str, str] | None
-    """Calibration, PSF and score in such files, for `faintspot.configuration.unpacked`."""
+    """Calibration, PSF and score in such files, for `faintspot.pipeline.configuration.unpacked`."""
     reference: NDArray[np.float64] | None
     """(2 n,): slopes that are or were to be subtracted, px from the layout's centres, all x, then all y."""
     pixels: str | None

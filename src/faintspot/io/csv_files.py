@@ -7,10 +7,10 @@ from typing import IO
 
 import numpy as np
 
-from faintspot.files import check_file_size
+from faintspot.base.files import check_file_size
 from faintspot.io.file_format import FileFormat
 from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes, with_absent
-from faintspot.io.slopes_writer import Begun
+from faintspot.io.slopes_writer import ExistingOutput
 
 _LINES = 1 << 12
 _INDEX = ("frame", "subaperture")
@@ -41,9 +41,9 @@ class Csv(FileFormat):
             lines = zip(*(column.astype(str).tolist() for column in columns), strict=True)
             stream.write("".join(",".join(line) + "\n" for line in lines).encode())
 
-    def finished(self, path: Path) -> Begun | None:
+    def finished(self, path: Path) -> ExistingOutput | None:
         """Say that it is there: a table does not tell of which run."""
-        return Begun(None, (0, 0), complete=True) if path.exists() else None
+        return ExistingOutput(None, (0, 0), complete=True) if path.exists() else None
 
     def read(self, path: Path) -> StoredSlopes:
         """Read the whole table."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import IO
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.locations import StoredArray
 from faintspot.io.slopes_folder import FolderStorage, is_partial, partial_folder
 from faintspot.io.slopes_format import Run, StoredSlopes
-from faintspot.io.slopes_writer import Begun, Storage
+from faintspot.io.slopes_writer import ExistingOutput, Storage
 
 
 class FileFormat:
@@ -48,7 +48,7 @@ class FileFormat:
         """Tell slopes from other arrays in a file whose name ends like one of slopes."""
         return True
 
-    def finished(self, path: Path) -> Begun | None:
+    def finished(self, path: Path) -> ExistingOutput | None:
         """Return what a finished output says of itself, or None when there is none."""
         if not path.exists():
             return None
@@ -56,7 +56,7 @@ class FileFormat:
             raise InputError(f"{path}: exists already and is no file: choose another name")
         stored = self.read(path)
         frames, subapertures = stored.variables["x"].shape
-        return Begun(stored.attributes.get("fingerprint"), (frames, subapertures), complete=True)
+        return ExistingOutput(stored.attributes.get("fingerprint"), (frames, subapertures), complete=True)
 
     def leftovers(self, path: Path) -> bool:
         """Tell whether an unfinished output lies beside `path`."""

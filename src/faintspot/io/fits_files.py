@@ -20,13 +20,13 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_bytes
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
 from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, check_stated, most_slopes_bytes
-from faintspot.sizes import check_bytes
 
 AOT_VERSION = "AOT-VERS"
 """Keyword of the primary header of a file of the Adaptive Optics Telemetry standard."""

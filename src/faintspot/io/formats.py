@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from faintspot.errors import InputError
-from faintspot.files import check_regular
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular
 from faintspot.io.csv_files import Csv
 from faintspot.io.file_format import FileFormat
 from faintspot.io.fits_files import Fits, FitsGz

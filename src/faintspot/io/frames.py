@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.closing import Closing
-from faintspot.errors import InputError
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_bytes, check_size
 from faintspot.io.formats import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
 from faintspot.io.raw import MOST_WHOLE_BYTES
-from faintspot.sizes import check_bytes, check_size
 
 _MOST_PIXELS = 1 << 26  # of a frame: 8192 x 8192
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_bytes
 from faintspot.io.file_format import FileFormat
 from faintspot.io.inflation import check_inflated
 from faintspot.io.locations import StoredArray, choose_name, one_line
 from faintspot.io.optional_packages import load_hdf5
 from faintspot.io.raw import MOST_WHOLE_BYTES
-from faintspot.sizes import check_bytes
 
 _MOST_OBJECTS = 10_000
 

@@ -9,9 +9,9 @@ import lzma
 import zlib
 from collections.abc import Iterator
 
+from faintspot.base.npz import DAMAGE
+from faintspot.base.sizes import check_bytes
 from faintspot.io.raw import MOST_WHOLE_BYTES
-from faintspot.npz import DAMAGE
-from faintspot.sizes import check_bytes
 
 _PIECE_BYTES, _ALWAYS_BYTES = 1 << 20, 1 << 26
 _DEFLATE_RATIO = 1032  # at most, by its format

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import one_of
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.io.csv_files import column_name
 from faintspot.io.slopes_format import (
     COORDINATE_UNITS,
@@ -18,8 +18,8 @@ from faintspot.io.slopes_format import (
     scaled_positions,
     unit_of,
 )
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import Slopes
 
 if TYPE_CHECKING:
     import pandas

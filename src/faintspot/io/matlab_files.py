@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.inflation import check_inflated
 from faintspot.io.locations import StoredArray, choose_name, one_line

@@ -9,8 +9,9 @@ from typing import IO
 
 import numpy as np
 
-from faintspot.errors import InputError
-from faintspot.files import parse_json
+from faintspot.base.errors import InputError
+from faintspot.base.files import parse_json
+from faintspot.base.npz import DAMAGE, Header, headers_of, open_archive, read_header, unpacked
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import PREFERRED_NAME, StoredArray, choose_name, one_line
 from faintspot.io.raw import MOST_WHOLE_BYTES, MappedArray, RawArray, WholeArray, pieces
@@ -22,7 +23,6 @@ from faintspot.io.slopes_format import (
     most_slopes_bytes,
     with_absent,
 )
-from faintspot.npz import DAMAGE, Header, headers_of, open_archive, read_header, unpacked
 
 
 class Npy(FileFormat):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from faintspot.errors import MissingExtraError
+from faintspot.base.errors import MissingExtraError
 
 
 def load_fits() -> Any:

@@ -9,7 +9,7 @@ import os
 import socket
 from pathlib import Path
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 _OWNER_BYTES = 200
 # File systems that know no locks: there the mark in the output, read before every write, has to do.

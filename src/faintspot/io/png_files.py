@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_pillow

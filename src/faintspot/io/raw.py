@@ -11,11 +11,11 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.files import check_regular
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular
+from faintspot.base.npz import DAMAGE
+from faintspot.base.sizes import check_bytes
 from faintspot.io.locations import one_line
-from faintspot.npz import DAMAGE
-from faintspot.sizes import check_bytes
 
 GZIP_SIGNATURE = b"\x1f\x8b"
 _PIECE_BYTES = 1 << 20

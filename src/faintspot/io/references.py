@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.formats import slope_endings, slope_format
 from faintspot.io.frames import read_array
 from faintspot.io.locations import split_location

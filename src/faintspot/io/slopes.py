@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import finite_array, number_between, one_of
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import check_regular, output_errors
+from faintspot.base.checks import finite_array, number_between, one_of
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import check_regular, output_errors
 from faintspot.io.file_format import FileFormat
 from faintspot.io.formats import slope_format
 from faintspot.io.locations import one_line

@@ -11,8 +11,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.files import parse_json
+from faintspot.base.errors import InputError
+from faintspot.base.files import parse_json
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip, pieces
 from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of, with_absent

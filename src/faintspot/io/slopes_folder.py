@@ -16,11 +16,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.files import check_regular, parse_json, read_bytes, replace_file, sync_file, sync_folder
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular, parse_json, read_bytes, replace_file, sync_file, sync_folder
+from faintspot.base.sizes import MOST_TEXT_BYTES
 from faintspot.io.slopes_format import VARIABLES, Run, StoredSlopes, with_absent
-from faintspot.io.slopes_writer import Begun
-from faintspot.sizes import MOST_TEXT_BYTES
+from faintspot.io.slopes_writer import ExistingOutput
 
 _RUN = "run.json"
 _MARK = "finished"
@@ -47,13 +47,13 @@ class FolderStorage:
         self._run = run
         self._export = export
 
-    def begun(self) -> Begun | None:
+    def begun(self) -> ExistingOutput | None:
         """Return what is there, or None."""
         if not is_partial(self.place):
             return None
         description = _read_description(self.place)
         sizes = (description["n_frames"], description["n_subapertures"])
-        return Begun(description["attributes"]["fingerprint"], sizes, complete=False)
+        return ExistingOutput(description["attributes"]["fingerprint"], sizes, complete=False)
 
     def remove(self) -> None:
         """Delete the folder."""

@@ -12,9 +12,9 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.sizes import check_bytes, memory_bytes
-from faintspot.slopes import Slopes
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_bytes, memory_bytes
+from faintspot.pipeline.slopes import Slopes
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.closing import Closing
-from faintspot.errors import InputError
-from faintspot.files import output_errors
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
+from faintspot.base.files import output_errors
 from faintspot.io.output_lock import OutputLock
 from faintspot.io.slopes_format import VARIABLES, Run, belongs_to_another_run, checked_block, exists_already
 
@@ -22,7 +22,7 @@ _MARK_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
-class Begun:
+class ExistingOutput:
     """What an output that is there says of itself."""
 
     fingerprint: str | None
@@ -61,7 +61,7 @@ class Storage(Protocol):
     def chunk(self) -> int:
         """How many frames are written at once; known when it is open."""
 
-    def begun(self) -> Begun | None:
+    def begun(self) -> ExistingOutput | None:
         """Return what is there; InputError when that is something else than slopes, or damaged."""
 
     def remove(self) -> None:

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.files import sync_file, sync_folder
+from faintspot.base.errors import InputError
+from faintspot.base.files import sync_file, sync_folder
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import (
@@ -30,7 +30,7 @@ from faintspot.io.slopes_format import (
     unit_of,
     with_absent,
 )
-from faintspot.io.slopes_writer import Begun
+from faintspot.io.slopes_writer import ExistingOutput
 from faintspot.io.zarr_store import (
     checked_codecs,
     chunk_files,
@@ -69,7 +69,7 @@ class StoreStorage:
         self._arrays: dict[str, Any] = {}
         self._not_synchronised: set[Path] = set()
 
-    def begun(self) -> Begun | None:
+    def begun(self) -> ExistingOutput | None:
         """Return what is there, or None."""
         return describe_store(self.place)
 
@@ -139,7 +139,7 @@ class StoreStorage:
         """The mark says it all."""
 
 
-def describe_store(path: Path) -> Begun | None:
+def describe_store(path: Path) -> ExistingOutput | None:
     """Return what the store of slopes says of itself; None when nothing is there.
 
     Raises
@@ -154,7 +154,7 @@ def describe_store(path: Path) -> Begun | None:
     except (OSError, ValueError, KeyError):
         raise InputError(f"{path}: exists and holds no slopes of faintspot: choose another name") from None
     sizes = (attributes["n_frames"], attributes["n_subapertures"])
-    return Begun(attributes["fingerprint"], sizes, attributes[_COMPLETE])
+    return ExistingOutput(attributes["fingerprint"], sizes, attributes[_COMPLETE])
 
 
 def read_store(path: Path) -> StoredSlopes:

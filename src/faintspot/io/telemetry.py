@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.files import output_errors
-from faintspot.flags import INVALID
+from faintspot.base.errors import InputError
+from faintspot.base.files import output_errors
+from faintspot.base.flags import INVALID
+from faintspot.base.sizes import check_bytes, memory_bytes
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import VARIABLES
@@ -31,7 +32,6 @@ from faintspot.io.zarr_store import (
     replace_attributes,
     stored_attributes,
 )
-from faintspot.sizes import check_bytes, memory_bytes
 
 zarr = load_zarr()
 FORMAT = TELEMETRY

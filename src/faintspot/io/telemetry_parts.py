@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.locations import one_line
 from faintspot.io.telemetry import attributes_of, finished_of, stored_names
 from faintspot.io.zarr_store import open_store, read_items

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.inflation import check_inflated
 from faintspot.io.locations import StoredArray, one_line

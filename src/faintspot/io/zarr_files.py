@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, choose_name, one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import Run, StoredSlopes
-from faintspot.io.slopes_writer import Begun, Storage
+from faintspot.io.slopes_writer import ExistingOutput, Storage
 from faintspot.io.zarr_store import check_array, is_store, open_store
 
 _MOST_ABSENT = 1000  # chunks for each that is there
@@ -75,7 +75,7 @@ class Zarr(FileFormat):
         except InputError:
             return False
 
-    def finished(self, path: Path) -> Begun | None:
+    def finished(self, path: Path) -> ExistingOutput | None:
         """Return what a complete store says of itself."""
         from faintspot.io.slopes_zarr import describe_store
 

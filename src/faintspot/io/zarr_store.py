@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
-from faintspot.files import check_regular, parse_json, read_bytes, replace_file
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular, parse_json, read_bytes, replace_file
+from faintspot.base.sizes import MOST_TEXT_BYTES, check_bytes
 from faintspot.io.inflation import check_inflated
 from faintspot.io.locations import one_line
 from faintspot.io.optional_packages import load_zarr
 from faintspot.io.raw import MOST_WHOLE_BYTES
-from faintspot.sizes import MOST_TEXT_BYTES, check_bytes
 
 TELEMETRY = "faintspot telemetry"
 """What a store of telemetry has as its format."""

@@ -1,1 +1,1 @@
-"""The same work as faintspot.estimate, fast: sub-apertures in SIMD lanes."""
+"""Fast versions of `faintspot.algorithms` and of the estimators: sub-apertures in SIMD lanes."""

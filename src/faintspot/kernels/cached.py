@@ -13,7 +13,7 @@ from typing import Any
 
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 
-from faintspot.errors import CacheWarning
+from faintspot.base.errors import CacheWarning
 
 
 def kernel_cache(function: Callable[..., Any], stamp: Any) -> Any:

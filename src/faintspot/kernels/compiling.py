@@ -25,7 +25,7 @@ from faintspot.kernels.cached import kernel_cache
 def _kernels_stamp() -> tuple[tuple[float, int], ...]:
     """Modification time and size of every source file that a kernel may have inlined."""
     package = Path(__file__).parent.parent
-    sources = sorted([*package.glob("kernels/*.py"), package / "checks.py", package / "flags.py"])
+    sources = sorted([*package.glob("kernels/*.py"), package / "base/checks.py", package / "base/flags.py"])
     return tuple(_stamp(source) for source in sources)
 
 

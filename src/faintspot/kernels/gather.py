@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from faintspot.checks import LARGEST_FLOAT32
+from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.simd import absolute, copy_transposed, get, load, put, select, splat, store, width_of
 

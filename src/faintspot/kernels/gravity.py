@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag
 from faintspot.kernels import brightest, total_variation
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag
 from faintspot.kernels.compiling import compiled, compiled_with
 from faintspot.kernels.gather import calibrate, fill_bad_pixels, gather_raw, scatter_image
 from faintspot.kernels.host import aligned_zeros

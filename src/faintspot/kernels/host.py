@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.kernels.simd import Lanes
 from faintspot.kernels.target import compile_target
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag
 from faintspot.kernels import groups, spot_rows
 from faintspot.kernels.background import subtract_background
 from faintspot.kernels.compiling import compiled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.base.flags import INVALID, SubapertureFlag
 from faintspot.kernels.compiling import compiled
 
 _INVALID, _NOT_CONVERGED = int(INVALID), int(SubapertureFlag.NOT_CONVERGED)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.checks import LARGEST_FLOAT32
+from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.gravity import FLOOR, LEVEL, gravity_of_groups, lightless
 from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, Task, store_slope

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from faintspot.checks import LARGEST_FLOAT32
+from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.kernels import groups
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (

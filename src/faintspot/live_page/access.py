@@ -9,7 +9,7 @@ import secrets
 import socket
 from collections.abc import Mapping
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 _LOOPBACK = "localhost"
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?", re.IGNORECASE | re.ASCII)

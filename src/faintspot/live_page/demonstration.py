@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import configuration as configuration_file
+from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.calibration import make_pipeline
+from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
+from faintspot.ao_loop.engine_files import write_engine_files
+from faintspot.ao_loop.observatory import prepare
+from faintspot.ao_loop.simulation import measure_gains
+from faintspot.base.errors import InputError
+from faintspot.base.files import output_errors, write_atomically
 from faintspot.control.configuration import CONTROLLER, save_control
 from faintspot.control.learnt import INTEGRATOR, KALMAN
-from faintspot.errors import InputError
-from faintspot.files import output_errors, write_atomically
 from faintspot.live_page.streams import NewestOfStream
-from faintspot.loop.arms import Arm
-from faintspot.loop.calibration import make_pipeline
-from faintspot.loop.configuration import LoopConfiguration, load_loop
-from faintspot.loop.engine_files import write_engine_files
-from faintspot.loop.observatory import prepare
-from faintspot.loop.simulation import measure_gains
+from faintspot.pipeline import configuration as configuration_file
+from faintspot.pipeline.settings import Settings
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.child_processes import ChildProcesses
 from faintspot.realtime.control import request
@@ -32,7 +33,6 @@ from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.realtime.telescope import TRUTH
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
-from faintspot.settings import Settings
 
 Floats = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.live_page.batch import Batch, Picture
 from faintspot.live_page.streams import NewestOfStream
 from faintspot.realtime.telemetry import TelemetryReader

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.base.flags import INVALID, SubapertureFlag
 from faintspot.io.frame_numbers import all_left_out
 from faintspot.live_page.batch import Batch, Floats
 from faintspot.realtime.interleaving import arms_after

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.live_page.batch import Source
 from faintspot.live_page.gathered import Gathered, flag_names
 from faintspot.live_page.messages import packed

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.io.telemetry import stored_names
 from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page.batch import Batch, Floats, Picture

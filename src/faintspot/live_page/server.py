@@ -14,14 +14,14 @@ from functools import partial
 from importlib.resources import files
 from typing import Any
 
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import parse_json
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import parse_json
 from faintspot.live_page.access import Access
 from faintspot.live_page.batch import Source
 from faintspot.live_page.board import Board
 from faintspot.live_page.messages import packed, plain
 from faintspot.live_page.page import UPDATE_S, Page
-from faintspot.live_page.wishes import Wishes, answered
+from faintspot.live_page.wishes import ClientRequests, answered
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.control import in_thread
 
@@ -74,7 +74,12 @@ class LiveServer:
     """
 
     def __init__(
-        self, source: Source, wishes: Wishes, access: Access, address: str = "127.0.0.1", port: int = 0
+        self,
+        source: Source,
+        wishes: ClientRequests,
+        access: Access,
+        address: str = "127.0.0.1",
+        port: int = 0,
     ) -> None:
         self.access, self.wishes, self.board = access, wishes, Board()
         self.clients: set[Client] = set()

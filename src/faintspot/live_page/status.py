@@ -6,12 +6,12 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators.documentation import allowed_in_words
 from faintspot.estimators.registry import estimators
+from faintspot.pipeline.settings import SharedOptions
 from faintspot.realtime.control import request
 from faintspot.realtime.private_socket import socket_path
-from faintspot.settings import SharedOptions
 
 _EVERY_S = 0.5
 _PATIENCE_S = 3.0

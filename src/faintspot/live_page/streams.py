@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.live_page.batch import Floats
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 

@@ -8,18 +8,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.config.written_changes import parse_changes, parse_subapertures
 from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.recorder import Recorder
-from faintspot.written_changes import parse_changes, parse_subapertures
 
 Wish = Callable[[dict[str, Any]], Mapping[str, Any]]
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,90}\.zarr")
 _MOST_CHANGES = 100
 
 
-class Wishes(Protocol):
+class ClientRequests(Protocol):
     """What a page may ask for, by name; each raises InputError where it is refused."""
 
     def known(self) -> Mapping[str, Wish]:
@@ -27,7 +27,7 @@ class Wishes(Protocol):
         ...
 
 
-def answered(wishes: Wishes, asked: dict[str, Any]) -> dict[str, Any]:
+def answered(wishes: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
     """Carry out a wish; whatever happens, there is an answer."""
     known = wishes.known()
     try:

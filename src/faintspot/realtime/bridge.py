@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.checks import number_between
+from faintspot.base.checks import number_between
 from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.pixel_ring import PixelRing

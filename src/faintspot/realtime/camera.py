@@ -12,13 +12,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
+from faintspot.base.sizes import check_size
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, sensor_frames
-from faintspot.simulate.generators import spawn
-from faintspot.sizes import check_size
 
 _SPIN_NS = 150_000  # a sleep wakes up later than asked for by up to this; the rest is spun
 _BETWEEN_REPORTS_NS = 100_000_000
@@ -245,7 +245,7 @@ class Camera(Readout):
     detector : Detector, optional
         Default: 1 e- read noise and nothing else.
     profile, size
-        The spots, as for `faintspot.simulate.spots`.
+        The spots, as for `faintspot.spots.shapes`.
     motion : SpotMotion, optional
     readout_fraction : float
         Part of the frame time in which the rows arrive, one after the other, 0 to 1. 0: all at once.

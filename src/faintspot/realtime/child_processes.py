@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from faintspot.closing import Closing
-from faintspot.errors import InputError
-from faintspot.files import output_errors
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
+from faintspot.base.files import output_errors
 
 _PATIENCE_S = 10.0  # for a process to end as it is asked to
 _LOOK_S = 0.02

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from faintspot.checks import number_between, one_of
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, one_of
+from faintspot.base.errors import InputError
 from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
 

@@ -20,9 +20,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from faintspot.closing import Closing
-from faintspot.errors import InputError
-from faintspot.files import parse_json
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
+from faintspot.base.files import parse_json
 from faintspot.realtime.private_socket import (
     ENGINE,
     bound_listener,

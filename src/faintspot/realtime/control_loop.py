@@ -8,19 +8,19 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
-from faintspot.control.commands import CommandLine
+from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled import INVALID_PART, MEAN_SQUARE, CompiledIntegrator, true_slopes
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import CONTROLLER, Control
 from faintspot.control.guarded import Guarded
-from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.timing import Latencies
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import RESULT_TYPES, Slopes
 
 NONE, OPEN, CLOSED = "none", "open", "closed"
 STATES = (NONE, OPEN, CLOSED)
@@ -43,7 +43,7 @@ class _Ready(NamedTuple):
     """Whether it asks how wide the prior is that slopes are drawn to."""
 
     @classmethod
-    def of(cls, control: Control, line: CommandLine) -> Self:
+    def of(cls, control: Control, line: CommandDelayLine) -> Self:
         controller = control.controller(line)
         return cls(
             control.options.controller,

@@ -9,11 +9,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from faintspot.configuration import packed, to_text
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import NONE, STREAM, Control
-from faintspot.errors import InputError
 from faintspot.io.frame_numbers import left_out
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.configuration import packed, to_text
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.realtime.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.realtime.engine_estimators import EngineEstimators
 from faintspot.realtime.frame_path import FramePath
@@ -28,7 +29,6 @@ from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
 from faintspot.realtime.workers import Workers
-from faintspot.settings import Settings
 
 _WATCH_S = 0.02  # between two looks of the watcher
 _LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer

@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators import registry
 from faintspot.realtime.estimator_file import EstimatorFile, load_estimators
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM

@@ -8,7 +8,7 @@ import types
 from dataclasses import dataclass
 from pathlib import Path
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators import registry
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.faults import faults_of

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.base.errors import InputError
 from faintspot.control.configuration import prior_std_px
-from faintspot.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import DENOISED, STAGE_ROWS, SlopeArrays, new_scratch
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.streaming import Arrival, streamed, wait_for_rows
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.workers import Workers
-from faintspot.slopes import RESULT_TYPES, Slopes
 
 STOP_CELL = 0
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
 
 ISIO, DAO = "isio", "dao"
@@ -103,7 +103,7 @@ class Places:
     total: int
 
 
-class Unfit(Exception):
+class IncompatibleStreamError(Exception):
     """What is there is no stream that can be used; the text says why, after "stream NAME: "."""
 
 
@@ -155,18 +155,22 @@ def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...
     """
     if kind == ISIO and bytes(metadata["version"]) != VERSION:
         version = bytes(metadata["version"]).decode("ascii", "replace")
-        raise Unfit(f"is of version {version!r}, expected {VERSION.decode()!r}")
+        raise IncompatibleStreamError(f"is of version {version!r}, expected {VERSION.decode()!r}")
     axes, code = int(metadata["naxis"]), int(metadata["datatype"])
     sizes = [int(each) for each in metadata["size"][: min(axes, 3)]]
     if not 1 <= axes <= 3 or min(sizes) < 1 or math.prod(sizes) != int(metadata["nelement"]):
-        raise Unfit(f"holds {axes} axes {sizes} of {int(metadata['nelement'])} values, which is no stream")
+        raise IncompatibleStreamError(
+            f"holds {axes} axes {sizes} of {int(metadata['nelement'])} values, which is no stream"
+        )
     if code not in TYPES:
-        raise Unfit(f"holds values of type {code}, expected real numbers")
+        raise IncompatibleStreamError(f"holds values of type {code}, expected real numbers")
     if kind == ISIO and int(metadata["location"]) != -1:
-        raise Unfit("is in the memory of a GPU, expected that of the processor")
+        raise IncompatibleStreamError("is in the memory of a GPU, expected that of the processor")
     places = places_of(kind, metadata)
     if places.total != size or size > _LARGEST_BYTES:
-        raise Unfit(f"has {size} bytes, expected {places.total} for its metadata: it is of another version")
+        raise IncompatibleStreamError(
+            f"has {size} bytes, expected {places.total} for its metadata: it is of another version"
+        )
     circular = kind == ISIO and axes == 3 and int(metadata["imagetype"]) & _KINDS_OF_IMAGE == _CIRCULAR
     shape = tuple(sizes[1::-1]) if circular else tuple(sizes[::-1])
     return places, shape, np.dtype(TYPES[code]), circular

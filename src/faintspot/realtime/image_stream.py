@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.kernels.ordered import fence, load, store
 from faintspot.realtime.image_layout import (
     COUNTER,
@@ -30,8 +30,8 @@ from faintspot.realtime.image_layout import (
     TYPES,
     VERSION,
     WRITING,
+    IncompatibleStreamError,
     Places,
-    Unfit,
     checked,
     path_of,
     places_of,
@@ -101,7 +101,7 @@ class ImageStream:
             status = os.fstat(descriptor)
             size, head = status.st_size, METADATA[kind]
             if not stat.S_ISREG(status.st_mode) or size <= head.itemsize:
-                raise Unfit(f"{self._path} is no stream")
+                raise IncompatibleStreamError(f"{self._path} is no stream")
             metadata = np.frombuffer(os.pread(descriptor, head.itemsize, 0), head)[0]
             places, self.shape, self.dtype, self._circular = checked(kind, metadata, size)
             access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
@@ -343,11 +343,11 @@ def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
     try:
         status, layout = os.fstat(descriptor), METADATA[kind]
         if not stat.S_ISREG(status.st_mode) or status.st_size <= layout.itemsize:
-            raise Unfit("is no stream")
+            raise IncompatibleStreamError("is no stream")
         head = np.frombuffer(os.pread(descriptor, layout.itemsize, 0), layout)[0]
         checked(kind, head, status.st_size)
         memory = mmap.mmap(descriptor, status.st_size)
-    except Unfit as error:
+    except IncompatibleStreamError as error:
         raise InputError(f"{kind}:{path}: {error}; remove it or choose another name") from None
     finally:
         os.close(descriptor)

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from faintspot.checks import number_between
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.config.written_changes import parse_changes
 from faintspot.control.learnt import CONTROLS
-from faintspot.errors import InputError
 from faintspot.estimators.registry import estimators
+from faintspot.pipeline.settings import Settings, without_denoising
 from faintspot.realtime.live import check_names
-from faintspot.settings import Settings, without_denoising
-from faintspot.written_changes import parse_changes
 
 _SET, _NONE = "set", "none"
 ARMS, FIRST_ARM, EVERY = "arms", "first_arm", "every"

@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.kernels.compiling import Direct, compiled_with
-from faintspot.light import MeanLight
+from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.realtime.live import LiveSettings
 from faintspot.realtime.prepared_settings import PreparedSettings
 
@@ -29,7 +29,7 @@ def add_light(flux: NDArray[np.float32], mean: NDArray[np.float64], frames: floa
 
 
 class LightFollower:
-    """Measures the mean light, as `MeanLight` does, and sets `flux_e` when it has changed.
+    """Measures the mean light, as `MeanFlux` does, and sets `flux_e` when it has changed.
 
     New tables are made in a thread of its own, as for any change of settings. Where the estimator that runs
     does not use the light, nothing is changed.
@@ -80,7 +80,7 @@ class LightFollower:
         pipeline = self._live.running.pipelines[0]
         if not pipeline.settings.estimator.uses_light:
             return False
-        lit = pipeline.with_light(MeanLight(self._mean.copy(), self._longest))
+        lit = pipeline.with_flux(MeanFlux(self._mean.copy(), self._longest))
         if lit is pipeline:
             return False
         self._live.wait(self._live.propose({"flux_e": lit.settings.flux_e}))

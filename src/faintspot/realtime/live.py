@@ -14,13 +14,13 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from faintspot.checks import number_between, numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_known
+from faintspot.config.options import PerSubaperture
 from faintspot.estimators.stepping import Stepping
-from faintspot.options import PerSubaperture
+from faintspot.pipeline.settings import Settings, check_option, option_names
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings, check_option, option_names
-from faintspot.toml_files import check_known
 
 HISTORY_LENGTH = 1000
 _POLL_S = 0.001

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.kernels.ordered import fence, load, store
 from faintspot.realtime.pixel_segment import (
     ARRIVALS,

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from faintspot.checks import number_between, numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
 from faintspot.realtime.processes import process_lives, process_start
 
 FOLDER = Path("/dev/shm")

@@ -7,9 +7,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.closing import Closing
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
 from faintspot.realtime.shared_streams import create_stream
 from faintspot.realtime.telemetry import TelemetryReader
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
 from faintspot.estimators.registry import estimator_named
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.realtime.frame_path import FramePath, Progress, check_real_time
 from faintspot.realtime.interleaving import Interleaving
 from faintspot.realtime.pixel_ring import PixelRing
@@ -20,7 +21,6 @@ from faintspot.realtime.prior import Prior
 from faintspot.realtime.python_path import PythonPath, tried
 from faintspot.realtime.time_limit import call_within
 from faintspot.realtime.workers import Workers
-from faintspot.settings import Settings
 
 TRIAL_LIMIT_S = 60.0  # an estimator may compile
 

@@ -12,7 +12,7 @@ import struct
 import tempfile
 from pathlib import Path
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 
 _BACKLOG = 64
 _LONGEST_PATH = 107  # bytes, of a Unix socket on Linux

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators.base import Positions
 from faintspot.estimators.python import PythonPrepared
 from faintspot.kernels.groups import CALIBRATED
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.realtime.frame_path import FramePath, check_real_time
 from faintspot.realtime.time_limit import call_is_under_way, end_thread
 from faintspot.realtime.trial_frames import trial_frames, typical_frame
-from faintspot.settings import Settings
 
 BUDGET_S = 1e-3
 MOST_FAILURES = 3  # frames in a row that fail, or take longer than the budget

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.interleaving import arms_after

@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.io import FrameSource
 from faintspot.realtime.camera import CameraReport, Readout, StopEvent
 from faintspot.realtime.pixel_ring import PixelRing

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.processes import process_age_s
 

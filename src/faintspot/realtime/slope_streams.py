@@ -8,9 +8,10 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.telemetry_rows import fill_telemetry_rows
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
 from faintspot.realtime.shared_streams import (
     LOCK_LIMIT_S,
     create_stream,
@@ -19,7 +20,6 @@ from faintspot.realtime.shared_streams import (
     lock_file,
     pyshmem_module,
 )
-from faintspot.slopes import RESULT_TYPES, Slopes
 
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.realtime.image_layout import DAO, ISIO, Unfit, path_of
+from faintspot.realtime.image_layout import DAO, ISIO, IncompatibleStreamError, path_of
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
 _NAP_S = 5e-4
@@ -84,7 +84,7 @@ class PyshmemStream:
         except FileNotFoundError:
             raise
         except (OSError, ValueError) as error:  # half made, or not for us
-            raise Unfit(f"cannot be opened ({' '.join(str(error).split())})") from None
+            raise IncompatibleStreamError(f"cannot be opened ({' '.join(str(error).split())})") from None
         self._name = name
         self.shape, self.dtype = tuple(self._source.shape), self._source.dtype
 
@@ -185,7 +185,7 @@ def open_stream(name: str) -> Stream:
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise Unfit(f"cannot be opened ({error.strerror})") from None
+            raise IncompatibleStreamError(f"cannot be opened ({error.strerror})") from None
     return PyshmemStream(name)
 
 
@@ -239,7 +239,7 @@ class Follower:
             source = open_stream(self.name)
         except FileNotFoundError:
             return "is not there"
-        except Unfit as error:
+        except IncompatibleStreamError as error:
             return str(error)
         obstacle = self._unfit(source.shape, source.dtype)
         if obstacle:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.image_stream import ImageStreamWriter

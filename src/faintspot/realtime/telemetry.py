@@ -29,10 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between
-from faintspot.closing import Closing
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
 from faintspot.kernels.ordered import fence
+from faintspot.pipeline.slopes import Slopes
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import Header, create_segment, segment_path
 from faintspot.realtime.processes import process_start
@@ -49,7 +50,6 @@ from faintspot.realtime.telemetry_segment import (
     up_to_pages,
 )
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import Slopes
 
 __all__ = ["TelemetryReader", "TelemetryRing"]
 
@@ -108,7 +108,7 @@ class TelemetryRing(Closing):
             The engine's; the segment is /dev/shm/NAME_telemetry.
         layout : Layout
         settings : str
-            The settings to begin with, for readers: TOML text (`faintspot.configuration.to_text`).
+            The settings to begin with, for readers: TOML text (`faintspot.pipeline.configuration.to_text`).
         arms : sequence of str, optional
             Names of the arms of interleaved settings, for readers.
         commands : int
@@ -116,7 +116,7 @@ class TelemetryRing(Closing):
         reference : (2 n,) array, optional
             Reference slopes that are subtracted, px, for readers.
         parts : mapping, optional
-            Calibration, PSF and score, for readers (`faintspot.configuration.packed`).
+            Calibration, PSF and score, for readers (`faintspot.pipeline.configuration.packed`).
         records : int, optional
             Places for records of about 60 + 25 n bytes: a reader may lag behind by one frame less. Default:
             as many as fit into 32 MiB, up to 4096.

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.closing import Closing
-from faintspot.loop.camera import make_detector
-from faintspot.loop.configuration import LoopConfiguration
-from faintspot.loop.observatory import Observatory
+from faintspot.ao_loop.camera import make_detector
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.base.closing import Closing
 from faintspot.realtime.camera import CameraReport, Readout, StopEvent, readout_type
 from faintspot.realtime.command_stream import CommandStream
 from faintspot.realtime.pixel_ring import PixelRing
@@ -82,7 +82,7 @@ class SimulatedTelescope(Readout, Closing):
 
     Attributes
     ----------
-    observatory : Observatory
+    observatory : TelescopeModel
     commands : CommandStream
 
     Raises
@@ -108,7 +108,7 @@ class SimulatedTelescope(Readout, Closing):
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
         self._conditions = Conditions.of(configuration)
         start = configuration.run.seed if seed is None else seed
-        self.observatory = observatory = Observatory(configuration, start, realisation)
+        self.observatory = observatory = TelescopeModel(configuration, start, realisation)
         self._wind = observatory.air.velocity
         layout, mirror = observatory.optics.sensor.layout, observatory.optics.mirror
         dtype = readout_type(make_detector(configuration))

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from faintspot.checks import number_between, numbers_between
-from faintspot.errors import InputError
-from faintspot.loop.configuration import ARCSEC, LoopConfiguration
-from faintspot.toml_files import check_keys
+from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.base.toml_files import check_keys
 from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators.faults import one_line
 
 Result = TypeVar("Result")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
+from faintspot.base.checks import number_between
 
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide
 _LONGEST_NS = 2**37 - 1  # 137 s; what is longer counts in the last bin

@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.base.files import parse_json
 from faintspot.estimators.faults import one_line
-from faintspot.files import parse_json
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.realtime.estimator_file import load_estimators
 from faintspot.realtime.python_path import tried
-from faintspot.settings import Settings
 
 LIMIT_S = 90.0
 _GRACE_S = 5.0  # for the process to end by itself

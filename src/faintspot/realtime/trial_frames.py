@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 
 _FLUX_E = 300.0
 _NOISE_E = 3.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from faintspot.flags import SubapertureFlag
+from faintspot.base.flags import SubapertureFlag
 from faintspot.recorded.statistics import MeasuredSlopes, SlopesSummary
 
 FLAG_MEANINGS = {

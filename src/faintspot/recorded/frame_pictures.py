@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from faintspot.estimators.base import Step
 from faintspot.estimators.total_variation import TotalVariation
+from faintspot.pipeline.slopes import Stages
 from faintspot.report.drawing import (
     LIGHT_GREY,
     TRUTH_COLOUR,
@@ -21,7 +22,6 @@ from faintspot.report.drawing import (
     styled,
 )
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import Stages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

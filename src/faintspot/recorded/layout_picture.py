@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.files import write_atomically
+from faintspot.base.files import write_atomically
 from faintspot.report.drawing import colour_bar, limits_of, new_figure, png, styled
 from faintspot.sensor.layout import Layout
 

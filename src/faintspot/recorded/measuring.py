@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import faintspot
-from faintspot import configuration
-from faintspot.checks import one_of
-from faintspot.errors import InputError
-from faintspot.flags import SubapertureFlag
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
+from faintspot.base.flags import SubapertureFlag
+from faintspot.config.tables import read_tables
 from faintspot.io.aot_reading import is_aot, read_aot
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.io.labelled import layout_coordinates
@@ -24,13 +24,13 @@ from faintspot.io.locations import split_location
 from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
 from faintspot.io.slopes_format import UNITS, VARIABLES, pixels_in, scaled_positions
-from faintspot.light import MeanLight
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline import configuration
+from faintspot.pipeline.mean_flux import MeanFlux
+from faintspot.pipeline.settings import Settings, with_preset, without_denoising
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.settings import Settings, with_preset, without_denoising
-from faintspot.slopes import Slopes
-from faintspot.tables import read_tables
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
@@ -113,7 +113,7 @@ def measure_recorded(
         Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
     mean_light : bool
         Tell the estimator the mean light of every sub-aperture over the recording, instead of letting it take
-        that of each frame: better where the star is faint and steady; see `faintspot.MeanLight`.
+        that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
         slopes of which they are the mean; see `faintspot.io.references.read_reference`.
@@ -257,7 +257,7 @@ def _told_mean_light(pipeline: SlopePipeline, source: FrameSource) -> SlopePipel
             start, min(start + _FRAMES_FOR_LIGHT, source.n_frames), _FRAMES_FOR_LIGHT
         )
     ]
-    return pipeline.with_light(MeanLight(np.concatenate(light)))
+    return pipeline.with_flux(MeanFlux(np.concatenate(light)))
 
 
 def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:

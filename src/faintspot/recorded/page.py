@@ -7,17 +7,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between
+from faintspot.base.errors import InputError
 from faintspot.estimators.base import Step
 from faintspot.estimators.total_variation import TotalVariation
+from faintspot.pipeline.slopes import Stages
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.recorded.wavefront_section import wavefront_sections
 from faintspot.report.page import POSITIONS, Page, configuration_section, html_of
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import Stages
 from faintspot.wavefront import Wavefront
 
 

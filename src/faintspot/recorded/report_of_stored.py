@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.io import open_frames
+from faintspot.pipeline.slopes import Stages
 from faintspot.recorded.page import slopes_report
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.stored_run import StoredRun, open_run
-from faintspot.slopes import Stages
 from faintspot.wavefront import Wavefront, fit_wavefront
 
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded

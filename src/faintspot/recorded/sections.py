@@ -29,7 +29,7 @@ from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:
     from faintspot.estimators.base import Step
-    from faintspot.slopes import Stages
+    from faintspot.pipeline.slopes import Stages
 
 NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import finite_array
-from faintspot.errors import InputError
-from faintspot.flags import INVALID, SubapertureFlag
+from faintspot.base.checks import finite_array
+from faintspot.base.errors import InputError
+from faintspot.base.flags import INVALID, SubapertureFlag
 
 Floats = NDArray[np.float64]
 

@@ -12,17 +12,17 @@ import tomlkit
 from numpy.typing import ArrayLike
 from tomlkit.exceptions import TOMLKitError
 
-from faintspot import configuration
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.config.tables import read_tables
 from faintspot.estimators.base import Estimator
 from faintspot.io import StoredSlopes, read_slopes
-from faintspot.pipeline import SlopePipeline
+from faintspot.pipeline import configuration
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
-from faintspot.sensor.score import Score, load_score
-from faintspot.settings import Settings
-from faintspot.tables import read_tables
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score, load_score
 
 _Part = TypeVar("_Part", PSF, Score)
 

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
 from faintspot.experiments.statistics import Estimate
 from faintspot.io.telemetry import Telemetry, read_telemetry
+from faintspot.pipeline.slopes import Slopes
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
@@ -26,7 +27,6 @@ from faintspot.recorded.telemetry_numbers import (
 from faintspot.recorded.wavefront_section import wavefront_sections
 from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import Slopes
 from faintspot.wavefront import Wavefront, fit_wavefront
 
 _MOST_GAPS, _MOST_CHANGES = 20, 200

@@ -10,7 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import MissingExtraError
+from faintspot.base.errors import MissingExtraError
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.pupil import lenslet_outlines, lenslet_pitch
 

@@ -10,8 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import faintspot
-from faintspot.errors import InputError, MissingExtraError
-from faintspot.files import derived, write_atomically
+from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.files import derived, write_atomically
 from faintspot.report.figure_data import FigureWithData
 
 POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."

@@ -12,12 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between, numbers_between, real_array
-from faintspot.errors import InputError
-from faintspot.files import derived
+from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
+from faintspot.base.npz import save_arrays
+from faintspot.config.tables import (
+    check_fields,
+    chosen_fields,
+    errors_of_table,
+    is_map,
+    read_tables,
+    save_tables,
+)
 from faintspot.io.frames import open_frames, read_array
-from faintspot.npz import save_arrays
-from faintspot.tables import check_fields, chosen_fields, errors_of_table, is_map, read_tables, save_tables
 
 _BLOCK_PIXELS = 1 << 22  # in memory at a time
 _MAPS = ("dark", "flat", "bad_pixels")

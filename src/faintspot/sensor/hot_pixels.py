@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between, real_array
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between, real_array
+from faintspot.base.errors import InputError
 
 _MAD_TO_STD = 1.4826
 _SHARPNESS = 4.0  # excess over the spread of the neighbours; a Nyquist-sampled spot's peak has 3 at most

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.region import Pupil, Rectangle
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW, window_size

@@ -10,12 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between, one_of
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_size
+from faintspot.base.toml_files import check_keys, checked_table
+from faintspot.config.tables import (
+    check_fields,
+    chosen_fields,
+    errors_of_table,
+    read_tables,
+    save_tables,
+    table_of,
+)
 from faintspot.sensor.window_size import pair_of_numbers, window_size
-from faintspot.sizes import check_size
-from faintspot.tables import check_fields, chosen_fields, errors_of_table, read_tables, save_tables, table_of
-from faintspot.toml_files import check_keys, checked_table
 
 if TYPE_CHECKING:
     from faintspot.sensor.windows import Windows
@@ -131,7 +138,7 @@ class Layout:
         )
 
     def _repr_html_(self) -> str:
-        from faintspot.notebook import layout_picture
+        from faintspot.base.notebook import layout_picture
 
         return layout_picture(self)
 

@@ -10,8 +10,8 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from faintspot.checks import finite_array, number_between, one_of, real_array
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between, one_of, real_array
+from faintspot.base.errors import InputError
 from faintspot.sensor.following import follow
 from faintspot.sensor.kin import best_kin
 from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import spline_filter1d
 from scipy.stats import chi2
 
-from faintspot.checks import finite_array, number_between, numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import numbers_between
+from faintspot.base.errors import InputError
 
 
 @dataclass(frozen=True)

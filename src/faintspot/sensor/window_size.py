@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.checks import numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import numbers_between
+from faintspot.base.errors import InputError
 
 SMALLEST_WINDOW, LARGEST_WINDOW = 2, 64
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from faintspot.checks import real_array
-from faintspot.errors import InputError
+from faintspot.base.checks import real_array
+from faintspot.base.errors import InputError
 from faintspot.sensor.lenslets import LensletGrid, find_lenslets
 from faintspot.sensor.window_size import LARGEST_WINDOW, window_size
 

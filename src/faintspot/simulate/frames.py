@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between
-from faintspot.errors import InputError
-from faintspot.simulate.detector import Detector
-from faintspot.simulate.generators import spawn
-from faintspot.simulate.spots import image_shape, per_spot, spots
-from faintspot.simulate.turbulence import LARGEST_D_OVER_R0, speckled_images
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
+from faintspot.sensor.detector import Detector
+from faintspot.spots.shapes import image_shape, per_spot, spots
+from faintspot.spots.speckled import LARGEST_D_OVER_R0, speckled_images
 
 _BLOCK_PIXELS = 1 << 21  # pixels simulated at a time: bounds the memory of the double-precision means
 
@@ -35,7 +35,7 @@ def subapertures(
     """Return noisy sub-aperture images in photo-electrons and the true positions of their spots.
 
     The images are `Detector.to_electrons` of the detector's read-out: background and dark current are in
-    them, not subtracted. The spots are those of `faintspot.simulate.spots`; flux_e, size, elongation and
+    them, not subtracted. The spots are those of `faintspot.spots.shapes`; flux_e, size, elongation and
     angle_deg are one number each or one per sub-aperture.
 
     Parameters
@@ -48,7 +48,7 @@ def subapertures(
         Electrons that a spot in the middle of its image leaves within it. Farther out more light is lost,
         as behind a field stop; turbulence, which spreads the light, loses more too.
     profile, size, elongation, angle_deg
-        The spot's shape, see `faintspot.simulate.spots`.
+        The spot's shape, see `faintspot.spots.shapes`.
     position_range_px : float
         True positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
@@ -156,7 +156,7 @@ def sensor_frames(
     flux_e : float or array_like, shape (n,)
         Electrons per frame that a spot in the middle of its window leaves within it.
     profile, size, elongation, angle_deg
-        The spot's shape, see `faintspot.simulate.spots`; one number each or one per sub-aperture.
+        The spot's shape, see `faintspot.spots.shapes`; one number each or one per sub-aperture.
     position_range_px : float
         True positions are uniform within plus and minus this, on each axis, anew in every frame, px.
     positions : array_like, shape (n, 2) or (n_frames, n, 2), optional

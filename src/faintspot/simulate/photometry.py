@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
 
 # Flux density (Jy) at magnitude 0 and relative width of the band: Bessell 1979 (PASP 91, 589) for B to I,
 # Campins, Rieke & Lebofsky 1985 (AJ 90, 896) for J to K.

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array
-from faintspot.errors import InputError
-from faintspot.slopes import Slopes
+from faintspot.base.checks import finite_array
+from faintspot.base.errors import InputError
+from faintspot.pipeline.slopes import Slopes
 
 Floats = NDArray[np.float64]
 

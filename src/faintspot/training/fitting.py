@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.sensor.score import table_sums
+from faintspot.spots.score import table_sums
 from faintspot.training.splines import STEPS_PER_PX, SplineTables
 
 Floats = NDArray[np.float64]

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import number_between, numbers_between, one_of, real_array
-from faintspot.errors import InputError
-from faintspot.estimate.noise import pixel_noise
+from faintspot.algorithms.noise import pixel_noise
+from faintspot.base.checks import number_between, numbers_between, one_of, real_array
+from faintspot.base.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_fit import Form
 from faintspot.training.psf_rounds import (
     Options,

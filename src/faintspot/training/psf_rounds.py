@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from faintspot.errors import InputError
-from faintspot.sensor.psf import PSF
+from faintspot.base.errors import InputError
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_fit import FIRST_FORM, Form, choose_form, fit_psf, samples_of
 from faintspot.training.registration import Floats, Registered, Stack, Tables, register, start
 from faintspot.training.stacking import Sums, stack_spots

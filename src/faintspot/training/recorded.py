@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between, one_of, real_array
-from faintspot.errors import InputError
-from faintspot.pipeline import SlopePipeline
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, real_array
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.score import STARTS, TrainedScore, smoothed_peak, table_sums
-from faintspot.settings import Settings
-from faintspot.simulate.generators import spawn
+from faintspot.spots.score import STARTS, TrainedScore, smoothed_peak, table_sums
 from faintspot.training.fitting import Sample, fit_passes
 from faintspot.training.simulation import MOST_PASSES, flux_classes
 from faintspot.training.splines import STEPS_PER_PX, SYMMETRIES, SplineTables, splines_for

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 
 Floats = NDArray[np.float64]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import checked_options, frame_stack, image_stack
 from faintspot.training.psf_rounds import Options, State, refitted, registered, stacked
 from faintspot.training.registration import Floats, Registered, Stack, Tables, start

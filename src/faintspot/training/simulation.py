@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between, one_of
-from faintspot.errors import InputError
-from faintspot.sensor.score import STARTS, TrainedScore, smoothed_peak
-from faintspot.simulate.detector import Detector
-from faintspot.simulate.generators import spawn
-from faintspot.simulate.spots import SMALLEST_SIZE, image_shape, per_spot, spots
-from faintspot.simulate.turbulence import LARGEST_D_OVER_R0, speckled_spots
+from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
+from faintspot.sensor.detector import Detector
+from faintspot.spots.score import STARTS, TrainedScore, smoothed_peak
+from faintspot.spots.shapes import SMALLEST_SIZE, image_shape, per_spot, spots
+from faintspot.spots.speckled import LARGEST_D_OVER_R0, speckled_spots
 from faintspot.training.fitting import Sample, best_passes, fit_passes, stacked_tables
 from faintspot.training.splines import (
     FINE_SPACING_PX,
@@ -188,11 +188,11 @@ def train_estimator(
     shape : (int, int)
         Rows and columns of a window, px.
     profile, size, elongation, angle_deg
-        The spot's shape, see `faintspot.simulate.spots`; size, elongation and angle may be (n_subapertures,)
+        The spot's shape, see `faintspot.spots.shapes`; size, elongation and angle may be (n_subapertures,)
         arrays: sub-apertures that are alike share a kind, and each kind takes its own training.
     d_over_r0 : float
         Side of the sub-aperture in units of the Fried parameter at the sensing wavelength. Above 0 the spots
-        are those of `faintspot.simulate.turbulence.speckled_spots`. When unsure, train for the larger one.
+        are those of `faintspot.spots.speckled.speckled_spots`. When unsure, train for the larger one.
     natural_tilt : bool
         Whether the turbulence's own tilt adds to the positions, as without a corrector in front.
     position_range_px : float

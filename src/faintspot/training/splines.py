@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.sensor.score import nodes_of_pixels
+from faintspot.spots.score import nodes_of_pixels
 
 Floats = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import image_stack, number_between
+from faintspot.base.checks import image_stack, number_between
 from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.psf import PSF
+from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import LearntPSF, learn_psf_from_images
 
 Floats = NDArray[np.float64]

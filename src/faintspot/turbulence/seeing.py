@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.checks import finite_array, number_between, numbers_between
-from faintspot.errors import InputError
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
 from faintspot.turbulence.von_karman import R0_WAVELENGTH_M, SPECTRUM
 
 Floats = NDArray[np.float64]

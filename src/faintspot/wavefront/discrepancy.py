@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.errors import InputError
+from faintspot.base.errors import InputError
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.layout import Layout
-from faintspot.slopes import Slopes
 
 Floats = NDArray[np.float64]
 

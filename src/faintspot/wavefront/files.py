@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from faintspot.errors import InputError
-from faintspot.files import write_atomically
+from faintspot.base.errors import InputError
+from faintspot.base.files import write_atomically
 from faintspot.io.optional_packages import load_fits
 from faintspot.report.figure_data import csv_text
 from faintspot.wavefront.fit import Floats, Wavefront, total

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.checks import number_between
-from faintspot.errors import InputError
+from faintspot.base.checks import number_between
+from faintspot.base.errors import InputError
+from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.pupil import Pupil, inside_pupil, lenslet_outlines, pupil_of
-from faintspot.slopes import Slopes
 from faintspot.wavefront.zernike import mean_gradients, zernike
 
 Floats = NDArray[np.float64]

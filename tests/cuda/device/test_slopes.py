@@ -166,7 +166,8 @@ def test_automatic_settings_follow_the_light_of_each_frame() -> None:
 
 @pytest.mark.parametrize("warps", [1] if simulated() else [1, 2, 4])  # the simulator's warps are blocks
 def test_slopes_do_not_depend_on_the_launch(warps: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    from faintspot.cuda import fused, measuring
+    from faintspot.cuda import fused
+    from faintspot.pipeline import device as measuring
 
     case = small_case(2, "uint16", (5, 6))
     expected = on_gpu(case)
@@ -195,7 +196,7 @@ def test_too_large_windows_are_refused() -> None:
 
 
 def test_too_large_frames_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    from faintspot.cuda import measuring
+    from faintspot.pipeline import device as measuring
 
     monkeypatch.setattr(measuring, "MOST_FRAME_PIXELS", 100)
     with pytest.raises(fs.InputError, match='frame of 8 x 16 pixels: device="cuda" takes at most 100'):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, Options, ToolSlopes, parts_of
 from faintspot.adapters.checks import check_matrix, check_version
-from faintspot.errors import InputError, MissingExtraError
+from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.sensor.layout import Layout
 
 try:

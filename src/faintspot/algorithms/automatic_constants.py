@@ -1,0 +1,196 @@
+"""Constants of the automatic settings, fitted to simulated spots; docs/automatic.md says how.
+
+Symbols are those of faintspot.algorithms.automatic.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Kept(NamedTuple):
+    """Constants of the number of kept pixels after one method."""
+
+    threshold: float  # c, noises of a dark pixel
+    threshold_photons: float  # c falls with the core's photon noise to this power
+    threshold_window: float  # c rises with ln(1 + N / A) to this power: larger windows, higher noise peaks
+    tail: float  # of the background's noise in C, per electron
+    gaussian: float  # pixels per area and ln(1 + C / c); 1/2 is the level set of a Gaussian
+    gaussian_px: float  # added to the area: the pixels' own width
+    core: float  # the same two of a sinc^2's core
+    core_px: float
+    lobe: float  # largest number of a sinc^2's core: lobe * A + lobe_px
+    lobe_px: float
+    wings: float  # the same as `core` of its side lobes, from C / c = wings_from
+    wings_px: float
+    wings_from: float
+    edge: float  # limit of k where the kept region reaches the window's edge
+    edge_exponent: float
+    lost: float  # C under which the spot is lost in noise, and how it goes with A, r and N
+    lost_area: float
+    lost_range: float
+    lost_window: float
+    shrink: float  # b, exponent and dependence on A of k where the spot is lost
+    shrink_exponent: float
+    shrink_area: float
+    off_lost: float  # D^2 r^2 / N under which a lost spot is not denoised
+    off: float  # (range / error of a single spot)^2 under which it is best not to denoise
+    off_photons: float  # q under which it is best not to denoise
+
+
+class Strength(NamedTuple):
+    """Constants of the strength."""
+
+    diffraction: float  # a
+    gaussian: float
+    decline: float  # d
+    tail: float  # of the background's noise, per electron
+    core_freedom: float  # degrees of freedom left by denoising, per A
+    noise_freedom: float  # and, where the spot is faint, by noise taken for light: up to D = noise_freedom_at
+    noise_freedom_at: float
+    noise_freedom_exponent: float
+    wings: float  # of a sinc^2: part of the light's noise that is removed; none of a Gaussian's
+    wings_window: float  # falls with A / N: in a small window most light is in the core
+    lost: float  # of sqrt(v), where the spot is lost
+
+
+class Smoothing(NamedTuple):
+    """Constants of the Gaussian smoothing."""
+
+    diffraction: float  # width at A = 9 of a bright spot, px
+    gaussian: float
+    area_exponent: float
+    faint: float
+    faint_exponent: float
+    tail: float  # of the background's noise, per electron
+    photons_diffraction: float  # exponents of 1 + photon noise of the core / v
+    photons_gaussian: float
+    lost: float  # width at A = 9 where the spot is lost, px
+
+
+class FewPhotons(NamedTuple):
+    """Constants of spots of few photons, without denoising."""
+
+    photons: float  # the spot's photon noise in D^2
+    diffraction: float  # pixels per area
+    gaussian: float
+    rarity: float  # q up to which photons are few
+    variance: float  # v up to which each stands out
+    range_exponent: float
+
+
+KEPT = {
+    "none": Kept(
+        threshold=3.85,
+        threshold_photons=0.231,
+        threshold_window=1.28,
+        tail=0.737,
+        gaussian=0.581,
+        gaussian_px=1.08,
+        core=0.432,
+        core_px=2.47,
+        lobe=0.851,
+        lobe_px=2.22,
+        wings=0.038,
+        wings_px=10.6,
+        wings_from=6.5,
+        edge=4.83,
+        edge_exponent=0.664,
+        lost=2.33,
+        lost_area=0.267,
+        lost_range=0.486,
+        lost_window=0.197,
+        shrink=6.49,
+        shrink_exponent=1.57,
+        shrink_area=0.0,
+        off_lost=0.0,
+        off=0.0,
+        off_photons=0.0,
+    ),
+    "tv": Kept(
+        threshold=0.116,
+        threshold_photons=0.691,
+        threshold_window=0.964,
+        tail=0.281,
+        gaussian=0.226,
+        gaussian_px=1.37,
+        core=0.182,
+        core_px=0.831,
+        lobe=1.09,
+        lobe_px=3.53,
+        wings=0.0088,
+        wings_px=0.118,
+        wings_from=213.0,
+        edge=19.3,
+        edge_exponent=1.38,
+        lost=2.03,
+        lost_area=0.442,
+        lost_range=0.155,
+        lost_window=0.0443,
+        shrink=4.14,
+        shrink_exponent=1.33,
+        shrink_area=0.115,
+        off_lost=0.38,
+        off=0.902,
+        off_photons=0.46,
+    ),
+    "smoothed": Kept(
+        threshold=0.547,
+        threshold_photons=0.781,
+        threshold_window=1.31,
+        tail=0.0882,
+        gaussian=0.345,
+        gaussian_px=0.439,
+        core=0.271,
+        core_px=0.162,
+        lobe=1.24,
+        lobe_px=1.64,
+        wings=0.0339,
+        wings_px=2.98,
+        wings_from=52.5,
+        edge=9.77,
+        edge_exponent=1.11,
+        lost=1.57,
+        lost_area=0.461,
+        lost_range=0.483,
+        lost_window=0.204,
+        shrink=3.81,
+        shrink_exponent=1.08,
+        shrink_area=0.023,
+        off_lost=0.106,
+        off=0.575,
+        off_photons=0.385,
+    ),
+}
+STRENGTH = Strength(
+    diffraction=1.1,
+    gaussian=1.09,
+    decline=0.0635,
+    tail=0.177,
+    core_freedom=1.71,
+    noise_freedom=159.0,
+    noise_freedom_at=5.03,
+    noise_freedom_exponent=6.92,
+    wings=0.438,
+    wings_window=4.99,
+    lost=0.606,
+)
+SMOOTHING = Smoothing(
+    diffraction=0.323,
+    gaussian=0.374,
+    area_exponent=0.133,
+    faint=1.16,
+    faint_exponent=0.47,
+    tail=1.1,
+    photons_diffraction=0.059,
+    photons_gaussian=0.0005,
+    lost=0.567,
+)
+FEW = FewPhotons(
+    photons=1.05,
+    diffraction=59.4,
+    gaussian=24.0,
+    rarity=0.51,
+    variance=0.0059,
+    range_exponent=4.0,
+)

@@ -1,0 +1,94 @@
+"""Brightest-pixel background subtraction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import image_stack, numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.kernels.host import lanes_for
+from faintspot.kernels.parallel import run_groups
+from faintspot.kernels.stacks import subtract_stack
+
+RULES = ("subtract_next", "threshold", "subtract_kth")
+
+
+def most_kept(pixels: int, rule: str) -> int:
+    """Largest number of pixels that can be kept of `pixels`: "subtract_next" needs one more to subtract."""
+    return pixels - 1 if rule == "subtract_next" else pixels
+
+
+def threshold_rank(keep: NDArray[np.int64], rule: str) -> NDArray[np.int64]:
+    """Rank (1 = largest) of the pixel whose value is the threshold."""
+    return keep + 1 if rule == "subtract_next" else keep
+
+
+def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtract_next") -> NDArray[Any]:
+    """Subtract the background that the `keep` brightest pixels of each image leave behind.
+
+    Parameters
+    ----------
+    images : (..., ny, nx) array
+        Computed in float32 when float32 (or float16), else in float64.
+    keep : int or array of int
+        Number of pixels k to keep, 1 to ny * nx (one less for "subtract_next"); scalar or broadcastable to
+        the leading shape.
+    rule : {"subtract_next", "threshold", "subtract_kth"}
+        With t the threshold of the image g:
+
+        - "subtract_next" [1]_: t = the (k+1)-th largest value, result max(g - t, 0). Exactly k pixels stay
+          unless values tie with t, which become zero like it.
+        - "threshold": t = the k-th largest value, pixels below t become zero, the others stay as they are.
+          Of pixels that tie with t all stay, so that more than k may.
+        - "subtract_kth": t = the k-th largest value, result max(g - t, 0); the k-th pixel becomes zero.
+
+    Returns
+    -------
+    (..., ny, nx) array
+
+    Raises
+    ------
+    InputError
+        For images that are not real, finite and at least two-dimensional, a `keep` out of range or of a
+        shape that does not broadcast, an unknown rule.
+
+    References
+    ----------
+    .. [1] Basden, A. G., Myers, R. M. & Gendron, E., 2012, MNRAS 419, 1628, and Basden et al. 2015,
+       arXiv:1503.06043.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> print(fs.brightest_pixels([[1.0, 2.0, 1.0], [2.0, 9.0, 6.0], [1.0, 3.0, 1.0]], 3))
+    [[0. 0. 0.]
+     [0. 7. 4.]
+     [0. 1. 0.]]
+    """
+    stack = image_stack("images", images)
+    one_of("rule", rule, RULES)
+    leading, (ny, nx) = stack.shape[:-2], stack.shape[-2:]
+    if ny * nx < 2:
+        raise InputError(f"images: expected at least 2 pixels, got {ny} x {nx}")
+    count = numbers_between(
+        f"keep ({ny} x {nx} pixels, rule {rule!r})", keep, 1, most_kept(ny * nx, rule), integer=True
+    )
+    try:
+        count = np.broadcast_to(count, leading)
+    except ValueError:
+        raise InputError(f"keep: shape {count.shape} does not broadcast to {leading}") from None
+
+    flat = stack.reshape(-1, ny * nx)
+    rank = threshold_rank(count.reshape(-1), rule)
+    result = np.empty_like(flat)
+    lanes = lanes_for(flat.dtype)
+    subtract = 0.0 if rule == "threshold" else 1.0
+
+    def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
+        subtract_stack(lanes, flat, rank, subtract, start, stop, scratch, result)
+
+    run_groups(job, -(-len(flat) // lanes.width), lanes, (ny, nx))
+    return result.reshape(stack.shape)

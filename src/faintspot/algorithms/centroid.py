@@ -1,0 +1,70 @@
+"""Centre of gravity."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import image_stack
+from faintspot.kernels.host import lanes_for
+from faintspot.kernels.parallel import run_groups
+from faintspot.kernels.stacks import centroid_stack
+
+
+def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
+    """Return the centre of gravity of each image.
+
+    Parameters
+    ----------
+    images : (..., ny, nx) array
+        Computed in float32 when float32 (or float16), else in float64.
+
+    Returns
+    -------
+    (..., 2) array
+        x (along columns) and y (along rows) in pixels from the image's centre: pixel i of n is at
+        ``i - (n - 1) / 2``. An image whose sum is not positive, or so small beside its values that no
+        position can be told, gives (0, 0), never NaN.
+
+    Raises
+    ------
+    InputError
+        For images that are not real, finite and at least two-dimensional.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> print(fs.centre_of_gravity([[0.0, 0.0, 0.0], [0.0, 3.0, 1.0], [0.0, 0.0, 0.0]]))
+    [0.25 0.  ]
+    """
+    stack = image_stack("images", images)
+    ny, nx = stack.shape[-2:]
+    flat = _scaled_up(stack.reshape(-1, ny * nx))
+    positions = np.empty((len(flat), 2), stack.dtype)
+    lanes = lanes_for(flat.dtype)
+
+    def job(start: int, stop: int, scratch: tuple[Any, ...]) -> None:
+        centroid_stack(lanes, flat, ny, nx, start, stop, scratch, positions)
+
+    run_groups(job, -(-len(flat) // lanes.width), lanes, (ny, nx))
+    positions[~np.isfinite(positions).all(axis=1)] = 0.0
+    return positions.reshape(*stack.shape[:-2], 2)
+
+
+def _scaled_up(flat: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Return images (n, pixels) with those whose values are tiny multiplied by a power of two.
+
+    The kernel multiplies by the reciprocal of a sum, which overflows where the sum is not a normal number.
+    """
+    limits = np.finfo(flat.dtype)
+    largest = np.abs(flat).max(axis=1)
+    tiny = (largest > 0) & (largest < limits.tiny / limits.eps)
+    if not tiny.any():
+        return flat
+    # Of a number that is not normal, all digits are kept.
+    power = -int(np.log2(limits.tiny)) // 2 + int(limits.nmant)
+    scaled = flat.copy()
+    scaled[tiny] *= flat.dtype.type(2.0) ** power
+    return scaled

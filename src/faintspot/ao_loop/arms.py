@@ -1,0 +1,105 @@
+"""What experiments compare: an estimator with its settings, and what a loop does with its slopes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from faintspot.base.checks import number_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.control.learning import CONTROLS, INTEGRATOR
+from faintspot.estimators.base import Estimator
+from faintspot.pipeline.settings import Settings
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
+
+PRIOR = "prior_std_px"
+"""Option of the estimators whose prior a loop sets: how far spots are from where they are expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A way to measure slopes, what it knows, and what a loop does with them: what experiments compare.
+
+    Parameters
+    ----------
+    label : str
+    settings : Settings
+    gain : float, optional
+        Loop gain, 0 to 2. Default: the configuration's.
+    window_pixels : int, optional
+        Side of the middle part of each sub-aperture's window that is used. Default: all.
+    weighted_reconstructor : bool
+        Whether slopes count by their standard errors.
+    predict_prior : bool
+        Whether estimators that take a prior are given the slopes that the loop predicts.
+    correct_gain : bool
+        Whether slopes are divided by the centroid gain measured at the run's flux.
+    true_slopes : bool
+        Whether slopes are the wavefront's true mean gradients instead of measured ones.
+    control : str
+        What makes commands of the slopes, see `faintspot.control.learning.CONTROLS`. All but the integrator
+        learn from telemetry of a loop with the integrator, on other air.
+    noise_scale : float
+        What control multiplies the variance of the slopes' noise by that telemetry shows.
+    psf, score : PSF, Score, optional
+        For the estimators that need them. Default PSF: that of a flat wavefront.
+
+    Raises
+    ------
+    InputError
+        For an empty label, an unknown control, a gain, window or scale out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.ao_loop import Arm
+    >>> arm = Arm("a window, less gain", fs.Settings("window"), gain=0.4)
+    >>> arm.control, arm.gain
+    ('integrator', 0.4)
+    """
+
+    label: str
+    settings: Settings
+    gain: float | None = None
+    window_pixels: int | None = None
+    weighted_reconstructor: bool = False
+    predict_prior: bool = False
+    correct_gain: bool = True
+    true_slopes: bool = False
+    control: str = INTEGRATOR
+    noise_scale: float = 1.0
+    psf: PSF | None = None
+    score: Score | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.label, str) or not self.label:
+            raise InputError(f"arm.label: expected a text, got {self.label!r}")
+        if not isinstance(self.settings, Settings):
+            raise InputError(f"arm.settings: expected Settings, got {type(self.settings).__name__}")
+        if self.gain is not None:
+            number_between("arm.gain", self.gain, 0, 2)
+        if self.window_pixels is not None:
+            number_between("arm.window_pixels", self.window_pixels, 2, 64, integer=True)
+        one_of("arm.control", self.control, list(CONTROLS))
+        number_between("arm.noise_scale", self.noise_scale, 0, 100, low_open=True)
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator with its options."""
+        return self.settings.estimator
+
+    @property
+    def name(self) -> str:
+        """Name of the estimator."""
+        return self.estimator.name
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Arguments of a pipeline beside settings and calibration."""
+        return {"psf": self.psf, "score": self.score}
+
+    def with_options(self, changes: Mapping[str, Any]) -> Arm:
+        """Return the same with some settings changed."""
+        return replace(self, settings=self.settings.replace(**changes)) if changes else self

@@ -1,0 +1,61 @@
+"""The sensor's camera: what it makes of the light, with its noise or without, and how that is undone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.detector import Detector
+
+
+class Exposing(Protocol):
+    """A camera."""
+
+    def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.generic]:
+        """Return a frame of so much light in each pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiselessDetector:
+    """A camera without photon noise, read noise and quantisation."""
+
+    detector: Detector
+
+    def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
+        """Return the mean frame, ADU."""
+        camera = self.detector
+        light = mean_e + camera.background_e + camera.dark_e
+        adu = camera.offset_adu + light * camera.em_gain / camera.gain_e_per_adu
+        return adu.astype(np.float32)
+
+
+def make_detector(configuration: LoopConfiguration) -> Detector:
+    """Return the sensor's camera."""
+    camera = configuration.camera
+    return Detector(
+        camera.read_noise_e,
+        dark_e=camera.dark_e,
+        background_e=camera.background_e,
+        em_gain=camera.em_gain,
+        gain_e_per_adu=camera.gain_e_per_adu,
+        offset_adu=camera.offset_adu,
+        bits=camera.bits,
+    )
+
+
+def camera_calibration(configuration: LoopConfiguration) -> Calibration:
+    """Return what turns the camera's frames into electrons of the star."""
+    camera = configuration.camera
+    background = camera.background_e + camera.dark_e
+    return Calibration(
+        dark=camera.offset_adu + background * camera.em_gain / camera.gain_e_per_adu,
+        gain_e_per_adu=camera.gain_e_per_adu,
+        em_gain=camera.em_gain,
+        read_noise_e=camera.read_noise_e,
+        background_e=background,
+    )

@@ -1,0 +1,463 @@
+"""What a closed-loop experiment simulates: telescope, sensor, mirror, air, camera and control (TOML)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from faintspot.ao_loop.checked_fields import LIST, NUMBER_OR_LIST, checked_section, number
+from faintspot.base.checks import one_of
+from faintspot.base.errors import InputError
+from faintspot.base.sizes import check_size
+from faintspot.base.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
+from faintspot.estimators.scene import Scene
+from faintspot.simulate.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
+from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
+
+ARCSEC = math.pi / 180 / 3600
+"""Radians in one arcsecond."""
+
+CLOSED, OPEN = "closed", "open"
+SPOT_FWHM = 0.886  # full width at half maximum of sinc^2, in lambda / d
+_MOST_POINTS = 4096**2  # of a wavefront
+_POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
+
+
+@dataclass(frozen=True)
+class Telescope:
+    """The telescope's pupil."""
+
+    diameter_m: float = number(4.2, 0.05, 100.0)
+    obstruction: float = number(0.29, 0.0, 0.9)
+    """Diameter of the central obstruction as a fraction of the pupil's."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The Shack-Hartmann sensor."""
+
+    subapertures: int = number(7, 1, 200, whole=True)
+    """Sub-apertures across the pupil."""
+    subaperture_m: float | None = number(None, 0.0, 100.0, low_open=True)
+    """Side of a sub-aperture in the pupil. Default: the sub-apertures just cover the pupil."""
+    pixels: int = number(16, 4, 64, whole=True)
+    """Pixels across a sub-aperture's window."""
+    wavelength_m: float = number(650e-9, 1e-7, 1e-4)
+    pixel_scale_arcsec: float | None = number(None, 0.0, 100.0, low_open=True)
+    """Default: two pixels for lambda / d."""
+    least_illumination: float = number(0.5, 0.0, 1.0, low_open=True)
+    """Part of its area in the pupil from which a sub-aperture is used."""
+    samples: int = number(12, 4, 128, whole=True)
+    """Points of the phase across a sub-aperture."""
+    spot_elongation: float = number(1.0, 1.0, 30.0)
+    """Full width at half maximum of a spot along x as a multiple of that along y, before the pixels."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The deformable mirror."""
+
+    actuators: int | None = number(None, 2, 201, whole=True)
+    """Actuators across the pupil, its edges included. Default: one at each corner of the sub-apertures."""
+    crosstalk: float = number(0.15, 0.0, 0.9, low_open=True)
+    """Height of an actuator's Gaussian influence function at its neighbour."""
+    tip_tilt: bool = True
+    """Whether a tip-tilt mirror helps."""
+
+
+@dataclass(frozen=True)
+class Atmosphere:
+    """Layers of frozen turbulence that the wind moves; the star is on axis and altitudes do not matter."""
+
+    r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, several=NUMBER_OR_LIST)
+    """Fried parameter at 500 nm; or the two ends between which it drifts."""
+    drift_time_s: float = number(60.0, 0.0, 1e6, low_open=True)
+    """Period of the drift."""
+    outer_scale_m: float = number(25.0, 0.5, 200.0)
+    altitude_m: tuple[float, ...] = number((0.0, 2500.0, 4000.0, 13500.0), 0.0, 1e5, several=LIST)
+    fraction: tuple[float, ...] = number((0.45, 0.25, 0.15, 0.15), 0.0, 1e6, several=LIST)
+    """Strength of each layer; their ratios matter."""
+    wind_speed_m_per_s: tuple[float, ...] = number((6.0, 9.0, 14.0, 22.0), 0.0, 200.0, several=LIST)
+    wind_direction_deg: tuple[float, ...] = number((20.0, 80.0, 150.0, 250.0), -360.0, 360.0, several=LIST)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The sensor's camera and the star's light on it; as `faintspot.simulate.Detector`."""
+
+    photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
+    """Photo-electrons of a fully lit sub-aperture in a frame; or give the magnitude."""
+    magnitude: float | None = number(None, -30.0, 60.0)
+    band: str = DEFAULT_BAND
+    zero_point: float | None = number(None, 0.0, 1e20, low_open=True)
+    """Photons per second and m^2 of magnitude 0. Default: that of the band."""
+    throughput: float = number(0.4, 0.0, 1.0, low_open=True)
+    quantum_efficiency: float = number(0.9, 0.0, 1.0, low_open=True)
+    read_noise_e: float = number(0.1, 0.0, 1e6)
+    """At the camera's output, after multiplication."""
+    em_gain: float = number(1.0, 1.0, 1e5)
+    gain_e_per_adu: float = number(1.0, 0.0, 1e6, low_open=True)
+    offset_adu: float = number(0.0, -1e6, 1e6)
+    bits: int | None = number(None, 1, 32, whole=True)
+    background_e: float = number(0.0, 0.0, 1e6)
+    dark_e: float = number(0.0, 0.0, 1e6)
+
+
+@dataclass(frozen=True)
+class Control:
+    """The loop."""
+
+    frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
+    delay_frames: int = number(2, 1, 100, whole=True)
+    """The command computed from frame k acts first during the exposure of frame k + delay_frames."""
+    gain: float = number(0.5, 0.0, 2.0)
+    leak: float = number(0.01, 0.0, 1.0)
+    """Part of the command that is forgotten in every frame, so that a loop that has lost the star returns."""
+    mode: str = CLOSED
+    """"closed", or "open": the sensor does not see the mirror."""
+    largest_condition: float = number(30.0, 1.0, 1e6)
+    """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
+    telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
+    """Closed loop with an integrator that other kinds of control learn from, on air that is not scored."""
+    told_wind_factor: float = number(1.0, 0.0, 100.0)
+    """Winds that control is told, as a multiple of the true ones."""
+    told_wind_turn_deg: float = number(0.0, -360.0, 360.0)
+    """Angle by which the winds that control is told are turned."""
+
+
+@dataclass(frozen=True)
+class Science:
+    """Where the Strehl ratio is measured, on axis."""
+
+    wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
+
+
+@dataclass(frozen=True)
+class Run:
+    """How long and how often."""
+
+    frames: int = number(1500, 1, 10_000_000, whole=True)
+    settle_frames: int = number(100, 0, 10_000_000, whole=True)
+    """Frames at the beginning that are not scored."""
+    seed: int = number(1, 0, 2**63 - 1, whole=True)
+    realisations: int = number(5, 1, 100_000, whole=True)
+    photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, several=LIST)
+    """Fluxes at which estimators are compared."""
+
+
+@dataclass(frozen=True)
+class LoopConfiguration:
+    """Everything that a closed-loop experiment is made of.
+
+    Raises
+    ------
+    InputError
+        For a value out of its range, and for parts that do not fit together: an aperture smaller than a
+        sub-aperture or than all of them cover, a window that the phase's points cannot fill, layers with
+        lists of different lengths, no light or two amounts of it.
+
+    Examples
+    --------
+    >>> from faintspot.ao_loop import LoopConfiguration
+    >>> loop = LoopConfiguration().replace("camera", photons_per_subaperture=50.0)
+    >>> loop.name, loop.sensor.subapertures, round(loop.subaperture_m, 2)
+    ('canary', 7, 0.6)
+    """
+
+    name: str = "canary"
+    telescope: Telescope = field(default_factory=Telescope)
+    sensor: Sensor = field(default_factory=Sensor)
+    mirror: Mirror = field(default_factory=Mirror)
+    atmosphere: Atmosphere = field(default_factory=Atmosphere)
+    camera: Camera = field(default_factory=lambda: Camera(photons_per_subaperture=100.0))
+    control: Control = field(default_factory=Control)
+    science: Science = field(default_factory=Science)
+    run: Run = field(default_factory=Run)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"name: expected a text, got {self.name!r}")
+        for name in SECTIONS:
+            object.__setattr__(self, name, checked_section(name, getattr(self, name), SECTIONS[name]))
+        _check_layers(self.atmosphere)
+        _check_light(self.camera)
+        _check_sampling(self)
+
+    def replace(self, section: str, **values: Any) -> LoopConfiguration:
+        """Return the configuration with some values of one section changed.
+
+        Raises
+        ------
+        InputError
+            For an unknown section or key, or a bad value.
+        """
+        check_known("", section, SECTIONS, "section")
+        check_keys(f"{section}.", values, _keys(section))
+        changed = dataclasses.replace(getattr(self, section), **values)
+        return dataclasses.replace(self, **{section: changed})
+
+    def slowed_to(self, rate_hz: float) -> LoopConfiguration:
+        """Return the same loop at another frame rate: with winds that move the air as far in a frame.
+
+        Raises
+        ------
+        InputError
+            For a rate or winds out of range.
+        """
+        part = rate_hz / self.control.frame_rate_hz
+        winds = tuple(part * each for each in self.atmosphere.wind_speed_m_per_s)
+        slower = self.replace("control", frame_rate_hz=rate_hz)
+        return slower.replace("atmosphere", wind_speed_m_per_s=winds)
+
+    @property
+    def subaperture_m(self) -> float:
+        """Side of a sub-aperture."""
+        given = self.sensor.subaperture_m
+        return self.telescope.diameter_m / self.sensor.subapertures if given is None else given
+
+    @property
+    def width_m(self) -> float:
+        """Width of all sub-apertures together, which the pupil lies in."""
+        return self.subaperture_m * self.sensor.subapertures
+
+    @property
+    def pixel_scale_rad(self) -> float:
+        """Angle on the sky that a pixel sees."""
+        if self.sensor.pixel_scale_arcsec is None:
+            return self.sensor.wavelength_m / self.subaperture_m / 2
+        return self.sensor.pixel_scale_arcsec * ARCSEC
+
+    @property
+    def spot_width_px(self) -> float:
+        """Width of a spot, lambda / d, in pixels."""
+        return self.sensor.wavelength_m / self.subaperture_m / self.pixel_scale_rad
+
+    @property
+    def d_over_r0(self) -> float:
+        """Side of a sub-aperture in Fried parameters at the sensor's wavelength, in the worst seeing."""
+        r0_sensing = np.min(self.atmosphere.r0_m) * (self.sensor.wavelength_m / R0_WAVELENGTH_M) ** (6 / 5)
+        return self.subaperture_m / float(r0_sensing)
+
+    def position_range_px(self, *, predicted: bool = False) -> float:
+        """Return how far spots may be from the reference, or from where the loop predicts them."""
+        return _POSITION_RANGE_PX[CLOSED if predicted else self.control.mode]
+
+    @property
+    def scene(self) -> Scene:
+        """What the estimators are told when their options are chosen."""
+        camera, elongation = self.camera, self.sensor.spot_elongation
+        return Scene(
+            flux_e=self.photons,
+            read_noise_e=camera.read_noise_e / camera.em_gain,
+            window=(self.sensor.pixels,) * 2,
+            spot_fwhm_px=SPOT_FWHM * self.spot_width_px * math.sqrt(elongation),
+            position_range_px=self.position_range_px(),
+            elongation=elongation,
+            excess_noise=2.0 if camera.em_gain > 1 else 1.0,
+            background_e=camera.background_e + camera.dark_e,
+            d_over_r0=self.d_over_r0,
+            diffraction_px=self.spot_width_px,
+        )
+
+    @property
+    def photons(self) -> float:
+        """Photo-electrons of a fully lit sub-aperture in a frame."""
+        camera = self.camera
+        if camera.photons_per_subaperture is not None:
+            return camera.photons_per_subaperture
+        return float(self.photometry.electrons(camera.magnitude or 0.0))
+
+    @property
+    def photometry(self) -> Photometry:
+        """From magnitudes to photo-electrons and back."""
+        return Photometry(
+            self.subaperture_m**2,
+            1 / self.control.frame_rate_hz,
+            self.camera.band,
+            self.camera.zero_point,
+            self.camera.throughput,
+            self.camera.quantum_efficiency,
+        )
+
+    def to_text(self) -> str:
+        """Return the configuration as TOML with every value written out."""
+        document = tomlkit.document()
+        document["name"] = self.name
+        for name in SECTIONS:
+            table = tomlkit.table()
+            for item in fields(SECTIONS[name]):
+                value = getattr(getattr(self, name), item.name)
+                if value is not None:  # TOML has no word for nothing
+                    table[item.name] = list(value) if isinstance(value, tuple) else value
+            document[name] = table
+        return tomlkit.dumps(document)
+
+    @classmethod
+    def from_text(cls, text: str, where: str = "configuration") -> LoopConfiguration:
+        """Read a configuration from TOML text; `where` names it in messages.
+
+        Raises
+        ------
+        InputError
+            When it is not TOML, has an unknown table or key, or a bad value.
+        """
+        return cls.from_document(parse_text(text, where), where)
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any], where: str) -> LoopConfiguration:
+        """Make a configuration of the tables of a TOML file.
+
+        Raises
+        ------
+        InputError
+            For an unknown table or key, or a bad value.
+        """
+        try:
+            return _build(document)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+
+
+SECTIONS: dict[str, type[Any]] = {
+    "telescope": Telescope,
+    "sensor": Sensor,
+    "mirror": Mirror,
+    "atmosphere": Atmosphere,
+    "camera": Camera,
+    "control": Control,
+    "science": Science,
+    "run": Run,
+}
+
+
+def load_loop(path: str | Path) -> LoopConfiguration:
+    """Read the configuration of a loop: a TOML file, or one of `shipped_loops` by its name.
+
+    Raises
+    ------
+    InputError
+        When there is neither, or as for `LoopConfiguration.from_text`.
+
+    Examples
+    --------
+    >>> from faintspot.ao_loop import load_loop
+    >>> canary = load_loop("canary")
+    >>> canary.telescope.diameter_m, canary.control.frame_rate_hz
+    (4.2, 250.0)
+    """
+    path = Path(path)
+    name = path.name.removesuffix(".toml")
+    # A folder of that name holds results of an earlier run.
+    if not path.is_file() and path.parent == Path() and name in shipped_loops():
+        document, where = parse_file(_shipped() / f"{name}.toml"), f"{name}.toml"
+    else:
+        shipped = ", ".join(shipped_loops())
+        document = parse_file(path, if_missing=f"none of the shipped configurations either: {shipped}")
+        where = str(path)
+    return LoopConfiguration.from_document(document, where)
+
+
+def shipped_loops() -> list[str]:
+    """Return the names of the configurations that come with the package.
+
+    Examples
+    --------
+    >>> from faintspot.ao_loop import shipped_loops
+    >>> shipped_loops()[:4]
+    ['camera_3e', 'canary', 'canary_faint', 'diffraction_limit']
+    """
+    names = (item.name for item in _shipped().iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def _shipped() -> Any:
+    return resources.files("faintspot.ao_loop") / "configurations"
+
+
+def _build(document: dict[str, Any]) -> LoopConfiguration:
+    check_keys("", document, ["name", *SECTIONS], what="table")
+    values: dict[str, Any] = {}
+    for name, table in document.items():
+        if name != "name":
+            check_keys(f"{name}.", checked_table(name, table), _keys(name))
+            table = SECTIONS[name](**table)
+        values[name] = table
+    return LoopConfiguration(**values)
+
+
+def _keys(section: str) -> list[str]:
+    return [item.name for item in fields(SECTIONS[section])]
+
+
+def _check_layers(air: Atmosphere) -> None:
+    names = ("altitude_m", "fraction", "wind_speed_m_per_s", "wind_direction_deg")
+    lengths = {name: len(getattr(air, name)) for name in names}
+    if len(set(lengths.values())) > 1 or not air.fraction:
+        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise InputError(f"atmosphere: expected lists with one value for each layer, got {found}")
+    if sum(air.fraction) <= 0:
+        raise InputError("atmosphere.fraction: expected at least one layer with a strength above 0")
+    if isinstance(air.r0_m, tuple) and (len(air.r0_m) != 2 or air.r0_m[0] > air.r0_m[1]):
+        raise InputError(f"atmosphere.r0_m = {list(air.r0_m)}: expected one number or [lowest, highest]")
+
+
+def _check_light(camera: Camera) -> None:
+    if (camera.photons_per_subaperture is None) == (camera.magnitude is None):
+        raise InputError("camera: expected either photons_per_subaperture or magnitude")
+    one_of("camera.band", camera.band, list(ZERO_POINTS))
+
+
+def _check_sampling(whole: LoopConfiguration) -> None:
+    """Refuse what the sensor's phase cannot hold and control that cannot be."""
+    one_of("control.mode", whole.control.mode, (CLOSED, OPEN))
+    if not isinstance(whole.mirror.tip_tilt, bool):
+        raise InputError(f"mirror.tip_tilt = {whole.mirror.tip_tilt!r}: expected true or false")
+    sensor = whole.sensor
+    check_size(
+        "sensor: (subapertures x samples)^2", [(sensor.subapertures * sensor.samples) ** 2], _MOST_POINTS
+    )
+    check_size(
+        "sensor: (subapertures x pixels)^2", [(sensor.subapertures * sensor.pixels) ** 2], what="pixels"
+    )
+    actuators = whole.mirror.actuators or sensor.subapertures + 1
+    check_size("interaction matrix (slopes, actuators)", (2 * sensor.subapertures**2, actuators**2))
+    diameter, side = whole.telescope.diameter_m, whole.subaperture_m
+    if side > diameter:
+        raise InputError(
+            f"telescope.diameter_m = {diameter:g}: expected at least one sub-aperture, "
+            f"sensor.subaperture_m = {side:g}"
+        )
+    if whole.width_m < diameter * (1 - 1e-9):
+        raise InputError(
+            f"sensor.subapertures = {sensor.subapertures} of {side:g} m: expected enough to cover the "
+            f"{diameter:g} m of the telescope"
+        )
+    needed = math.ceil(field_of_view(whole) / whole.spot_width_px)
+    if sensor.samples < needed:
+        raise InputError(
+            f"sensor.samples = {sensor.samples}: expected at least {needed} for a field of "
+            f"{field_of_view(whole):.3g} px with lambda / d = {whole.spot_width_px:.3g} px"
+        )
+    if whole.run.settle_frames >= whole.run.frames:
+        raise InputError(
+            f"run.settle_frames = {whole.run.settle_frames}: expected fewer than the {whole.run.frames} "
+            "frames"
+        )
+
+
+def field_of_view(whole: LoopConfiguration) -> float:
+    """Return the width of the images behind the lenslets that must not repeat itself, px."""
+    return whole.sensor.pixels * 1.125 + 2 * 3 * blur_px(whole)
+
+
+def blur_px(whole: LoopConfiguration) -> float:
+    """Return the standard deviation along x of the source that elongates the spots, px."""
+    width = SPOT_FWHM * whole.spot_width_px
+    return width * math.sqrt(whole.sensor.spot_elongation**2 - 1) / 2.3548

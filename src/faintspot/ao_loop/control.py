@@ -1,0 +1,199 @@
+"""The controller of an arm: the integrator, or one that has learnt from telemetry of the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.ao_loop.arms import PRIOR, Arm
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, Run
+from faintspot.ao_loop.record import LoopRecord
+from faintspot.base.errors import InputError
+from faintspot.control.base import Controller
+from faintspot.control.commands import CommandDelayLine
+from faintspot.control.integrator import Integrator
+from faintspot.control.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
+from faintspot.control.telemetry import Telemetry, make_telemetry
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
+
+if TYPE_CHECKING:
+    from faintspot.ao_loop.observatory import LoopOptics
+
+Floats = NDArray[np.float64]
+
+FIRST_TELEMETRY_REALISATION = 2000
+"""The realisation of the air that control learns from; never scored, nor tuned on."""
+
+_TELEMETRY_PRIOR_PX = 0.6  # while telemetry is taken, as nothing is known yet
+_SETTLE_FRAMES = 50
+
+
+def make_controller(
+    configuration: LoopConfiguration,
+    optics: LoopOptics,
+    arm: Arm,
+    learnt: Learnt | None,
+    line: CommandDelayLine,
+) -> Controller:
+    """Return the controller of an arm, which sends its commands along `line`."""
+    if learnt is not None:
+        return learnt.controller(line, prior_std_px(arm, len(optics.interaction)))
+    control = configuration.control
+    return Integrator(
+        line,
+        optics.interaction,
+        optics.reconstructor,
+        control.gain if arm.gain is None else arm.gain,
+        control.leak,
+        weighted=arm.weighted_reconstructor and not arm.true_slopes,
+        sees_mirror=control.mode == CLOSED,
+    )
+
+
+def learnt_control(
+    configuration: LoopConfiguration, arm: Arm, seed: int, learns_on: LoopConfiguration | None = None
+) -> tuple[Arm, Learnt | None]:
+    """Return what the control of an arm has learnt, None: it need not; and the arm with what follows.
+
+    The prior of an estimator that has one becomes as wide as the control is sure.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    arm : Arm
+    seed : int
+    learns_on : LoopConfiguration, optional
+        Of the loop that telemetry is taken from. Default: the same.
+
+    Raises
+    ------
+    InputError
+        For control that learns, in open loop.
+    """
+    if arm.control == INTEGRATOR:
+        return arm, None
+    if configuration.control.mode != CLOSED:
+        raise InputError(f"arm.control = {arm.control!r}: expected {INTEGRATOR!r} in open loop")
+    on = configuration if learns_on is None else learns_on
+    learnt = _learnt(replace(on, name="-", run=Run()), _Known.of(arm), arm.control, arm.noise_scale, seed)
+    if learnt.expected_std_px is not None and _has_prior(arm):
+        std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
+        arm = _with_prior(arm, std)
+    return arm, learnt
+
+
+def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
+    """Return the prior of the arm's estimator around what control predicts, (2 n,), or None."""
+    if not _has_prior(arm):
+        return None
+    each = np.broadcast_to(getattr(arm.settings, PRIOR), (slopes // 2,))
+    return np.tile(each, 2).astype(np.float64)
+
+
+def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
+    """Return what theory knows of the slopes of sub-apertures, with the winds that control is told."""
+    air, control = configuration.atmosphere, configuration.control
+    angle = np.deg2rad(air.wind_direction_deg)
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    return SlopeTurbulence(
+        cells[:, ::-1].astype(np.float64) * configuration.subaperture_m,
+        configuration.subaperture_m,
+        configuration.pixel_scale_rad,
+        float(np.mean(air.r0_m)),
+        air.outer_scale_m,
+        np.array(air.fraction),
+        np.array(air.wind_speed_m_per_s, np.float64)[:, None] * around,
+    ).turned(control.told_wind_factor, control.told_wind_turn_deg)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """An arm, equal to others that would leave the same telemetry."""
+
+    arm: Arm = field(compare=False)
+    same: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, arm: Arm) -> _Known:
+        from faintspot.pipeline.configuration import to_text
+
+        plain = replace(arm, label="telemetry", control=INTEGRATOR, noise_scale=1.0)
+        if _has_prior(arm):
+            plain = _with_prior(plain, _TELEMETRY_PRIOR_PX)
+        values = {
+            **vars(plain),
+            "settings": to_text(plain.settings),
+            "psf": id(arm.psf),
+            "score": id(arm.score),
+        }
+        return cls(plain, tuple(values.items()))
+
+
+@lru_cache(maxsize=8)
+def _learnt(
+    configuration: LoopConfiguration, known: _Known, kind: str, noise_scale: float, seed: int
+) -> Learnt:
+    from faintspot.ao_loop.observatory import prepare
+
+    if kind == KALMAN and noise_scale != 1.0:  # learning takes long
+        usual = _learnt(configuration, known, kind, 1.0, seed)
+        return replace(usual, model=usual.model.with_noise(noise_scale))
+    optics, control = prepare(configuration), configuration.control
+    telemetry = _telemetry(_without_told(configuration), known, seed)
+    told = slope_turbulence(configuration, optics.sensor.layout.cells)
+    frame_s = 1 / control.frame_rate_hz
+    theories = {
+        "winds as told": np.array([layer.lagged_px2(frame_s) for layer in told.layers()]),
+        "winds from anywhere": told.from_anywhere().lagged_px2(frame_s)[None],
+    }
+    plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
+    return learn(kind, plant, telemetry, theories, noise_scale)
+
+
+@lru_cache(maxsize=8)
+def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int) -> Telemetry:
+    """Run the loop with an integrator on air that is never scored."""
+    from faintspot.ao_loop.simulation import simulate_loop
+
+    frames = configuration.control.telemetry_frames
+    run = configuration.replace("run", frames=frames, settle_frames=0)
+    record = simulate_loop(run, [known.arm], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    return telemetry_of(record, known.arm)
+
+
+def telemetry_of(record: LoopRecord, arm: Arm) -> Telemetry:
+    """Return what control learns from a run of one arm with the integrator."""
+    divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
+    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
+    expected = np.zeros_like(held)
+    if arm.predict_prior:  # what acts less the latest command, which acts so many frames later
+        later = record.delay_frames - 1
+        expected[: len(held) - later] = held[: len(held) - later] - held[later:]
+    telemetry = make_telemetry(
+        record.slopes_px.astype(np.float64) / divisor,
+        record.standard_error_px.astype(np.float64) / divisor,
+        held,
+        expected,
+        prior_std_px(arm, held.shape[1]),
+    )
+    return telemetry.part(_SETTLE_FRAMES, record.frames - record.delay_frames)
+
+
+def _has_prior(arm: Arm) -> bool:
+    """Whether the slopes are drawn towards what the control predicts."""
+    has = arm.predict_prior and PRIOR in arm.settings.declared() and not arm.true_slopes
+    return has and getattr(arm.settings, PRIOR) is not None
+
+
+def _with_prior(arm: Arm, std_px: float | Floats) -> Arm:
+    changes: dict[str, Any] = {PRIOR: std_px}
+    return replace(arm, settings=arm.settings.replace(**changes))
+
+
+def _without_told(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration as far as its telemetry depends on it."""
+    return configuration.replace("control", told_wind_factor=1.0, told_wind_turn_deg=0.0)

@@ -1,0 +1,114 @@
+"""What a real-time engine needs to know of a simulated telescope, as files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from faintspot.ao_loop.arms import PRIOR, Arm
+from faintspot.ao_loop.calibration import flat_psf, make_pipeline, reference_slopes
+from faintspot.ao_loop.camera import camera_calibration
+from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
+from faintspot.ao_loop.control import learnt_control
+from faintspot.ao_loop.observatory import prepare
+from faintspot.ao_loop.simulation import measure_gains
+from faintspot.base.files import output_errors, write_atomically
+from faintspot.config.tables import read_tables
+from faintspot.control import configuration as control_file
+from faintspot.control.learning import INTEGRATOR, KALMAN
+from faintspot.pipeline import configuration as configuration_file
+from faintspot.pipeline.settings import Settings
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
+
+CONFIGURATION = "faintspot.toml"
+INTERACTION = "interaction_matrix.npy"
+REFERENCE = "reference_slopes.npy"
+MODEL = "control_model.npz"
+_SETTINGS = Settings("brightest", keep_brightest=20)
+
+
+def write_engine_files(
+    configuration: LoopConfiguration, folder: str | Path, control: str = INTEGRATOR
+) -> Path:
+    """Write layout, calibration and PSF, and what a controller needs, into a folder.
+
+    faintspot.toml (what else is in it stays; without an estimator it gets the 20 brightest pixels);
+    interaction_matrix.npy, (2 n, commands) float64, px for a command of 1 nm; reference_slopes.npy, (2 n,)
+    float32, px, what that estimator measures of a flat wavefront. Slopes are all x, then all y. [control] has
+    the loop's gain, leak and delay where it says nothing else, and the estimator's centroid gain.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    folder : path
+        Made where there is none.
+    control : str
+        Kind of control, see `faintspot.control.learning.CONTROLS`. All but the integrator learn from
+        telemetry of the simulated loop, on other air, which takes up to a minute: control_model.npz.
+
+    Returns
+    -------
+    Path
+        Of faintspot.toml.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be written, or faintspot.toml exists and cannot be understood.
+    MissingExtraError
+        When HCIPy is not installed.
+    """
+    folder = Path(folder)
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    optics = prepare(configuration)
+    path = folder / CONFIGURATION
+    psf = flat_psf(configuration.spot_width_px, configuration.sensor.spot_elongation)
+    sizes: dict[str, Any] = {
+        "subaperture_m": configuration.subaperture_m,
+        "pixel_scale_arcsec": configuration.pixel_scale_rad / ARCSEC,
+    }
+    configuration_file.save(path, replace(optics.sensor.layout, **sizes))
+    configuration_file.save(path, camera_calibration(configuration))
+    configuration_file.save(path, psf)
+    if not configuration_file.has(path, "settings"):
+        configuration_file.save(path, _SETTINGS)
+    known = configuration_file.load_all(path)
+    arm = _arm(known.settings, psf, known.score, control)
+    reference = reference_slopes(configuration, optics.sensor, arm)
+    write_atomically(folder / INTERACTION, lambda stream: np.save(stream, optics.interaction))
+    write_atomically(folder / REFERENCE, lambda stream: np.save(stream, reference))
+    loop, before = configuration.control, read_tables(path).get(control_file.TABLE, {})
+    usual = {"gain": loop.gain, "leak": loop.leak, "delay_frames": loop.delay_frames}
+    measured = {"interaction_matrix": INTERACTION, "reference_slopes": REFERENCE, "centroid_gain": 1.0}
+    seed = configuration.run.seed
+    if arm.correct_gain:
+        pipeline = make_pipeline(configuration, optics.sensor, arm)
+        measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])
+    _, learnt = learnt_control(configuration, arm, seed)
+    if learnt is not None:
+        learnt.model.save(folder / MODEL)
+        measured |= {"controller": control, "model": MODEL}
+    control_file.save_control(path, **{**usual, **before, **measured})
+    return path
+
+
+def _arm(settings: Settings, psf: PSF, score: Score | None, control: str) -> Arm:
+    """The arm of the simulated loop that does what the engine will do."""
+    predicts = control == KALMAN and settings.estimator.takes_prior
+    if predicts and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
+        anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of
+        settings = settings.replace(**anything)
+    return Arm(
+        "-",
+        settings,
+        psf=psf,
+        score=score,
+        control=control,
+        predict_prior=predicts,
+        correct_gain=not predicts,
+    )

@@ -1,0 +1,157 @@
+"""What is observed, one frame at a time: from time and commands to the wavefront, its truth, and pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
+from faintspot.ao_loop.calibration import interaction_matrix
+from faintspot.ao_loop.camera import Exposing, NoiselessDetector, make_detector
+from faintspot.ao_loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
+from faintspot.ao_loop.mirror import BestFit, DeformableMirror, make_mirror
+from faintspot.ao_loop.telescope import Pupil, ScienceCamera, make_pupil
+from faintspot.ao_loop.wavefront_sensor import ShackHartmann, make_sensor
+from faintspot.control.reconstructor import Reconstructor, check_controllable, make_reconstructor
+
+_OF_AIR = (
+    "frame_rate_hz",
+    "delay_frames",
+    "mode",
+    "largest_condition",
+)  # of the control: of typical spots, too
+
+
+@dataclass(frozen=True, eq=False)
+class LoopOptics:
+    """Everything that is the same in all runs of a configuration."""
+
+    pupil: Pupil
+    sensor: ShackHartmann
+    mirror: DeformableMirror
+    interaction: NDArray[np.float64]
+    """(2 n, commands) px for 1 nm."""
+    reconstructor: Reconstructor
+    science: ScienceCamera
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What nobody at a telescope knows of a frame."""
+
+    field: NDArray[np.complex64]
+    """Complex amplitude in the pupil at the science wavelength, (points, points)."""
+    strehl: float
+    rms_nm: float
+    """Of the wavefront after the mirror, over the pupil, without piston."""
+    r0_m: float
+
+
+class TelescopeModel:
+    """A star seen through air, telescope, mirror and sensor by the sensor's camera.
+
+    Air and noise depend on seed, realisation and frame alone.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    seed, realisation : int
+    correctable : bool
+        Whether the air is only what the mirror can make.
+    noiseless : bool
+        Whether every pixel holds its mean light.
+
+    Attributes
+    ----------
+    optics : LoopOptics
+    air : MovingLayers
+        May be changed between two frames, as may
+    photons : float
+        photo-electrons of a fully lit sub-aperture in a frame.
+    detector : Exposing
+    """
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        seed: int,
+        realisation: int = 0,
+        *,
+        correctable: bool = False,
+        noiseless: bool = False,
+    ) -> None:
+        self.optics = optics = prepare(configuration)
+        self.air = air_of(without_light(configuration), seed, realisation)
+        self.photons = configuration.photons
+        camera = make_detector(configuration)
+        self.detector: Exposing = NoiselessDetector(camera) if noiseless else camera
+        self._best_fit = BestFit.of(optics.mirror, optics.pupil, piston=False) if correctable else None
+        self._sees_mirror = configuration.control.mode == CLOSED
+        self._science_wavelength_m = configuration.science.wavelength_m
+        self._seed, self._realisation = seed, realisation
+
+    def wavefronts(
+        self, time_s: float, commands: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the wavefront after the mirror, and the one that the sensor sees, nm, (points, points)."""
+        air = self.air.wavefront_nm(time_s)
+        if self._best_fit is not None:
+            air = self._best_fit.fitted(air)
+        after = air + self.optics.mirror.wavefront_nm(commands)
+        return after, after if self._sees_mirror else air
+
+    def truth(self, time_s: float, wavefront_nm: NDArray[np.float32]) -> Truth:
+        """Return what a wavefront after the mirror does to the science image."""
+        pupil = self.optics.pupil
+        field = pupil.field(wavefront_nm, self._science_wavelength_m)
+        return Truth(field, pupil.strehl(field), pupil.rms(wavefront_nm), self.air.r0_m(time_s))
+
+    def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
+        """Return the camera's frame of that number (its noise's) of a wavefront that the sensor sees, ADU."""
+        sensor = self.optics.sensor
+        light = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
+        rng = np.random.default_rng([self._seed, self._realisation, number, 2])
+        return self.detector.expose(light, rng)
+
+
+def prepare(configuration: LoopConfiguration) -> LoopOptics:
+    """Return telescope, sensor, mirror and their calibration; the last ones made are kept.
+
+    Raises
+    ------
+    InputError
+        When no sub-aperture is lit, or there are more commands than slopes can control.
+    MissingExtraError
+        When HCIPy is not installed.
+    """
+    control = Control(largest_condition=configuration.control.largest_condition)
+    camera = Camera(photons_per_subaperture=1.0)
+    return _prepared(
+        replace(configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=control, run=Run())
+    )
+
+
+def without_light(configuration: LoopConfiguration) -> LoopConfiguration:
+    """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
+    control = Control(**{name: getattr(configuration.control, name) for name in _OF_AIR})
+    camera = Camera(photons_per_subaperture=1.0)
+    return replace(configuration, name="-", camera=camera, control=control, run=Run())
+
+
+@lru_cache(maxsize=2)
+def air_of(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
+    """Return the air of a configuration `without_light`; the last ones made are kept."""
+    return make_atmosphere(configuration, seed, realisation)
+
+
+@lru_cache(maxsize=2)
+def _prepared(configuration: LoopConfiguration) -> LoopOptics:
+    pupil = make_pupil(configuration)
+    sensor, mirror = make_sensor(configuration, pupil), make_mirror(configuration, pupil)
+    check_controllable(mirror.commands, 2 * len(sensor.layout))
+    interaction = interaction_matrix(sensor, mirror)
+    reconstructor = make_reconstructor(interaction, configuration.control.largest_condition)
+    return LoopOptics(pupil, sensor, mirror, interaction, reconstructor, ScienceCamera.of(pupil))

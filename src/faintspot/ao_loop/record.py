@@ -1,0 +1,100 @@
+"""What a closed-loop run leaves: the telemetry, and the truth that a simulation knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.ao_loop.files import Stored
+from faintspot.base.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRecord(Stored):
+    """One run of the loop, n sub-apertures and m commands.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
+    >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
+    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record.labels, record.frames, 0.0 < record.mean_strehl() < 1.0
+    (('brightest',), 40, True)
+    """
+
+    WHAT: ClassVar[str] = "a record of a loop"
+
+    slopes_px: NDArray[np.float32]
+    """(frames, 2 n): all x, then all y, from the reference; not divided by the centroid gain."""
+    valid: NDArray[np.bool_]
+    """(frames, n)"""
+    standard_error_px: NDArray[np.float32]
+    """(frames, 2 n); infinite where invalid or unknown."""
+    commands: NDArray[np.float32]
+    """(frames, m): what the mirror held during each frame, nm."""
+    strehl: NDArray[np.float64]
+    """(frames,): of each frame at the science wavelength, on axis."""
+    residual_nm: NDArray[np.float64]
+    """(frames,): rms of the wavefront after the mirror."""
+    r0_m: NDArray[np.float64]
+    """(frames,): true Fried parameter at 500 nm."""
+    arm: NDArray[np.int8]
+    """(frames,): number of the arm that measured the frame."""
+    interaction_matrix: NDArray[np.float64]
+    """(2 n, m): displacements of the spots, true px, for a command of 1 nm."""
+    centroid_gain: NDArray[np.float64]
+    """(arms,): slope measured for a displacement of 1 px, at the run's flux."""
+    corrected: NDArray[np.bool_]
+    """(arms,): whether the loop divided the slopes by that gain."""
+    psf: NDArray[np.float32]
+    """(arms, pixels, pixels): mean image of the frames after settling; a flat wavefront's peak is 1."""
+    labels: tuple[str, ...]
+    """Of the arms."""
+    arm_settings: tuple[str, ...]
+    """TOML text of each arm's settings."""
+    cells: NDArray[np.int64]
+    """(n, 2): row and column of each sub-aperture in the lenslet array."""
+    illumination: NDArray[np.float64]
+    """(n,): part of each sub-aperture that is in the pupil."""
+    frame_rate_hz: float
+    delay_frames: int
+    """The command computed from frame k acted first during frame k + delay_frames."""
+    settle_frames: int
+    closed: bool
+    """Whether the sensor saw the mirror."""
+    subaperture_m: float
+    pixel_scale_rad: float
+    wavelength_m: float
+    science_wavelength_m: float
+    psf_pixel_rad: float
+    configuration: str
+    """TOML text."""
+    seed: int
+    realisation: int
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.strehl)
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """(frames,): whether a frame comes after settling."""
+        return np.arange(self.frames) >= self.settle_frames
+
+    def mean_strehl(self, arm: int = 0) -> float:
+        """Return the long-exposure Strehl ratio of an arm: the mean of its frames after settling.
+
+        Raises
+        ------
+        InputError
+            When the arm has no such frame.
+        """
+        chosen = self.scored & (self.arm == arm)
+        if not chosen.any():
+            raise InputError(f"arm = {arm}: no frame after the {self.settle_frames} settling ones")
+        return float(self.strehl[chosen].mean())

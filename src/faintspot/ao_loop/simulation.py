@@ -1,0 +1,356 @@
+"""The closed loop, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.ao_loop.arms import Arm
+from faintspot.ao_loop.calibration import (
+    centroid_gain,
+    make_pipeline,
+    mean_light,
+    typical_spots,
+)
+from faintspot.ao_loop.camera import Exposing, make_detector
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
+from faintspot.ao_loop.control import learnt_control, make_controller
+from faintspot.ao_loop.observatory import TelescopeModel, air_of, prepare, without_light
+from faintspot.ao_loop.record import LoopRecord
+from faintspot.ao_loop.telescope import PSF_SAMPLING
+from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.control.commands import CommandDelayLine
+from faintspot.control.learning import INTEGRATOR, Learnt
+from faintspot.pipeline import configuration as configuration_file
+from faintspot.pipeline.mean_flux import MeanFlux
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
+
+_MOST_ARMS = 127
+
+
+@dataclass(frozen=True)
+class DisabledErrors:
+    """What a run leaves out of what spoils the Strehl ratio, for error budgets; by default nothing."""
+
+    noiseless: bool = False
+    """Every pixel holds its mean light."""
+    true_slopes: bool = False
+    """Slopes are the wavefront's mean gradients, of every arm."""
+    correctable: bool = False
+    """The air is only what the mirror can make."""
+    faster: float = 1.0
+    """How many times as often frames are taken, as much light in each, in stretches over the same time."""
+    exact_gain: bool = False
+    """Slopes are divided by the centroid gain that they had in a first run, of one arm."""
+
+    stretch_frames: ClassVar[int] = 100
+    """Of a faster loop, which sees as much of the air, but not all of it."""
+    stretch_settle_frames: ClassVar[int] = 40
+
+    def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
+        """Return the configuration with its frame rate, and the light in a frame as it was."""
+        if self.faster == 1.0:
+            return configuration
+        rate = configuration.control.frame_rate_hz * self.faster
+        camera = {"photons_per_subaperture": configuration.photons, "magnitude": None}
+        return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
+
+    def arm(self, arm: Arm) -> Arm:
+        """Return an arm as it is in such a run."""
+        return replace(arm, true_slopes=arm.true_slopes or self.true_slopes)
+
+    def time_s(self, frame: int, frame_rate_hz: float) -> float:
+        """Return the middle of a frame."""
+        first = 0 if self.faster == 1.0 else frame - frame % self.stretch_frames
+        return first * self.faster / frame_rate_hz + (frame - first + 0.5) / frame_rate_hz
+
+    def settled(self, frames: int) -> NDArray[np.bool_]:
+        """Return which frames do not come right after a gap, (frames,)."""
+        place = np.arange(frames) % self.stretch_frames
+        return (place >= self.stretch_settle_frames) | (self.faster == 1.0)
+
+
+def simulate_loop(
+    configuration: LoopConfiguration,
+    arms: Sequence[Arm],
+    schedule: ArrayLike | None = None,
+    *,
+    seed: int | None = None,
+    realisation: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    idealised: DisabledErrors | None = None,
+    learns_on: LoopConfiguration | None = None,
+) -> LoopRecord:
+    """Run the loop once.
+
+    In every frame the sensor sees, for the whole exposure, the wavefront of its middle after the mirror; the
+    command computed from frame k acts first during the exposure of frame k + delay_frames. Air and noise
+    depend on seed, realisation and frame alone: runs with other arms see the same.
+
+    Parameters
+    ----------
+    configuration : LoopConfiguration
+    arms : sequence of Arm
+    schedule : (frames,) array of int, optional
+        Which arm measures each frame. Default: the configuration's number of frames with the first arm.
+    seed : int, optional
+        Default: the configuration's.
+    realisation : int
+        Other realisations have other air and other noise.
+    progress : callable, optional
+        Called with the number of frames done and that of all, after every frame.
+    idealised : DisabledErrors, optional
+        What is left out of what spoils the Strehl ratio.
+    learns_on : LoopConfiguration, optional
+        Of the loop that control learns from where it does. Default: the same, with other air.
+
+    Returns
+    -------
+    LoopRecord
+
+    Raises
+    ------
+    InputError
+        For a schedule that names arms that are not there, no arms, or parts that do not fit together.
+    MissingExtraError
+        When HCIPy is not installed.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
+    >>> loop = LoopConfiguration().replace("run", frames=40, settle_frames=20)
+    >>> record = simulate_loop(loop, [Arm("brightest", fs.Settings("brightest"))])
+    >>> record.strehl.shape, record.slopes_px.shape, bool(record.strehl[-1] > record.strehl[0])
+    ((40,), (40, 72), True)
+    """
+    which = _checked_schedule(configuration, arms, schedule)
+    start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
+    number = int(number_between("realisation", realisation, 0, integer=True))
+    switches = DisabledErrors() if idealised is None else idealised
+    ready = [
+        learnt_control(switches.configuration(configuration), arm, start, learns_on)
+        for arm in map(switches.arm, arms)
+    ]
+    what = configuration, ready, which, start, number, switches
+    gains = None
+    if switches.exact_gain:
+        gains = _Loop(*what).run(None).gains_in_run()
+    return _Loop(*what, gains).run(progress).record()
+
+
+def measure_gains(
+    configuration: LoopConfiguration,
+    pipelines: Sequence[SlopePipeline],
+    *,
+    seed: int,
+    realisation: int = 0,
+    detector: Exposing | None = None,
+) -> NDArray[np.float64]:
+    """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
+    optics, detector = prepare(configuration), detector or make_detector(configuration)
+    spots = _typical_spots(without_light(configuration), seed, realisation)
+    return np.array(
+        [
+            centroid_gain(pipeline, optics.sensor, detector, configuration.photons, spots, seed)
+            for pipeline in pipelines
+        ]
+    )
+
+
+class _Loop:
+    """One run: its parts, its state and what it has written down."""
+
+    def __init__(
+        self,
+        configuration: LoopConfiguration,
+        ready: Sequence[tuple[Arm, Learnt | None]],
+        which: NDArray[np.int64],
+        seed: int,
+        realisation: int,
+        idealised: DisabledErrors,
+        gains: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.configuration = configuration = idealised.configuration(configuration)
+        self.arms = arms = tuple(arm for arm, _ in ready)
+        self.which, self.idealised = which, idealised
+        self.seed, self.realisation = seed, realisation
+        self.observatory = TelescopeModel(
+            configuration,
+            seed,
+            realisation,
+            correctable=idealised.correctable,
+            noiseless=idealised.noiseless,
+        )
+        self.optics = optics = self.observatory.optics
+        self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
+        self.lights = [self._first_light(pipeline) for pipeline in self.pipelines]
+        for number in range(len(arms)):
+            self._follow_light(number)
+        self.gains, self.divisors = self._gains_and_divisors(gains)
+        self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
+        self.controllers = [make_controller(configuration, optics, *each, self.line) for each in ready]
+        frames, n = len(which), len(optics.sensor.layout)
+        self.slopes = np.zeros((frames, 2 * n), np.float32)
+        self.valid = np.zeros((frames, n), np.bool_)
+        self.errors = np.zeros((frames, 2 * n), np.float32)
+        self.commands = np.zeros((frames, optics.mirror.commands), np.float32)
+        self.truth = np.zeros((3, frames))
+        self.regression = np.zeros((2, len(arms)))
+        pixels = len(optics.science.transform)
+        self.images = np.zeros((len(arms), pixels, pixels))
+
+    def _first_light(self, pipeline: SlopePipeline) -> MeanFlux | None:
+        """Return the mean light of every sub-aperture for an estimator that uses it, as before a run."""
+        if not pipeline.settings.estimator.uses_light or pipeline.settings.flux_e is not None:
+            return None
+        spots = _typical_spots(without_light(self.configuration), self.seed, self.realisation)
+        photons, sensor = self.configuration.photons, self.optics.sensor
+        return mean_light(pipeline, sensor, self.observatory.detector, photons, spots, self.seed)
+
+    def _follow_light(self, number: int) -> None:
+        """Tell an arm's pipeline the mean light."""
+        light = self.lights[number]
+        if light is not None:
+            self.pipelines[number] = self.pipelines[number].with_flux(light)
+
+    def _gains_and_divisors(
+        self, known: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return every arm's centroid gain, and what its slopes are divided by."""
+        if known is not None:
+            return known, known
+        gains = measure_gains(
+            self.configuration,
+            self.pipelines,
+            seed=self.seed,
+            realisation=self.realisation,
+            detector=self.observatory.detector,
+        )
+        gains = np.where([arm.true_slopes for arm in self.arms], 1.0, gains)
+        return gains, np.where([arm.correct_gain for arm in self.arms], gains, 1.0)
+
+    def run(self, progress: Callable[[int, int], None] | None) -> _Loop:
+        """Simulate all frames."""
+        frames = len(self.which)
+        for frame in range(frames):
+            self.step(frame)
+            if progress is not None:
+                progress(frame + 1, frames)
+        return self
+
+    def step(self, frame: int) -> None:
+        """Simulate one frame."""
+        number, commands = int(self.which[frame]), self.line.acting
+        time = self.idealised.time_s(frame, self.configuration.control.frame_rate_hz)
+        after, seen = self.observatory.wavefronts(time, commands)
+        self._observe(frame, time, after)
+        slopes = self._measure(frame, seen)
+        error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
+        vector = slopes.vector.astype(np.float64) / self.divisors[number]
+        self.controllers[number].update(vector, error.astype(np.float64) / self.divisors[number])
+        self.slopes[frame], self.errors[frame] = slopes.vector, error
+        self.valid[frame], self.commands[frame] = slopes.valid, commands
+
+    def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
+        """Take the science image and write down the truth."""
+        truth = self.observatory.truth(time, wavefront)
+        self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
+        if frame >= self.configuration.run.settle_frames:
+            self.images[self.which[frame]] += self.optics.science.image(truth.field)
+
+    def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
+        """Measure the slopes of the frame that the sensor's camera takes."""
+        number, sensor = int(self.which[frame]), self.optics.sensor
+        if self.arms[number].true_slopes:
+            return _true_slopes(sensor.mean_slopes_px(wavefront))
+        prior = None
+        if self.arms[number].predict_prior:
+            prior = self.controllers[number].expected().mean_px
+        slopes = self.pipelines[number](self.observatory.frame(frame, wavefront), prior)
+        known = self.lights[number]
+        if known is not None:
+            self.lights[number] = known.updated(slopes.flux)
+            self._follow_light(number)
+        if self.idealised.exact_gain and frame >= self.configuration.run.settle_frames:
+            true = sensor.mean_slopes_px(wavefront)
+            self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
+        return slopes
+
+    def gains_in_run(self) -> NDArray[np.float64]:
+        """Return the regression of each arm's measured slopes on the true ones."""
+        return np.asarray(self.regression[0] / self.regression[1])
+
+    def record(self) -> LoopRecord:
+        """Return what was written down."""
+        configuration, sensor = self.configuration, self.optics.sensor
+        scored = self.which[configuration.run.settle_frames :]
+        exposures = np.maximum(1, np.bincount(scored, minlength=len(self.arms)))
+        strehl, residual, r0 = self.truth
+        return LoopRecord(
+            self.slopes,
+            self.valid,
+            self.errors,
+            self.commands,
+            strehl,
+            residual,
+            r0,
+            self.which.astype(np.int8),
+            self.optics.interaction,
+            self.gains,
+            np.array([arm.correct_gain for arm in self.arms]),
+            (self.images / exposures[:, None, None]).astype(np.float32),
+            tuple(arm.label for arm in self.arms),
+            tuple(configuration_file.to_text(arm.settings) for arm in self.arms),
+            sensor.layout.cells,
+            sensor.illumination,
+            configuration.control.frame_rate_hz,
+            configuration.control.delay_frames,
+            configuration.run.settle_frames,
+            configuration.control.mode == CLOSED,
+            configuration.subaperture_m,
+            configuration.pixel_scale_rad,
+            configuration.sensor.wavelength_m,
+            configuration.science.wavelength_m,
+            configuration.science.wavelength_m / configuration.width_m / PSF_SAMPLING,
+            configuration.to_text(),
+            self.seed,
+            self.realisation,
+        )
+
+
+def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
+    """Return slopes that are known without an error."""
+    x, y = vector.astype(np.float32).reshape(2, -1)
+    zeros, counts = np.zeros(len(x), np.float32), np.zeros(len(x), np.int32)
+    return Slopes(x, y, zeros, np.zeros(len(x), np.uint8), counts, counts, zeros, zeros)
+
+
+def _checked_schedule(
+    configuration: LoopConfiguration, arms: Sequence[Arm], schedule: ArrayLike | None
+) -> NDArray[np.int64]:
+    if not 1 <= len(arms) <= _MOST_ARMS:
+        raise InputError(f"arms: expected 1 to {_MOST_ARMS}, got {len(arms)}")
+    if len(arms) > 1 and any(arm.control != INTEGRATOR for arm in arms):
+        raise InputError("arms: expected one, or several with the integrator alone")
+    if schedule is None:
+        return np.zeros(configuration.run.frames, np.int64)
+    which = numbers_between("schedule", schedule, 0, len(arms) - 1, integer=True)
+    if which.ndim != 1:
+        raise InputError(f"schedule: expected one arm for each frame, got shape {which.shape}")
+    return which.astype(np.int64)
+
+
+@lru_cache(maxsize=2)
+def _typical_spots(
+    configuration: LoopConfiguration, seed: int, realisation: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    optics, air = prepare(configuration), air_of(configuration, seed, realisation)
+    return typical_spots(configuration, optics.sensor, optics.mirror, air, optics.reconstructor.matrix)

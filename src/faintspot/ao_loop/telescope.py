@@ -1,0 +1,114 @@
+"""The telescope: its pupil on a square grid of points, and the Strehl ratio of a wavefront in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.ao_loop.configuration import LoopConfiguration
+from faintspot.base.errors import MissingExtraError
+
+_SUPERSAMPLING = 8
+_PSF_HALF_WIDTH = 8  # lambda / width of the pupil
+PSF_SAMPLING = 4  # pixels for lambda / width
+
+
+@dataclass(frozen=True, eq=False)
+class Pupil:
+    """Amplitude on (n, n) points that tile the square around the pupil."""
+
+    amplitude: NDArray[np.float32]
+    """Part of each point's area that is in the pupil."""
+    width_m: float
+    """Of all points together."""
+
+    @property
+    def points(self) -> int:
+        """Points across the pupil."""
+        return len(self.amplitude)
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance between points."""
+        return self.width_m / self.points
+
+    def rms(self, wavefront: NDArray[np.floating]) -> float:
+        """Return the rms of a wavefront (n, n) over the pupil without its mean, in the wavefront's unit."""
+        weights = self.amplitude / self.amplitude.sum()
+        mean = float(np.vdot(weights, wavefront))
+        return float(np.sqrt(max(0.0, float(np.vdot(weights, wavefront * wavefront)) - mean**2)))
+
+    def field(self, wavefront_nm: NDArray[np.floating], wavelength_m: float) -> NDArray[np.complex64]:
+        """Return the complex amplitude (n, n) of a wavefront at a wavelength."""
+        phase = (wavefront_nm * np.float32(2e-9 * np.pi / wavelength_m)).astype(np.float32)
+        field = np.empty(phase.shape, np.complex64)
+        np.cos(phase, out=field.real)
+        np.sin(phase, out=field.imag)
+        field *= self.amplitude
+        return field
+
+    def strehl(self, field: NDArray[np.complex64]) -> float:
+        """Return the intensity on axis, of a flat wavefront's: |sum A exp(i phi)|^2 / (sum A)^2."""
+        return float(abs(field.sum(dtype=np.complex128)) ** 2 / self.amplitude.sum(dtype=np.float64) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class ScienceCamera:
+    """Fraunhofer images on axis, in units of the peak of a flat wavefront."""
+
+    transform: NDArray[np.complex64]
+    """(pixels, n): Fourier transform along one axis."""
+    scale: float
+
+    @classmethod
+    def of(cls, pupil: Pupil) -> ScienceCamera:
+        """Make the camera of a pupil: four pixels for lambda / width, out to 8, the axis on a pixel."""
+        half = _PSF_HALF_WIDTH * PSF_SAMPLING
+        angle = np.arange(-half, half + 1) / PSF_SAMPLING  # lambda / width
+        line = (np.arange(pupil.points) + 0.5) / pupil.points - 0.5
+        transform = np.exp(-2j * np.pi * np.outer(angle, line)).astype(np.complex64)
+        return cls(transform, 1 / float(pupil.amplitude.sum(dtype=np.float64)) ** 2)
+
+    def image(self, field: NDArray[np.complex64]) -> NDArray[np.float32]:
+        """Return the intensity (pixels, pixels) of a field in the pupil."""
+        amplitude = self.transform @ field @ self.transform.T
+        intensity = (amplitude.real**2 + amplitude.imag**2) * np.float32(self.scale)
+        return np.asarray(intensity, np.float32)
+
+
+def require_hcipy(purpose: str) -> ModuleType:
+    """Return the module hcipy.
+
+    Raises
+    ------
+    MissingExtraError
+        When it is not installed.
+    """
+    try:
+        import hcipy
+    except ImportError:
+        raise MissingExtraError("hcipy", "loop", purpose) from None
+    module: ModuleType = hcipy
+    return module
+
+
+def make_pupil(configuration: LoopConfiguration) -> Pupil:
+    """Return the pupil of a configuration, sampled for its sensor."""
+    hcipy = require_hcipy("the closed loop")
+    telescope, sensor = configuration.telescope, configuration.sensor
+    aperture = hcipy.make_obstructed_circular_aperture(telescope.diameter_m, telescope.obstruction)
+    grid = pupil_grid(configuration)
+    amplitude = hcipy.evaluate_supersampled(aperture, grid, _SUPERSAMPLING).shaped
+    assert len(amplitude) == sensor.subapertures * sensor.samples
+    return Pupil(np.ascontiguousarray(amplitude, np.float32), configuration.width_m)
+
+
+def pupil_grid(configuration: LoopConfiguration) -> object:
+    """Return HCIPy's grid of the pupil's points, m."""
+    points = configuration.sensor.subapertures * configuration.sensor.samples
+    hcipy = require_hcipy("the closed loop")
+    grid: object = hcipy.make_pupil_grid(points, configuration.width_m)
+    return grid

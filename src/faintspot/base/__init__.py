@@ -1,0 +1,1 @@
+"""Errors, checks and files that every other package builds on."""

@@ -1,0 +1,141 @@
+"""Checks at the door: every public function and every file passes its values through these.
+
+Each check returns the value in the form the code behind it works with, or raises InputError with one
+line that names the value, what it was and what was expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.errors import InputError
+
+# Largest pixel values whose sums and squares the kernels form without overflow.
+LARGEST_FLOAT32 = 1e30
+LARGEST_FLOAT64 = 1e290
+
+
+def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
+    """Return `value` as a real numeric array (bool counts as integer); dtype is kept.
+
+    What a masked array (numpy.ma) masks becomes NaN, and integers with it floats.
+
+    Raises
+    ------
+    InputError
+        When it is not numeric, is complex, is empty or has too few dimensions.
+    """
+    try:
+        array = _masked_as_nan(value) if np.ma.is_masked(value) else np.asarray(value)
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"{name}: expected an array of real numbers, got {type(value).__name__} ({error})"
+        ) from None
+    if array.dtype == np.bool_:
+        array = array.astype(np.uint8)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{name}: expected real numbers, got dtype {array.dtype}")
+    if array.ndim < minimum_dimensions:
+        raise InputError(
+            f"{name}: expected at least {minimum_dimensions} dimensions, got shape {array.shape}"
+        )
+    if array.size == 0:
+        raise InputError(f"{name}: expected at least one value, got an empty array of shape {array.shape}")
+    return array
+
+
+def _masked_as_nan(value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
+    """Return a masked array as floats that hold its values, float32 where that does, and NaN."""
+    dtype = np.result_type(value.dtype, np.float32)
+    filled: NDArray[Any] = np.ma.filled(value.astype(dtype), np.nan)
+    return filled
+
+
+def finite_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
+    """Return `value` as a real array without NaN or infinity."""
+    array = real_array(name, value, minimum_dimensions=minimum_dimensions)
+    if array.dtype.kind == "f":
+        bad = array.size - int(np.count_nonzero(np.isfinite(array)))
+        if bad:
+            raise InputError(f"{name}: expected finite numbers, got {bad} NaN or infinite of {array.size}")
+    return array
+
+
+def image_stack(name: str, value: Any) -> NDArray[np.floating[Any]]:
+    """Return `value` as finite float32 or float64 images (..., ny, nx), contiguous.
+
+    float32 and float16 become float32; everything else float64.
+    """
+    array = finite_array(name, value, minimum_dimensions=2)
+    dtype = np.float32 if array.dtype.kind == "f" and array.dtype.itemsize <= 4 else np.float64
+    limit = LARGEST_FLOAT32 if dtype == np.float32 else LARGEST_FLOAT64
+    largest = float(np.max(np.abs(array)))
+    if largest > limit:
+        raise InputError(f"{name}: expected magnitudes up to {limit:g} in {np.dtype(dtype)}, got {largest:g}")
+    return np.ascontiguousarray(array, dtype=dtype)
+
+
+def numbers_between(
+    name: str,
+    value: Any,
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    integer: bool = False,
+    low_open: bool = False,
+) -> NDArray[Any]:
+    """Return `value` (scalar or array) as float64, or int64 when `integer`, within [low, high].
+
+    With `low_open` the value `low` itself is refused.
+    """
+    array = finite_array(name, value)
+    wrong = (array <= low) if low_open else (array < low)
+    wrong = wrong | (array > high)
+    if np.any(wrong):
+        raise InputError(f"{name} = {array[wrong].flat[0]:g}: expected {_range_text(low, high, low_open)}")
+    if integer:
+        rounded: NDArray[Any] = np.rint(array)
+        if np.any(rounded != array):
+            raise InputError(f"{name} = {array[rounded != array].flat[0]:g}: expected a whole number")
+        return rounded.astype(np.int64)
+    numbers: NDArray[Any] = array.astype(np.float64)
+    return numbers
+
+
+def number_between(
+    name: str,
+    value: Any,
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    integer: bool = False,
+    low_open: bool = False,
+) -> float:
+    """Return one number within the range, as numbers_between does; as float (exact for whole numbers)."""
+    array = numbers_between(name, value, low, high, integer=integer, low_open=low_open)
+    if array.ndim:
+        raise InputError(f"{name}: expected one number, got an array of shape {array.shape}")
+    return float(array)
+
+
+def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
+    """Return `value` when it is one of the names in `choices`."""
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(
+            f"{name} = {value!r}: expected one of {', '.join(repr(choice) for choice in choices)}"
+        )
+    return value
+
+
+def _range_text(low: float, high: float, low_open: bool) -> str:
+    """Say a range in words: 'a number from 0 to 1', 'a number above 0'."""
+    start = f"above {low:g}" if low_open else f"from {low:g}"
+    if np.isinf(high):
+        return f"a number above {low:g}" if low_open else f"a number of at least {low:g}"
+    if np.isinf(low):
+        return f"a number up to {high:g}"
+    return f"a number {start} to {high:g}"

@@ -1,0 +1,196 @@
+"""NumPy's .npz files: written in one step; read within a limit that is checked beforehand."""
+
+from __future__ import annotations
+
+import lzma
+import math
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import numpy as np
+
+from faintspot.base.errors import InputError
+from faintspot.base.files import check_regular, write_atomically
+from faintspot.base.sizes import check_bytes
+
+MOST_BYTES = 1 << 29
+"""Memory that the arrays of a file may take together."""
+DAMAGE = (
+    OSError,
+    EOFError,
+    zlib.error,
+    lzma.LZMAError,
+    zipfile.BadZipFile,
+    RuntimeError,
+    NotImplementedError,
+)
+"""What the decoders of gzip and zip raise."""
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the start of a .npy file, or of a member of a .npz file, says of the array behind it."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[Any]
+    offset: int
+
+    @property
+    def data_bytes(self) -> int:
+        """Bytes of the array."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_header(name: str, stream: IO[bytes], actual_bytes: int) -> Header:
+    """Read the header of an array that takes `actual_bytes` with it.
+
+    Raises
+    ------
+    InputError
+        When it is none, is of Python objects, or the array is cut.
+    """
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    try:
+        version = np.lib.format.read_magic(stream)
+        shape, fortran_order, dtype = readers[version](stream)
+    except KeyError:
+        raise InputError(f"{name}: expected .npy format version 1 or 2, got another") from None
+    except DAMAGE:
+        raise
+    except Exception as error:  # NumPy evaluates the header as Python, which fails in many ways
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{name}: expected a NumPy array ({reason})") from None
+    header = Header(shape, fortran_order, dtype, stream.tell())
+    if dtype.hasobject:
+        raise InputError(f"{name}: expected numbers, got Python objects, which are never unpickled")
+    if any(side < 0 for side in shape):
+        raise InputError(f"{name}: damaged: its header has the shape {shape}")
+    if actual_bytes < (promised := header.offset + header.data_bytes):
+        raise InputError(f"{name}: truncated: its header promises {promised} bytes, there are {actual_bytes}")
+    return header
+
+
+def open_archive(path: str | Path) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]:
+    """Open a .npz file; return it, and its arrays by name.
+
+    Raises
+    ------
+    InputError
+        When it is no regular file.
+    Exception
+        Any of `DAMAGE`.
+    """
+    check_regular(path)
+    archive = zipfile.ZipFile(path)
+    found = [item for item in archive.infolist() if item.filename.endswith(".npy")]
+    return archive, {item.filename.removesuffix(".npy"): item for item in found}
+
+
+def headers_of(path: str | Path, names: Iterable[str] | None = None) -> dict[str, Header]:
+    """Return the headers of the arrays of these names that are there, or of all; raises as `open_archive`."""
+    archive, members = open_archive(path)
+    with archive:
+        headers = {}
+        for name in members if names is None else (name for name in names if name in members):
+            with archive.open(members[name]) as stream:
+                headers[name] = read_header(f"{path}:{name}", stream, members[name].file_size)
+    return headers
+
+
+def unpacked(
+    path: str | Path, what: str, names: Iterable[str] | None = None, most: int = MOST_BYTES
+) -> dict[str, Any]:
+    """Return the arrays of these names that are there, or all, when they take at most so many bytes.
+
+    Raises
+    ------
+    InputError
+        When they take more.
+    Exception
+        As `open_archive`; ValueError when an array is damaged.
+    """
+    headers = headers_of(path, names)
+    check_bytes(path, sum(header.data_bytes for header in headers.values()), most, what)
+    archive, members = open_archive(path)
+    values = {}
+    with archive:
+        for name in headers:
+            # zip gives no more bytes than the member states, whatever its content inflates to.
+            with archive.open(members[name]) as stream:
+                values[name] = np.lib.format.read_array(stream, allow_pickle=False)
+    return values
+
+
+def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a compressed file in one step, as `write_atomically` does.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    write_atomically(path, lambda stream: np.savez_compressed(stream, **arrays))
+
+
+def read_arrays(
+    path: str | Path,
+    what: str,
+    names: Sequence[str] | None = None,
+    optional: Sequence[str] = (),
+    most: int = MOST_BYTES,
+) -> dict[str, Any]:
+    """Return the arrays of these names, or all, from a file that should hold `what` in at most so many bytes.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, is too large, or an array that is not optional is missing.
+    """
+    try:
+        values = unpacked(path, what, names, most)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except InputError:
+        raise
+    except Exception:  # a damaged archive raises whatever its decoder meets
+        raise InputError(f"{path}: expected {what} (.npz), got something else") from None
+    for name in names or ():
+        if name not in values and name not in optional:
+            raise InputError(f"{path}: expected {what}, but {name} is missing")
+    return values
+
+
+def save_fields(path: str | Path, item: object, names: Sequence[str]) -> None:
+    """Write the attributes of these names that are not None with `save_arrays`.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    values = {name: getattr(item, name) for name in names}
+    save_arrays(path, {name: value for name, value in values.items() if value is not None})
+
+
+def load_fields(
+    make: Callable[..., Made], path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
+) -> Made:
+    """Return what is made of the arrays that `save_fields` wrote, see `read_arrays`.
+
+    Raises
+    ------
+    InputError
+        As `read_arrays`; what `make` raises, with the file's name.
+    """
+    values = read_arrays(path, what, names, optional)
+    try:
+        return make(**values)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

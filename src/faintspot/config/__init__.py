@@ -1,0 +1,1 @@
+"""Options, tables and presets of a configuration."""

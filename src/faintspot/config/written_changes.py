@@ -1,0 +1,79 @@
+"""Changes of settings as people write them: NAME=VALUE, and lists of sub-apertures.
+
+Nothing is imported that takes time, for commands that only pass them on to a running engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from faintspot.base.errors import InputError
+
+_MOST_SUBAPERTURES = 1_000_000
+_WORDS = {"none": None, "true": True, "false": False}
+
+
+def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
+    """Return new values by name from texts such as "noise_std=2.5" and "keep_brightest=20".
+
+    Values are numbers, true, false, none, texts, or several of them between commas: one for each
+    sub-aperture. Names are not looked at: whoever has the settings knows which there are.
+
+    Raises
+    ------
+    InputError
+        For a text that is not NAME=VALUE, a repeated name, an empty value.
+    """
+    changes: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (name and equals):
+            raise InputError(f"{text!r}: expected NAME=VALUE, such as search_range_px=2.5")
+        if name in changes:
+            raise InputError(f"{name}: expected one new value, got two")
+        items = [item.strip() for item in value.split(",")]
+        if "" in items:
+            raise InputError(f"{text!r}: expected a value after '=', or several between commas")
+        parsed = [_parsed_value(item) for item in items]
+        changes[name] = parsed[0] if len(parsed) == 1 else parsed
+    if not changes:
+        raise InputError("settings: expected at least one NAME=VALUE, such as search_range_px=2.5, got none")
+    return changes
+
+
+def parse_subapertures(text: str) -> list[int]:
+    """Return sub-apertures' numbers from a text such as "4,5,10-20"; both ends of a range belong to it.
+
+    In the order given, each once.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    numbers: dict[int, None] = {}
+    for part in text.split(","):
+        ends = [end.strip() for end in part.split("-")]
+        if len(ends) > 2 or not all(end.isascii() and end.isdecimal() and len(end) < 10 for end in ends):
+            raise InputError(
+                f"sub-apertures {text!r}: expected numbers and ranges such as 4,5,10-20, got {part.strip()!r}"
+            )
+        first, last = int(ends[0]), int(ends[-1])
+        if last < first:
+            raise InputError(f"sub-apertures {text!r}: expected a range upwards, got {part.strip()!r}")
+        if last >= _MOST_SUBAPERTURES:
+            raise InputError(f"sub-apertures {text!r}: expected numbers below {_MOST_SUBAPERTURES}")
+        numbers.update(dict.fromkeys(range(first, last + 1)))
+    return list(numbers)
+
+
+def _parsed_value(text: str) -> Any:
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            continue
+    return text

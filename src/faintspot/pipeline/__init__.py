@@ -1,0 +1,1 @@
+"""The slope pipeline: settings, plan and slopes."""

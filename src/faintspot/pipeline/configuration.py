@@ -1,0 +1,174 @@
+"""One TOML file (faintspot.toml) for layout, calibration, estimator and settings, PSF and score.
+
+Maps of a calibration, PSF and score are kept beside it, in NAME.calibration.npz and so on, and named in it.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from faintspot.base.errors import InputError
+from faintspot.base.files import derived
+from faintspot.base.toml_files import check_keys
+from faintspot.config.tables import errors_of_table, read_tables, save_tables, tables_as_text
+from faintspot.pipeline.settings import Settings
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score, load_score
+
+_PACKED, _MOST_PACKED_BYTES = "faintspot.toml", 1 << 20
+_ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
+
+Item = Layout | Calibration | Settings | PSF | Score
+
+
+class Configuration(NamedTuple):
+    """Everything that a configuration file describes."""
+
+    layout: Layout
+    settings: Settings
+    calibration: Calibration
+    psf: PSF | None
+    score: Score | None
+
+
+def load(path: str | Path, table: str) -> Any:
+    """Read one part of a configuration file as the object it describes.
+
+    Parameters
+    ----------
+    path : path
+    table : {"layout", "calibration", "settings"}
+
+    Returns
+    -------
+    Layout, Calibration or Settings
+        A file without a calibration table gives `Calibration()`.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is not TOML, lacks the table, or has an unknown key or a bad value.
+    """
+    kinds: dict[str, Any] = {"layout": Layout, "calibration": Calibration, "settings": Settings}
+    return kinds[table].load(path)
+
+
+def load_all(path: str | Path) -> Configuration:
+    """Read everything from a configuration file; PSF and score may be absent."""
+    path = Path(path)
+    document = read_tables(path)
+    return Configuration(
+        Layout.from_tables(path, document),
+        Settings.from_tables(path, document),
+        Calibration.from_tables(path, document),
+        psf_of(path, document),
+        score_of(path, document),
+    )
+
+
+def has(path: str | Path, table: str) -> bool:
+    """Say whether a configuration file exists and has a table; "settings" may be its [estimator] alone.
+
+    Raises
+    ------
+    InputError
+        When the file exists and cannot be read, or is not TOML.
+    """
+    if not Path(path).exists():
+        return False
+    document = read_tables(path)
+    return table in document or (table == "settings" and "estimator" in document)
+
+
+def save(path: str | Path, item: Item) -> None:
+    """Write an object into its table of a configuration file; other tables and comments stay as they are.
+
+    Raises
+    ------
+    InputError
+        When the file exists and is not TOML, or cannot be written.
+    """
+    if not isinstance(item, PSF | Score):
+        item.save(path)
+        return
+    table = "psf" if isinstance(item, PSF) else "score"
+    store = derived(path, f".{table}.npz")
+    item.save(store)
+    save_tables(path, {table: {"file": store.name}})
+
+
+def packed(calibration: Calibration, psf: PSF | None, score: Score | None) -> dict[str, str] | None:
+    """Return the files that `save` writes, as base64 text by name; None where they exceed 1 MiB."""
+    with TemporaryDirectory() as folder:
+        for item in (calibration, psf, score):
+            if item is not None:
+                save(Path(folder) / _PACKED, item)
+        files = list(Path(folder).iterdir())
+        if sum(file.stat().st_size for file in files) > _MOST_PACKED_BYTES:
+            return None
+        return {file.name: base64.b64encode(file.read_bytes()).decode() for file in files}
+
+
+def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score | None]:
+    """Return what `packed` was given.
+
+    Raises
+    ------
+    InputError
+        When they are no such files.
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / _PACKED
+        try:
+            for name, text in files.items():
+                (Path(folder) / Path(name).name).write_bytes(base64.b64decode(text, validate=True))
+        except (OSError, ValueError, TypeError, AttributeError):
+            raise InputError("configuration: expected files in base64") from None
+        document = read_tables(path)
+        return Calibration.from_tables(path, document), psf_of(path, document), score_of(path, document)
+
+
+def to_text(*items: Layout | Calibration | Settings) -> str:
+    """Return the configuration as TOML text; maps of a calibration are given by their shape only."""
+    tables: dict[str, Any] = {}
+    for item in items:
+        if isinstance(item, Settings):
+            tables |= {name: values for name, values in item.to_tables().items() if values}
+        else:
+            tables["layout" if isinstance(item, Layout) else "calibration"] = item.to_table()
+    return tables_as_text(tables)
+
+
+def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
+    """Return the PSF that a configuration file describes or names, if any."""
+    if "psf" not in document:
+        return None
+    values = document["psf"]
+    with errors_of_table(path, "psf"):
+        if "profile" in values:
+            check_keys("psf.", values, _ANALYTIC_KEYS, what="key beside profile")
+            return PSF.analytic(**values)
+        return PSF.load(_named_file(path, "psf", values, ("file", "profile")))
+
+
+def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
+    """Return the score that a configuration file names, if any."""
+    if "score" not in document:
+        return None
+    with errors_of_table(path, "score"):
+        return load_score(_named_file(path, "score", document["score"], ("file",)))
+
+
+def _named_file(path: Path, table: str, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:
+    """The file that a table names, relative to the configuration."""
+    check_keys(f"{table}.", values, known)
+    name = values.get("file")
+    if not isinstance(name, str):
+        raise InputError(f"{table}.file: expected the name of a file, found {name!r}")
+    return path.parent / name

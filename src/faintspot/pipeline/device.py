@@ -1,0 +1,266 @@
+"""Slopes of frames on the GPU: tables brought there once, launches, results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import cuda
+from numpy.typing import DTypeLike, NDArray
+
+from faintspot.base.errors import InputError
+from faintspot.cuda.flat_start import inverse_pivots
+from faintspot.cuda.fused import (
+    BAD_COUNT,
+    ERROR_X,
+    ERROR_Y,
+    FEWEST_BLOCKS,
+    FLUX,
+    ITERATIONS,
+    WARPS,
+    X,
+    Y,
+    slopes_kernel,
+)
+from faintspot.cuda.strips import WARP
+from faintspot.estimators.gravity import GravityPrepared
+from faintspot.estimators.registry import estimators
+
+if TYPE_CHECKING:
+    from faintspot.pipeline.plan import Plan
+    from faintspot.sensor.calibration import Calibration
+    from faintspot.sensor.layout import Layout
+
+MOST_FRAMES = 65535
+"""In one launch: so many blocks CUDA counts along y."""
+
+MOST_FRAME_PIXELS = 2**31 - 1
+"""Of one frame: so many an int32 counts."""
+
+_MOST_BYTES = 1 << 28  # of frames on the GPU at a time
+
+
+@dataclass(frozen=True)
+class DeviceSlopes:
+    """Slopes in the GPU's memory, arrays of shape (n_frames, n_subapertures); see `Slopes`.
+
+    The arrays are Numba's, which CuPy, PyTorch and JAX take as they are.
+    """
+
+    x: Any
+    y: Any
+    flux: Any
+    flags: Any
+    iterations: Any
+    bad_pixels: Any
+    standard_error_x: Any
+    standard_error_y: Any
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the kernel writes, in one piece of memory so that one transfer brings all of it."""
+
+    memory: Any
+    """uint8."""
+    numbers: Any
+    counts: Any
+    flags: Any
+
+    @classmethod
+    def within(cls, memory: Any, n_frames: int, n: int) -> Results:
+        """Lay out memory of `size_of` bytes, on the host or on the GPU."""
+        size = n_frames * n
+        numbers = memory[: 20 * size].view(np.float32).reshape(5, n_frames, n)
+        counts = memory[20 * size : 28 * size].view(np.int32).reshape(2, n_frames, n)
+        return cls(memory, numbers, counts, memory[28 * size : 29 * size].reshape(n_frames, n))
+
+    @staticmethod
+    def size_of(n_frames: int, n: int) -> int:
+        """Bytes for n_frames frames of n sub-apertures."""
+        return 29 * n_frames * n
+
+    def slopes(self) -> DeviceSlopes:
+        """Return the results by name, as views."""
+        numbers, counts = self.numbers, self.counts
+        return DeviceSlopes(
+            numbers[X],
+            numbers[Y],
+            numbers[FLUX],
+            self.flags,
+            counts[ITERATIONS],
+            counts[BAD_COUNT],
+            numbers[ERROR_X],
+            numbers[ERROR_Y],
+        )
+
+
+class DevicePipeline:
+    """A pipeline's work on the GPU. `SlopePipeline(..., device="cuda").on_device` is one.
+
+    Parameters
+    ----------
+    layout : Layout
+    calibration : Calibration
+    preparation : Plan
+        The pipeline's tables.
+
+    Raises
+    ------
+    InputError
+        For an estimator that runs on the CPU only, and windows that are too large for a warp.
+    """
+
+    def __init__(self, layout: Layout, calibration: Calibration, preparation: Plan) -> None:
+        prepared = preparation.prepared
+        if not preparation.estimator.runs_on_gpu or not isinstance(prepared, GravityPrepared):
+            able = ", ".join(repr(name) for name, kind in estimators().items() if kind.runs_on_gpu)
+            raise InputError(
+                f'estimator = {preparation.estimator.name!r}: device="cuda" runs {able}; use one of these or '
+                'device="cpu"'
+            )
+        self.layout = layout
+        self.calibration = calibration
+        self._preparation = preparation
+        first_step = prepared.first_step
+        self._kernel = slopes_kernel(layout.window, prepared.before, first_step.algorithm)
+        height, line = layout.frame_shape
+        if height * line > MOST_FRAME_PIXELS:
+            raise InputError(
+                f'frame of {height} x {line} pixels: device="cuda" takes at most {MOST_FRAME_PIXELS}; '
+                "use several frames"
+            )
+        self._line = np.int32(line)
+        self._places = cuda.to_device((layout.corners @ [line, 1]).astype(np.int32))
+        maps = np.asarray(calibration.maps(layout.frame_shape), np.float32)
+        self._maps = cuda.to_device(np.ascontiguousarray(maps.reshape(2, -1)))
+        taps = np.ones((len(layout), 2, 1)) if first_step.taps is None else first_step.taps  # ones: not used
+        self._taps = cuda.to_device(np.ascontiguousarray(taps, np.float32))
+        self._pivots = cuda.to_device(inverse_pivots(layout.window))
+        self._tables: tuple[NDArray[np.float32], Any] | None = None
+        self._first_variants = cuda.to_device(np.zeros(1, np.int32))
+
+    @property
+    def needs_light(self) -> bool:
+        """Whether settings follow the light of each frame, which only the CPU measures."""
+        return self._preparation.needs_light
+
+    def measure(self, frames: Any, *, stream: Any = 0) -> DeviceSlopes:
+        """Measure frames that are in the GPU's memory; the slopes stay there.
+
+        Images of a stack (n, ny, nx), each with settings of its own, are sub-apertures of one tall frame
+        (n * ny, nx): see `faintspot.measure_images` for its layout.
+
+        Parameters
+        ----------
+        frames : (h, w) or (n, h, w) array on the GPU, uint16 or float32, contiguous
+            Numba's, or anything with `__cuda_array_interface__`, such as CuPy's or PyTorch's.
+        stream : Numba stream, optional
+            Where the kernel is launched. This returns before it has run.
+
+        Raises
+        ------
+        InputError
+            For frames that are not of this kind or shape, and for settings that follow each frame's light.
+        """
+        self.check_constant_light()
+        array = frames if hasattr(frames, "copy_to_host") else _as_device_array(frames)
+        if array.ndim == 2:
+            array = array.reshape(1, *array.shape)
+        if array.ndim != 3 or tuple(array.shape[1:]) != tuple(self.layout.frame_shape):
+            height, width = self.layout.frame_shape
+            raise InputError(
+                f"frames: expected shape ({height}, {width}) or (n, {height}, {width}), got {frames.shape}"
+            )
+        if np.dtype(array.dtype) not in (np.uint16, np.float32):
+            raise InputError(f"frames: expected uint16 or float32 on the GPU, got {array.dtype}")
+        n_frames = len(array)
+        if n_frames > MOST_FRAMES:
+            raise InputError(f"frames: expected at most {MOST_FRAMES} at a time, got {n_frames}")
+        variants = self._first_variants
+        if n_frames > 1:
+            variants = cuda.to_device(np.zeros(n_frames, np.int32), stream=stream)
+        results = self.new_results(n_frames)
+        self.launch(array, array.dtype, variants, results, stream)
+        return results.slopes()
+
+    def measure_from_host(
+        self, frames: NDArray[Any], dtype: DTypeLike, variants: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], ...]:
+        """Measure frames (n, h, w) in the host's memory; return what `Slopes` holds, (n, n_subapertures).
+
+        Parameters
+        ----------
+        frames : (n, h, w) array, uint16 or float32, contiguous
+        dtype : dtype
+            Of the camera's pixels, which says at what value they saturate.
+        variants : (n,) int64
+            Table of settings of each frame.
+        """
+        most = min(max(1, _MOST_BYTES // frames[0].nbytes), MOST_FRAMES)
+        parts = []
+        for start in range(0, len(frames), most):
+            block = frames[start : start + most]
+            results = self.new_results(len(block))
+            which = cuda.to_device(np.ascontiguousarray(variants[start : start + most], np.int32))
+            self.launch(cuda.to_device(block), dtype, which, results)
+            memory = results.memory.copy_to_host()
+            slopes = Results.within(memory, len(block), len(self.layout)).slopes()
+            parts.append([getattr(slopes, field.name) for field in fields(slopes)])
+        return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+
+    def new_results(self, n_frames: int) -> Results:
+        """Return memory on the GPU for the slopes of so many frames."""
+        n = len(self.layout)
+        memory = cuda.device_array(Results.size_of(n_frames, n), np.uint8)
+        return Results.within(memory, n_frames, n)
+
+    def launch(self, frames: Any, dtype: DTypeLike, variants: Any, results: Results, stream: Any = 0) -> None:
+        """Launch the kernel on arrays of the GPU; parameters as `slopes_kernel` takes them."""
+        blocks = max(-(-len(self.layout) // WARPS), FEWEST_BLOCKS), len(frames)
+        self._kernel[blocks, WARPS * WARP, stream](
+            frames.reshape(len(frames), self._maps.shape[1]),
+            self._line,
+            self._places,
+            self._maps,
+            np.float32(self.calibration.saturation(np.dtype(dtype))),
+            self._tables_on_device(),
+            variants,
+            self._taps,
+            self._pivots,
+            results.numbers,
+            results.counts,
+            results.flags,
+        )
+
+    def check_constant_light(self) -> None:
+        """Refuse settings that follow each frame's light.
+
+        Raises
+        ------
+        InputError
+            For such.
+        """
+        if self.needs_light:
+            raise InputError(
+                "settings.flux_e: expected the light per sub-aperture, since automatic settings would follow "
+                "each frame's, which is measured on the CPU only"
+            )
+
+    def _tables_on_device(self) -> Any:
+        """The tables of settings, brought over anew only where there are new ones."""
+        tables = self._preparation.settings
+        if self._tables is None or self._tables[0] is not tables:
+            self._tables = tables, cuda.to_device(np.ascontiguousarray(tables, np.float32))
+        return self._tables[1]
+
+
+def _as_device_array(frames: Any) -> Any:
+    """An array of another library as Numba's, without a copy."""
+    if not hasattr(frames, "__cuda_array_interface__"):
+        raise InputError(
+            f"frames: expected an array on the GPU, got {type(frames).__name__}; call the pipeline for "
+            "frames in the host's memory"
+        )
+    return cuda.as_cuda_array(frames)

@@ -1,0 +1,70 @@
+"""Estimators for stacks of images, each image a sub-aperture of its own."""
+
+from __future__ import annotations
+
+from numpy.typing import ArrayLike
+
+from faintspot.base.checks import real_array
+from faintspot.base.errors import InputError
+from faintspot.estimators.base import Estimator
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.pipeline.slopes import Slopes
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
+
+
+def measure_images(
+    images: ArrayLike,
+    settings: Settings | Estimator,
+    *,
+    calibration: Calibration | None = None,
+    psf: PSF | None = None,
+    score: Score | None = None,
+    prior: ArrayLike | None = None,
+) -> Slopes:
+    """Measure the positions of the spots of a stack of images, each image a sub-aperture of its own.
+
+    Parameters
+    ----------
+    images : (n, ny, nx) array
+        ADU; electrons with the default calibration.
+    settings : Settings or Estimator
+        Its arrays hold one value per image. Light that is not given (`flux_e`) is the mean of the stack.
+    calibration : Calibration, optional
+        Without maps: gain, dark level, read noise.
+    psf, score
+        As `SlopePipeline`; an index holds the PSF or kind of each image.
+    prior : (n, 2) array, optional
+        Predicted positions, px from the images' centres.
+
+    Returns
+    -------
+    Slopes
+        Arrays of shape (n,); x and y in px from each image's centre.
+
+    Raises
+    ------
+    InputError
+        For images that are not real or not three-dimensional, and as `SlopePipeline`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> images, truth = fs.simulate.subapertures(2000, flux_e=100.0, rng=np.random.default_rng(1))
+    >>> for settings in (fs.Settings("brightest", keep_brightest=12), fs.Settings(noise_std=0.5)):
+    ...     slopes = fs.measure_images(images, settings)
+    ...     error = np.abs(np.stack([slopes.x, slopes.y], axis=1) - truth).mean()
+    ...     print(f"{settings.estimator.name}: R = {error:.3f} px")
+    brightest: R = 0.077 px
+    tv: R = 0.073 px
+    """
+    stack = real_array("images", images)
+    if stack.ndim != 3:
+        raise InputError(f"images: expected shape (n, ny, nx), got {stack.shape}")
+    n, ny, nx = stack.shape
+    layout = Layout.stacked(n, (ny, nx))
+    pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score)
+    return pipeline(stack.reshape(n * ny, nx), prior)

@@ -1,0 +1,87 @@
+"""The light of every sub-aperture as a running mean: what a single faint frame cannot say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import number_between, numbers_between, real_array
+from faintspot.base.errors import InputError
+
+_LEAST_LIGHT_E = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class MeanFlux:
+    """Mean light of every sub-aperture over the frames before; a value that is passed on, frame by frame.
+
+    ::
+
+        light = fs.MeanFlux(first_frames_slopes.flux)
+        for frame in frames:
+            slopes = pipeline.with_flux(light)(frame)
+            light = light.updated(slopes.flux)
+
+    Parameters
+    ----------
+    flux_e : (n,) or (n_frames, n) array
+        Light, electrons, of one frame or of several, whose mean counts.
+    time_constant_frames : float
+        Frames after which a frame counts 1 / e times as much as the newest; before as many have been seen,
+        all count alike.
+    frames : float
+        Frames that `flux_e` (n,) is the mean of. Default: 1, or their number.
+
+    Raises
+    ------
+    InputError
+        For light that is not finite, of another shape, or numbers out of range.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> light = fs.MeanFlux([100.0, 40.0])
+    >>> print(light.updated([110.0, 60.0]).flux_e)
+    [105.  50.]
+    """
+
+    flux_e: Any
+    time_constant_frames: float = 1000.0
+    frames: float | None = None
+
+    def __post_init__(self) -> None:
+        light = numbers_between("flux_e", self.flux_e, -1e12, 1e12)
+        if light.ndim not in (1, 2):
+            raise InputError(f"flux_e: expected shape (n,) or (n_frames, n), got {light.shape}")
+        number_between("time_constant_frames", self.time_constant_frames, 1.0)
+        seen = 1 if light.ndim == 1 else len(light)
+        frames = number_between("frames", seen if self.frames is None else self.frames, 0.0, low_open=True)
+        mean = light if light.ndim == 1 else light.mean(axis=0)
+        mean.flags.writeable = False
+        object.__setattr__(self, "flux_e", mean)
+        object.__setattr__(self, "frames", float(frames))
+
+    def updated(self, flux_e: ArrayLike) -> MeanFlux:
+        """Return the mean with one more frame's light (n,), electrons; what is not finite counts nothing.
+
+        Raises
+        ------
+        InputError
+            For another number of sub-apertures.
+        """
+        light = real_array("flux_e", flux_e)
+        if light.shape != self.flux_e.shape:
+            raise InputError(f"flux_e: expected shape {self.flux_e.shape}, got {light.shape}")
+        assert self.frames is not None
+        frames = min(self.frames + 1.0, self.time_constant_frames)
+        change = np.where(np.isfinite(light), light - self.flux_e, 0.0) / frames
+        return replace(self, flux_e=self.flux_e + change, frames=frames)
+
+    @property
+    def positive_flux_e(self) -> NDArray[np.float64]:
+        """The mean, and a thousandth of an electron where noise has made it less."""
+        light: NDArray[np.float64] = np.maximum(self.flux_e, _LEAST_LIGHT_E)
+        return light

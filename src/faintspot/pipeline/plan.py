@@ -1,0 +1,180 @@
+"""What a pipeline computes once, before the first frame: settings and tables in the kernels' own form."""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.estimators.base import Estimator, Prepared
+from faintspot.estimators.python import PythonPrepared
+from faintspot.estimators.sensor import Sensor
+from faintspot.kernels import groups
+from faintspot.kernels.compiling import Direct
+from faintspot.kernels.groups import Task
+from faintspot.pipeline.settings import Settings, spot_fwhm_px
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
+
+_MOST_LIGHT_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
+
+Floats = NDArray[np.float64]
+
+
+def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> NDArray[np.float32]:
+    """Dark and scale of every sub-aperture's pixels in the kernel's own order, to be read as one stream.
+
+    Shape (n_groups, pixels, 2, W); the last group repeats its last sub-aperture.
+    """
+    n_groups = -(-len(layout) // width)
+    windows = layout.images(calibration.maps(layout.frame_shape)).reshape(2, len(layout), layout.pixels)
+    lanes = windows[:, np.minimum(np.arange(n_groups * width), len(layout) - 1)]
+    return np.ascontiguousarray(lanes.reshape(2, n_groups, width, layout.pixels).transpose(1, 3, 0, 2))
+
+
+class Plan:
+    """Settings of every sub-aperture and the estimator's tables, for every level of light that occurs.
+
+    Parameters
+    ----------
+    layout, settings, calibration, psf, score
+        As `SlopePipeline`.
+    zero : (n, 2) array
+        Reference positions, px from the windows' centres.
+    width : int
+        SIMD lanes.
+
+    Raises
+    ------
+    InputError
+        When the parts do not fit together.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        settings: Settings,
+        calibration: Calibration,
+        psf: PSF | None,
+        score: Score | None,
+        zero: Floats,
+        width: int,
+    ) -> None:
+        n, pixels = len(layout), layout.pixels
+
+        def each(name: str) -> NDArray[Any]:
+            return settings.values(name, n, pixels)
+
+        search = each("search_range_px").astype(np.float64)
+        self.sensor = Sensor(
+            layout,
+            calibration,
+            psf,
+            score,
+            zero,
+            np.where(np.isnan(search), np.inf, search),
+            each("flux_e").astype(np.float64),
+            spot_fwhm_px(settings, n, pixels),
+            width,
+        )
+        self.estimator: Estimator = settings.estimator
+        self.estimator.check(self.sensor)
+        own = self.estimator.prepared(self.sensor)
+        self.prepared: Prepared = PythonPrepared(self.estimator, self.sensor) if own is None else own
+        self.no_prior = np.zeros((1, 2, n), np.float32)
+        """The prior of slopes that nobody has predicted: 0."""
+        self._fixed = self._fixed_table(each)
+        self._levels: list[NDArray[np.float32]] = []
+        self._variants: dict[int, int] = {}
+        self._kernels: dict[tuple[Any, str], Direct] = {}
+        self._lock = threading.RLock()
+        self._made: tuple[NDArray[np.float32], Any, Any] | None = None
+        if not self.needs_light:
+            self._add(self.sensor.flux_e)
+
+    @property
+    def needs_light(self) -> bool:
+        """Whether the light must be measured in every frame."""
+        return self.prepared.needs_light
+
+    @property
+    def settings(self) -> NDArray[np.float32]:
+        """Tables of settings (n_variants, rows, n)."""
+        return self._arguments()[0]
+
+    @property
+    def own_scratch(self) -> Any:
+        """Function that makes the memory of the estimator's kernel."""
+        return self._arguments()[2]
+
+    def kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that measures groups of frames of this dtype."""
+        return self._direct(self.prepared.kernel, frames)
+
+    def light_kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that sums up their light."""
+        return self._direct(self.prepared.light_kernel, frames)
+
+    def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
+        key = kernel, frames.dtype.char
+        if key not in self._kernels:
+            self._kernels[key] = Direct(kernel)
+        return self._kernels[key]
+
+    def task(self, variants: NDArray[np.int64], prior: NDArray[np.float32] | None = None) -> Task:
+        """Return what the kernel is to do with frames.
+
+        Parameters
+        ----------
+        variants : (n_frames,) int64
+            Table of settings of each frame.
+        prior : (1 or n_frames, 2, n) float32, optional
+            Predicted slopes. Default 0.
+        """
+        settings, tables, _ = self._arguments()
+        return Task(settings, variants, self.no_prior if prior is None else prior, tables)
+
+    def _arguments(self) -> tuple[NDArray[np.float32], Any, Any]:
+        """Settings, tables and scratch, made anew only where there is new light."""
+        with self._lock:
+            if self._made is None or len(self._made[0]) != len(self._levels):
+                prepared = self.prepared
+                self._made = np.stack(self._levels), prepared.tables, prepared.own_scratch
+            return self._made
+
+    def variants(self, light_e: Floats) -> NDArray[np.int64]:
+        """Return the variant of frames with that much light per sub-aperture; make those that are new."""
+        with np.errstate(invalid="ignore"):
+            light = np.clip(np.nan_to_num(light_e, nan=1.0, posinf=_MOST_LIGHT_E), 1.0, _MOST_LIGHT_E)
+        step = self.prepared.light_step
+        levels = np.rint(np.log(light) / math.log(step)).astype(np.int64)
+        with self._lock:  # several threads may measure frames with one pipeline
+            for level in np.unique(levels).tolist():
+                if level not in self._variants:
+                    self._add(np.full(self.sensor.n, step**level))
+                    self._variants[level] = len(self._levels) - 1
+        return np.array([self._variants[level] for level in levels.tolist()], np.int64)
+
+    def _add(self, flux_e: Floats) -> None:
+        """Add the settings' table of a light level."""
+        table = self._fixed.copy()
+        self.prepared.fill_light(table, flux_e)
+        self._levels.append(table)
+
+    def _fixed_table(self, each: Any) -> NDArray[np.float32]:
+        """The settings that do not depend on the light."""
+        sensor = self.sensor
+        table = np.zeros((self.prepared.setting_rows, sensor.n), np.float32)
+        table[groups.ZERO_X], table[groups.ZERO_Y] = sensor.zero.T
+        table[groups.RANGE] = sensor.search_range_px
+        table[groups.MOST_BAD] = np.floor(each("max_bad_fraction") * sensor.pixels)
+        known = sensor.calibration.read_noise_photoelectrons is not None
+        table[groups.VARIANCE] = self.prepared.variance if known else -1.0
+        table[groups.EXCESS], table[groups.ERROR_SCALE] = sensor.excess_noise, each("error_scale")
+        self.prepared.fill(table)
+        return table

@@ -1,0 +1,407 @@
+"""The slope pipeline: frame -> calibrate -> estimator -> slopes."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from faintspot.base.checks import number_between, numbers_between, one_of, real_array
+from faintspot.base.errors import InputError
+from faintspot.estimators.base import Estimator
+from faintspot.estimators.python import PythonPrepared
+from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
+from faintspot.kernels.host import lanes_for
+from faintspot.kernels.parallel import run_groups
+from faintspot.pipeline import configuration
+from faintspot.pipeline.mean_flux import MeanFlux
+from faintspot.pipeline.plan import Plan, packed_calibration
+from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.slopes import RESULT_TYPES, Slopes, Stages
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
+from faintspot.spots.psf import PSF
+from faintspot.spots.score import Score
+
+if TYPE_CHECKING:
+    from faintspot.pipeline.device import DevicePipeline
+
+_KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
+_NO_STAGES = np.empty((0, 0, 0, 0), np.float32)
+_LIGHT_COST = 0.1  # of summing up a sub-aperture's pixels, as `Estimator.cost`
+
+
+class SlopePipeline:
+    """Turns frames into slopes.
+
+    Parameters
+    ----------
+    layout : Layout
+    settings : Settings or Estimator
+    calibration : Calibration, optional
+        Default: frames are in electrons already.
+    reference : array or Slopes, optional
+        Reference positions, px from each sub-aperture's centre, subtracted from every position: (n, 2) x and
+        y, or (2 n,) all x then all y, or the slopes of one frame; up to the frame's longer side. Default 0.
+    psf : PSF, optional
+        Needed by estimators that know the spot itself; tells others the spots' width.
+    score : Score, optional
+        Needed by estimators that apply one: `TrainedScore`; `FixedWeights` take the place of a window's.
+    width : int, optional
+        SIMD width in float32 numbers: 4, 8 or 16. Default: what the machine has.
+    threads : int, optional
+        Most threads to use. Default: all processors that the process may use. Slopes do not depend on it.
+    device : {"cpu", "cuda"}, optional
+        Where frames are measured. On an NVIDIA GPU ("cuda", see `faintspot.cuda`) with estimators that run
+        there; `explain` and real time use the CPU always.
+
+    Raises
+    ------
+    InputError
+        When the parts do not fit together, and for "cuda" without a GPU.
+    MissingExtraError
+        For "cuda" without the extra `gpu`.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
+    >>> frames, truth = fs.simulate.sensor_frames(
+    ...     layout.corners, layout.window, layout.frame_shape, 20, flux_e=200.0, rng=np.random.default_rng(1)
+    ... )
+    >>> pipeline = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12))
+    >>> slopes = pipeline(frames)
+    >>> slopes.x.shape
+    (20, 36)
+    >>> print(f"mean error {np.abs(slopes.x - truth[..., 0]).mean():.2f} px")
+    mean error 0.05 px
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        settings: Settings | Estimator,
+        calibration: Calibration | None = None,
+        reference: ArrayLike | Slopes | None = None,
+        *,
+        psf: PSF | None = None,
+        score: Score | None = None,
+        width: int | None = None,
+        threads: int | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.layout = layout
+        self.settings = Settings(settings) if isinstance(settings, Estimator) else settings
+        self.calibration = Calibration() if calibration is None else calibration
+        self.threads = (
+            None if threads is None else int(number_between("threads", threads, 1, 4096, integer=True))
+        )
+        self._lanes = lanes_for(np.float32, width)
+        self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
+        self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
+        self.preparation = self._prepared()
+        """What was computed beforehand."""
+        self._identity = _identity(*self._parts)
+        self.device = one_of("device", device, ("cpu", "cuda"))
+        self.on_device = self._device_pipeline() if self.device == "cuda" else None
+
+    @classmethod
+    def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
+        """Make the pipeline that a configuration file (faintspot.toml) describes."""
+        layout, settings, calibration, psf, score = configuration.load_all(path)
+        return cls(layout, settings, calibration, psf=psf, score=score, **options)
+
+    def _prepared(self) -> Plan:
+        """Make the tables for the SIMD lanes that are set."""
+        return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
+
+    def _device_pipeline(self) -> DevicePipeline:
+        """Bring the tables to the GPU."""
+        from faintspot.cuda.availability import check_cuda
+
+        check_cuda()
+        from faintspot.pipeline.device import DevicePipeline
+
+        return DevicePipeline(self.layout, self.calibration, self.preparation)
+
+    @property
+    def width(self) -> int:
+        """Sub-apertures that are measured at once."""
+        return self._lanes.width
+
+    def with_width(self, width: int) -> SlopePipeline:
+        """Return the same pipeline with another SIMD width: 4, 8 or 16. Slopes do not depend on it.
+
+        Raises
+        ------
+        InputError
+            For another width.
+        """
+        other = copy.copy(self)
+        other._lanes = lanes_for(np.float32, width)
+        other._calibration = packed_calibration(self.layout, self.calibration, width)
+        other.preparation = other._prepared()
+        other.on_device = None if self.on_device is None else other._device_pipeline()
+        return other
+
+    @property
+    def spot(self) -> tuple[PSF | None, Score | None]:
+        """PSF and score that it was given."""
+        return self._parts[:2]
+
+    def with_settings(self, settings: Settings) -> SlopePipeline:
+        """Return the same pipeline with other settings.
+
+        Raises
+        ------
+        InputError
+            When they do not fit.
+        """
+        psf, score, zero = self._parts
+        return SlopePipeline(
+            self.layout,
+            settings,
+            self.calibration,
+            zero - self.layout.offsets,
+            psf=psf,
+            score=score,
+            width=self.width,
+            threads=self.threads,
+            device=self.device,
+        )
+
+    def with_flux(self, light: MeanFlux | ArrayLike) -> SlopePipeline:
+        """Return the same pipeline for a mean light of its sub-apertures.
+
+        Estimators that use the light measure it in every frame where nobody tells them (`flux_e`), which
+        costs precision when a frame is faint. Light counts in steps of a few per cent: where it has not
+        changed by so much, this pipeline itself is returned, so that it may be called in every frame.
+
+        Parameters
+        ----------
+        light : MeanFlux, or float or (n,) array
+            Electrons of a frame.
+
+        Raises
+        ------
+        InputError
+            For light that is not positive, or of another number of sub-apertures.
+        """
+        flux = light.positive_flux_e if isinstance(light, MeanFlux) else light
+        flux = numbers_between("light", flux, 0.0, 1e12, low_open=True)
+        if flux.shape not in ((), (len(self.layout),)):
+            raise InputError(f"light: expected one number or {len(self.layout)}, got shape {flux.shape}")
+        step = math.log(self.preparation.prepared.light_step)
+        known = self.preparation.sensor.flux_e
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steady = np.abs(np.log(flux / known)) <= step
+        if steady.all():
+            return self
+        rounded = np.exp(step * np.rint(np.log(flux) / step))
+        return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
+
+    def for_images(self) -> SlopePipeline:
+        """Return the same pipeline for calibrated images (n, ny, nx), electrons, read as one tall frame."""
+        layout, camera = self.layout, self.calibration
+        other = copy.copy(self)
+        other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
+        other.calibration = Calibration(
+            dark=None if camera.dark is None else 0.0,
+            rough_dark=camera.rough_dark,
+            gain_e_per_adu=camera.em_gain,
+            em_gain=camera.em_gain,
+            read_noise_e=camera.read_noise_e,
+            background_e=camera.background_e,
+        )
+        other._calibration = packed_calibration(other.layout, other.calibration, self.width)
+        other.preparation = other._prepared()
+        other.device, other.on_device = "cpu", None
+        return other
+
+    @property
+    def needs_light(self) -> bool:
+        """Whether settings follow the light of each frame, which is looked at before it is measured."""
+        return self.preparation.needs_light
+
+    def fingerprint(self) -> bytes:
+        """Return bytes that differ between pipelines that could give different slopes for the same frame."""
+        parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape))
+        calibration = self.calibration
+        text = (
+            f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_e} "
+            f"{calibration.background_e} {calibration.em_gain} {calibration.vouches_for_dark} "
+            f"{configuration.to_text(self.settings)}"
+        )
+        return (
+            b"".join(np.ascontiguousarray(part).tobytes() for part in parts) + self._identity + text.encode()
+        )
+
+    def __call__(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Slopes:
+        """Measure the slopes of a frame (h, w) or of frames (n, h, w), in ADU.
+
+        NaN and infinite pixels count as bad pixels; a sub-aperture that cannot be measured is flagged.
+
+        Parameters
+        ----------
+        frame : array
+        prior : array or Slopes, optional
+            Predicted slopes, px, for "map" (the mean of its prior) and "trained" (where it begins): as
+            `reference`, or one such array for every frame. Default 0, which is also what counts where a
+            number is not finite, or larger than the frame's longer side.
+
+        Raises
+        ------
+        InputError
+            For a frame that is not real or not of the layout's shape, or a prior of the wrong shape.
+        """
+        return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
+
+    def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
+        """Return the sub-aperture images after every step, for pictures and for finding faults.
+
+        Estimators that work on the calibrated image itself leave it as it is in every step.
+        """
+        array = self._checked(frame)
+        slopes, stages = self._run(array, _camera_type(frame), prior, explain=True)
+        calibrated, denoised, background = stages.reshape(3, *slopes.x.shape, *self.layout.window)
+        return Stages(self.layout.images(array), calibrated, denoised, background, slopes)
+
+    def _checked(self, frame: ArrayLike) -> NDArray[Any]:
+        array = real_array("frame", frame, minimum_dimensions=2)
+        if array.ndim > 3 or array.shape[-2:] != self.layout.frame_shape:
+            height, width = self.layout.frame_shape
+            raise InputError(
+                f"frame: expected shape ({height}, {width}) or (n, {height}, {width}), got {array.shape}"
+            )
+        return array
+
+    def _run(
+        self,
+        array: NDArray[Any],
+        dtype: np.dtype[Any],
+        prior: ArrayLike | Slopes | None,
+        explain: bool,
+    ) -> tuple[Slopes, NDArray[np.float32]]:
+        """Compute the slopes, and the stages where asked for."""
+        frames = kernel_frames(array)
+        n_frames, n = len(frames), len(self.layout)
+        results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
+        prepared = self.preparation.prepared
+        stages = _NO_STAGES
+        if explain or isinstance(prepared, PythonPrepared):
+            stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
+        source = self.source(frames, dtype)
+        variants = self._variants(source)
+        if self.on_device is not None and not explain:
+            measured = self.on_device.measure_from_host(frames, dtype, variants)
+            return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
+        predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
+        task = self.preparation.task(variants, predicted)
+        kernel = self.preparation.kernel(frames)
+
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            kernel(source, task, start, stop, scratch, results, stages)
+
+        n_groups = n_frames * -(-n // self._lanes.width)
+        own_scratch = self.preparation.own_scratch
+        cost = self.preparation.estimator.cost
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
+        if isinstance(prepared, PythonPrepared):
+            images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
+            for f in range(n_frames):
+                predicted_f = task.prior[min(f, len(task.prior) - 1)]
+                prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
+        return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
+
+    def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
+        """Return what kernels read of frames.
+
+        Parameters
+        ----------
+        frames : (n, h, w) array, uint16 or float32, contiguous
+        dtype : dtype
+            Of the camera's pixels, which says at what value they saturate.
+        """
+        saturation = self.calibration.saturation(np.dtype(dtype))
+        corners, window = self.layout.corners, self.layout.window
+        return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
+
+    def _variants(self, source: Source) -> NDArray[np.int64]:
+        """Which table of settings every frame is measured with, by its light where that matters."""
+        n_frames, n = len(source.frames), len(self.layout)
+        if not self.needs_light:
+            return np.zeros(n_frames, np.int64)
+        light = np.empty((n_frames, n), np.float32)
+
+        light_kernel = self.preparation.light_kernel(source.frames)
+
+        def job(start: int, stop: int, scratch: Scratch) -> None:
+            light_kernel(source, start, stop, scratch, light)
+
+        n_groups = n_frames * -(-n // self._lanes.width)
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_LIGHT_COST)
+        return self.preparation.variants(light.mean(axis=1, dtype=np.float64))
+
+
+def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
+    """Return frames as kernels read them: (n, h, w), contiguous, uint16 or float32."""
+    if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
+        return array if array.ndim == 3 else array[None]
+    dtype = np.uint16 if array.dtype == np.uint8 else np.float32
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
+        frames = np.ascontiguousarray(array, dtype=dtype)
+    return frames.reshape(-1, *array.shape[-2:])
+
+
+def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:
+    """Reference positions as (n, 2)."""
+    n, side = len(layout), max(layout.frame_shape)
+    if reference is None:
+        return np.zeros((n, 2))
+    given = reference.vector if isinstance(reference, Slopes) else reference
+    array = numbers_between("reference", given, -side, side)
+    if array.shape == (2 * n,):
+        return np.stack([array[:n], array[n:]], axis=1)
+    if array.shape != (n, 2):
+        raise InputError(f"reference: expected shape ({n}, 2) or ({2 * n},), got {array.shape}")
+    return array
+
+
+def _camera_type(frame: ArrayLike) -> np.dtype[Any]:
+    """Return the type of a frame's pixels as they were given: integers with a mask become floats later."""
+    return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
+
+
+def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:
+    """Predicted slopes as the kernel reads them: (1 or n_frames, 2, n).
+
+    What no frame can hold, as of a loop that has diverged, counts as not predicted.
+    """
+    n = len(layout)
+    array = real_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
+    if array.shape in ((n, 2), (n_frames, n, 2)):
+        array = np.moveaxis(array, -1, -2)
+    elif array.shape not in ((2 * n,), (n_frames, 2 * n)):
+        raise InputError(
+            f"prior: expected shape ({n}, 2) or ({2 * n},), or as many for each of the {n_frames} frames, "
+            f"got {array.shape}"
+        )
+    possible = np.abs(array) <= max(layout.frame_shape)
+    return np.ascontiguousarray(np.where(possible, array, 0.0).reshape(-1, 2, n), np.float32)
+
+
+def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -> bytes:
+    """A digest of what slopes depend on beside layout, settings and calibration."""
+    digest = hashlib.sha256(zero.tobytes())
+    for part in (psf, score):
+        for field in fields(part) if part is not None else ():
+            value = getattr(part, field.name)
+            whole = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            digest.update(f"{type(part).__name__}.{field.name}".encode() + whole)
+    return digest.digest()

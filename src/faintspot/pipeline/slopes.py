@@ -1,0 +1,128 @@
+"""What a pipeline gives: slopes, and the images after every step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.base.flags import INVALID
+from faintspot.base.notebook import slopes_in_words, table
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from faintspot.sensor.layout import Layout
+
+RESULT_TYPES = tuple(map(np.dtype, ("f4", "f4", "f4", "u1", "i4", "i4", "f4", "f4")))
+
+
+@dataclass(frozen=True, repr=False)
+class Slopes:
+    """Slopes of one frame, arrays of shape (n_subapertures,), or of several, (n_frames, n_subapertures).
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((2, 2), pixels=8)
+    >>> frame = np.zeros(layout.frame_shape)
+    >>> frame[2:4, 4:6] = 50.0
+    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=4))(frame)
+    >>> slopes.valid
+    array([ True, False, False, False])
+    >>> float(slopes.x[0]), float(slopes.y[0]), float(slopes.flux[0])
+    (1.0, -1.0, 200.0)
+    >>> fs.SubapertureFlag(int(slopes.flags[1])).name
+    'NO_LIGHT'
+    """
+
+    x: NDArray[np.float32]
+    """Position of the spot along columns, px from the reference; 0 where invalid."""
+    y: NDArray[np.float32]
+    """Position along rows."""
+    flux: NDArray[np.float32]
+    """Electrons left after the background subtraction."""
+    flags: NDArray[np.uint8]
+    """Bits of `SubapertureFlag`."""
+    iterations: NDArray[np.int32]
+    """Iterations that the denoising took."""
+    bad_pixels: NDArray[np.int32]
+    """Number of pixels that were masked, NaN or infinite."""
+    standard_error_x: NDArray[np.float32]
+    """Standard error of x, px; infinite where invalid, and where the read noise is not known."""
+    standard_error_y: NDArray[np.float32]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether the slope was measured."""
+        return (self.flags & INVALID) == 0  # type: ignore[no-any-return]
+
+    @property
+    def vector(self) -> NDArray[np.float32]:
+        """All x, then all y, along the last axis: what a reconstructor multiplies."""
+        return np.concatenate([self.x, self.y], axis=-1)
+
+    def __repr__(self) -> str:
+        return f"Slopes({', '.join(f'{name} {value}' for name, value in slopes_in_words(self).items())})"
+
+    def _repr_html_(self) -> str:
+        return table("Slopes", slopes_in_words(self))
+
+    def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
+        """Return an xarray.Dataset with dimensions frame and subaperture, units as attributes.
+
+        Parameters
+        ----------
+        layout : Layout, optional
+            Of these sub-apertures: for centre_x, centre_y (px), row and column as coordinates.
+        unit : {"px", "arcsec"}
+            Of positions and their standard errors; arcsec needs a layout with `pixel_scale_arcsec`.
+
+        Raises
+        ------
+        InputError
+            When the layout has another number of sub-apertures, or no scale that is needed.
+        MissingExtraError
+            When xarray is not installed.
+        """
+        from faintspot.io.labelled import dataset_of
+
+        return dataset_of(self, layout, unit)
+
+    def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
+        """Return a pandas.DataFrame with a row for each frame and sub-aperture, its index.
+
+        Columns have the names of .csv files, as x_px; `layout` and `unit` are those of `to_xarray`, and so
+        are the errors.
+        """
+        from faintspot.io.labelled import table_of_slopes
+
+        return table_of_slopes(self, layout, unit)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> layout = fs.Layout.grid((7, 7), pixels=16)
+    >>> frames, _ = fs.simulate.sensor_frames(layout.corners, layout.window, layout.frame_shape, 1)
+    >>> stages = fs.SlopePipeline(layout, fs.Settings(noise_std=0.5, keep_brightest=12)).explain(frames[0])
+    >>> stages.denoised.shape
+    (49, 16, 16)
+    >>> bool(stages.denoised.std() < stages.calibrated.std())
+    True
+    """
+
+    raw: NDArray[Any]
+    """As in the frame, ADU."""
+    calibrated: NDArray[np.float32]
+    """Electrons, bad pixels filled."""
+    denoised: NDArray[np.float32]
+    background_subtracted: NDArray[np.float32]
+    slopes: Slopes

@@ -1,0 +1,262 @@
+"""A camera's detector: from the mean light on each pixel to what is read out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.base.generators import spawn
+
+LARGEST_MEAN_E = 1e12
+"""The largest mean number of electrons per pixel accepted (far beyond any full well)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """A CCD, CMOS or electron-multiplying CCD with its noise.
+
+    In the order of the light: photo-electrons of the star, background and dark current (each Poisson),
+    full well, multiplication register, read noise (Gaussian), conversion to ADU, quantisation.
+
+    The convention for ADU is ``adu = offset_adu + electrons_out / gain_e_per_adu``, where electrons_out is
+    what leaves the multiplication register plus the read noise. Photo-electrons are got back by
+    ``(adu - offset_adu) * gain_e_per_adu / em_gain``, which is what `to_electrons` does. With the default
+    offset and gain, and no multiplication, ADU are electrons.
+
+    Each source of noise draws from a generator of its own, so that changing one leaves the draws of the
+    others as they were.
+
+    Parameters
+    ----------
+    read_noise_e : float or array_like, shape (ny, nx)
+        Standard deviation of the read noise in electrons at the output, that is after multiplication:
+        in photo-electrons it is read_noise_e / em_gain. Any number from 0; never rounded.
+    dark_e : float or array_like, shape (ny, nx)
+        Mean electrons per pixel and frame from dark current and clock-induced charge.
+    background_e : float or array_like, shape (ny, nx)
+        Mean photo-electrons per pixel and frame from the sky and stray light.
+    em_gain : float
+        Mean gain of the multiplication register; 1 is a detector without one. For n electrons in, the
+        output is Gamma distributed with shape n and scale em_gain (Basden, Haniff & Mackay 2003, MNRAS
+        345, 985), the limit for a gain much above 1.
+    gain_e_per_adu : float
+        Electrons (after multiplication) for one ADU.
+    offset_adu : float
+        Level added to every pixel. With `bits`, values below 0 ADU are cut off: give an offset of
+        several times the read noise.
+    bits : int or None
+        Bits of the analogue-to-digital converter, 1 to 32: values are rounded to whole ADU and saturate at
+        0 and at 2**bits - 1. None leaves them continuous.
+    full_well_e : float or None
+        Largest number of electrons that a pixel holds before multiplication.
+    hot_pixels : sequence of (row, column, electrons)
+        Pixels with that many mean dark electrons per frame on top of `dark_e`.
+
+    Raises
+    ------
+    InputError
+        When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> emccd = fs.simulate.Detector(50.0, em_gain=500.0, gain_e_per_adu=10.0, offset_adu=200.0, bits=14)
+    >>> adu = emccd.expose(np.full((1000, 8, 8), 3.0), np.random.default_rng(1))
+    >>> electrons = emccd.to_electrons(adu)
+    >>> print(f"{adu.dtype}: mean {electrons.mean():.1f}, variance {electrons.var():.1f} e-")
+    uint16: mean 3.0, variance 5.9 e-
+    """
+
+    read_noise_e: float | NDArray[np.float64] = 0.1
+    _: KW_ONLY
+    dark_e: float | NDArray[np.float64] = 0.0
+    background_e: float | NDArray[np.float64] = 0.0
+    em_gain: float = 1.0
+    gain_e_per_adu: float = 1.0
+    offset_adu: float = 0.0
+    bits: int | None = None
+    full_well_e: float | None = None
+    hot_pixels: Sequence[tuple[int, int, float]] = ()
+
+    def __post_init__(self) -> None:
+        checked: dict[str, Any] = {
+            name: _number_or_map(name, getattr(self, name))
+            for name in ("read_noise_e", "dark_e", "background_e")
+        }
+        checked["em_gain"] = number_between("em_gain", self.em_gain, 1)
+        checked["gain_e_per_adu"] = number_between("gain_e_per_adu", self.gain_e_per_adu, 0, low_open=True)
+        checked["offset_adu"] = number_between("offset_adu", self.offset_adu)
+        if self.bits is not None:
+            checked["bits"] = int(number_between("bits", self.bits, 1, 32, integer=True))
+        if self.full_well_e is not None:
+            checked["full_well_e"] = number_between("full_well_e", self.full_well_e, 0, low_open=True)
+        checked["hot_pixels"] = _hot_pixels(self.hot_pixels)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def excess_noise_factor(self) -> float:
+        """Factor by which the multiplication register raises the variance of the electrons: 2, or 1 without.
+
+        It is the F^2 of Robbins & Hadwen (2003, IEEE Trans. Electron Devices 50, 1227) in the limit of a
+        large gain, which is exact for this register's Gamma distribution.
+        """
+        return 2.0 if self.em_gain > 1 else 1.0
+
+    def expose(
+        self, mean_e: ArrayLike, rng: np.random.Generator | None = None
+    ) -> NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]:
+        """Return one read-out of the detector for each image of mean photo-electrons.
+
+        Parameters
+        ----------
+        mean_e : array_like, shape (..., ny, nx)
+            Mean photo-electrons per pixel from the star, 0 to 1e12. Zeros give dark frames (with sky).
+        rng : numpy.random.Generator, optional
+            Where the noise comes from.
+
+        Returns
+        -------
+        ndarray, shape (..., ny, nx)
+            ADU: float32, or with `bits` uint16 (up to 16 bits) or uint32.
+
+        Raises
+        ------
+        InputError
+            When `mean_e` is negative or not finite, or its images do not have the shape of the detector's
+            maps or do not contain its hot pixels.
+        """
+        mean = self._checked_mean(mean_e)
+        photon, dark, background, register, read = spawn(rng, 5)
+        electrons = photon.poisson(mean).astype(np.float64)
+        for generator, level in ((dark, self._dark_map(mean.shape)), (background, self.background_e)):
+            if np.any(level):
+                electrons += generator.poisson(level, mean.shape)
+        if self.full_well_e is not None:
+            np.minimum(electrons, self.full_well_e, out=electrons)
+        if self.em_gain > 1:
+            electrons = self.em_gain * register.standard_gamma(electrons)
+        if np.any(self.read_noise_e):
+            electrons += self.read_noise_e * read.standard_normal(mean.shape)
+        return self._digitise(electrons)
+
+    def to_electrons(self, adu: ArrayLike) -> NDArray[np.float32] | NDArray[np.float64]:
+        """Return the photo-electrons of a read-out: (adu - offset_adu) * gain_e_per_adu / em_gain.
+
+        Background and dark current are still in them.
+
+        Parameters
+        ----------
+        adu : array_like
+            What `expose` returned, any shape.
+
+        Returns
+        -------
+        ndarray, same shape
+            Photo-electrons; float64 when `adu` is, else float32.
+
+        Raises
+        ------
+        InputError
+            When `adu` holds anything but finite numbers.
+        """
+        values = finite_array("adu", adu)
+        electrons = (values.astype(np.float64) - self.offset_adu) * (self.gain_e_per_adu / self.em_gain)
+        return electrons if values.dtype == np.float64 else electrons.astype(np.float32)
+
+    def variance(self, mean_e: ArrayLike) -> NDArray[np.float64]:
+        """Return the variance, in photo-electrons squared, of a read-out turned into photo-electrons.
+
+        excess_noise_factor * (mean_e + dark + background) + (read_noise_e / em_gain)^2, and with `bits`
+        one twelfth of an ADU squared. Saturation and full well are left out, and the twelfth holds once
+        the noise is at least half an ADU.
+
+        Parameters
+        ----------
+        mean_e : array_like, shape (..., ny, nx)
+            Mean photo-electrons per pixel from the star.
+
+        Returns
+        -------
+        ndarray, float64, shape (..., ny, nx)
+
+        Raises
+        ------
+        InputError
+            As `expose` does.
+        """
+        mean = self._checked_mean(mean_e)
+        collected = mean + self._dark_map(mean.shape) + self.background_e
+        at_output = np.square(self.read_noise_e)
+        if self.bits is not None:
+            at_output = at_output + self.gain_e_per_adu**2 / 12
+        variance: NDArray[np.float64] = self.excess_noise_factor * collected + at_output / self.em_gain**2
+        return variance
+
+    def _checked_mean(self, mean_e: ArrayLike) -> NDArray[np.float64]:
+        """Return the mean images as float64; refuse what does not fit the detector."""
+        mean: NDArray[np.float64] = numbers_between("mean_e", mean_e, 0, LARGEST_MEAN_E)
+        if mean.ndim < 2:
+            raise InputError(f"mean_e: expected shape (..., rows, columns), got {mean.shape}")
+        for name in ("read_noise_e", "dark_e", "background_e"):
+            expected = np.shape(getattr(self, name))
+            if expected not in ((), mean.shape[-2:]):
+                raise InputError(f"mean_e: expected images of shape {expected}, as {name}, got {mean.shape}")
+        for row, column, _ in self.hot_pixels:
+            if row >= mean.shape[-2] or column >= mean.shape[-1]:
+                raise InputError(
+                    f"mean_e: hot pixel ({row}, {column}) is outside images of {mean.shape[-2:]}"
+                )
+        return mean
+
+    def _dark_map(self, shape: tuple[int, ...]) -> float | NDArray[np.float64]:
+        """Return the mean dark electrons, hot pixels included, for images (..., ny, nx) of that shape."""
+        if not self.hot_pixels:
+            return self.dark_e
+        dark = np.broadcast_to(self.dark_e, shape[-2:]).copy()
+        for row, column, electrons in self.hot_pixels:
+            dark[row, column] += electrons
+        return dark
+
+    def _digitise(
+        self, electrons_out: NDArray[np.float64]
+    ) -> NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]:
+        """Convert electrons at the output to ADU; round and saturate them when the converter has bits."""
+        adu = self.offset_adu + electrons_out / self.gain_e_per_adu
+        if self.bits is None:
+            return adu.astype(np.float32)
+        whole = np.clip(np.rint(adu), 0, 2**self.bits - 1)
+        return whole.astype(np.uint16) if self.bits <= 16 else whole.astype(np.uint32)
+
+
+def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
+    """Return a level of at least 0: a number, or a read-only map of shape (ny, nx)."""
+    level: NDArray[np.float64] = numbers_between(name, value, 0, LARGEST_MEAN_E)
+    if level.ndim == 0:
+        return float(level)
+    if level.ndim != 2:
+        raise InputError(f"{name}: expected one number or a map (rows, columns), got shape {level.shape}")
+    level.flags.writeable = False
+    return level
+
+
+def _hot_pixels(value: Any) -> tuple[tuple[int, int, float], ...]:
+    """Return hot pixels as (row, column, electrons)."""
+    if not isinstance(value, Sequence | np.ndarray):
+        raise InputError(f"hot_pixels: expected a list of (row, column, electrons), got {value!r}")
+    if len(value) == 0:
+        return ()
+    table = finite_array("hot_pixels", value)
+    if table.ndim != 2 or table.shape[1] != 3:
+        raise InputError(f"hot_pixels: expected (row, column, electrons) for each, got shape {table.shape}")
+    where = numbers_between("hot_pixels row or column", table[:, :2], 0, 2**31, integer=True)
+    levels = numbers_between("hot_pixels electrons", table[:, 2], 0, LARGEST_MEAN_E)
+    return tuple(
+        (int(row), int(column), float(level)) for (row, column), level in zip(where, levels, strict=True)
+    )

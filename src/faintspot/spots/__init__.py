@@ -1,0 +1,1 @@
+"""Spot models, point-spread functions, trained scores and the Cramer-Rao bound."""

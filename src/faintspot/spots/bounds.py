@@ -1,0 +1,361 @@
+"""How well a spot's position can be measured at all: the Cramer-Rao bound, and photon efficiency.
+
+The bound holds for estimators without bias. An estimator that knows that positions lie within some range
+can do better where the light says little; see `prior_std_px`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import number_between, numbers_between, one_of
+from faintspot.base.errors import InputError
+from faintspot.sensor.detector import Detector
+from faintspot.spots.shapes import image_shape, position_array, spots
+
+Floats = NDArray[np.float64]
+
+MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
+"""Mean absolute value of a normal distribution of standard deviation 1: R of an estimator at the bound."""
+
+_NOISES = ("exact", "gaussian")
+_SMALLEST_MEAN_E = 1e-6  # pixels with less light say nothing about the position
+_LARGEST_TABLED_VARIANCE = 40.0  # above, the expansion of the information is good to 5e-4
+_SMALLEST_TABLED_NOISE_E = 0.05  # below, electrons are counted without error
+_BRACKET = 1e12  # largest and, inverted, smallest flux that photon_efficiency looks at, e-
+_FLUX_STEPS_PER_DECADE = 12
+
+
+class SpotImages(Protocol):
+    """A measured or analytic spot: noiseless images at given positions, such as `faintspot.PSF`."""
+
+    def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> Floats:
+        """Return images (n, ny, nx) of spots at positions (n, 2)."""
+
+
+class _Spot(NamedTuple):
+    """Images of a spot that leaves 1 e- in its window when centred, and their derivatives: (m, pixels)."""
+
+    image: Floats
+    along_x: Floats
+    along_y: Floats
+
+
+class _Noise(NamedTuple):
+    """What blurs the light of each pixel, in photo-electrons; maps are flattened: (pixels,)."""
+
+    read_noise_e: Floats
+    background_e: Floats
+    excess: float
+    exact: bool
+
+
+def cramer_rao(
+    flux_e: ArrayLike,
+    *,
+    shape: tuple[int, int] = (16, 16),
+    profile: str = "diffraction",
+    size: float = 1.0,
+    elongation: float = 1.0,
+    angle_deg: float = 0.0,
+    psf: SpotImages | None = None,
+    detector: Detector | None = None,
+    positions: ArrayLike = (0.0, 0.0),
+    position_range_px: float | None = None,
+    unknown_flux: bool = True,
+    unknown_background: bool = False,
+    prior_std_px: float | None = None,
+    noise: str = "exact",
+) -> NDArray[np.float64]:
+    """Return the smallest standard error with which a spot's position can be measured without bias.
+
+    It is the root of the diagonal of the inverse Fisher information of (x, y, flux, background). An estimator
+    with normally distributed errors at the bound has the slope error R = sqrt(2 / pi) times the mean of the
+    two axes.
+
+    Parameters
+    ----------
+    flux_e : float or array_like, any shape
+        Electrons that a spot in the middle of its image leaves within it, as in
+        `faintspot.simulate.subapertures`; above 0.
+    shape : (int, int)
+        Rows and columns (ny, nx) of the image, at least 3 px each.
+    profile, size, elongation, angle_deg
+        The spot, see `faintspot.spots.shapes`. Not used with `psf`.
+    psf : object with a method ``images(positions, shape, flux_e)``, optional
+        The spot itself, such as a `faintspot.PSF`. Pixels where it is not positive are left out. Noise in a
+        learnt spot's wings adds to the apparent information where read noise is low.
+    detector : Detector, optional
+        Its noise; the mean of background and dark current is known unless `unknown_background`. Converter
+        steps count as read noise of 1/12 ADU squared; full well and saturation are left out. Default: 0.1 e-
+        read noise and nothing else.
+    positions : array_like, shape (2,) or (m, 2)
+        x and y in px; the result is the mean over them.
+    position_range_px : float, optional
+        Positions uniform within plus and minus this on each axis, instead of `positions`.
+    unknown_flux, unknown_background : bool
+        Whether they have to be measured along with the position.
+    prior_std_px : float, optional
+        Standard deviation of a normal distribution around the true position that the estimator knows from
+        elsewhere: 1 / prior_std_px^2 is added to the information of x and y (van Trees 1968), so the result
+        never exceeds it. Positions uniform within +-a have a standard deviation a / sqrt(3); the bound is
+        then only a guide, since that distribution has edges (R without light is a / 2, not 0.46 a).
+    noise : {"exact", "gaussian"}
+        "exact": information of Poisson electrons plus Gaussian read noise, summed over the number of
+        electrons. "gaussian": the sum over pixels of (dm/dx)^2 / variance; lower information at low light,
+        the same with much light. Behind a multiplication register both are the latter, with twice the photon
+        noise: not a strict bound where it sees single electrons, which could be counted.
+
+    Returns
+    -------
+    ndarray, float64, shape of flux_e + (2,)
+        Standard error along x and along y, px; infinite where the image holds no light.
+
+    Raises
+    ------
+    InputError
+        When a value is not finite, out of its range or of the wrong shape.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> camera = fs.simulate.Detector(read_noise_e=1.0)
+    >>> print(fs.cramer_rao([50.0, 500.0], shape=(8, 8), detector=camera).round(3))
+    [[0.133 0.133]
+     [0.034 0.034]]
+    """
+    flux: Floats = numbers_between("flux_e", flux_e, 0.0, low_open=True)
+    ny, nx = image_shape("shape", shape)
+    if min(ny, nx) < 3:
+        raise InputError(f"shape: expected at least 3 rows and columns, got ({ny}, {nx})")
+    exact = one_of("noise", noise, _NOISES) == "exact"
+    prior = math.inf
+    if prior_std_px is not None:
+        prior = number_between("prior_std_px", prior_std_px, 0.0, low_open=True)
+    where = _positions(positions, position_range_px)
+    if psf is None:
+        form = {"profile": profile, "size": size, "elongation": elongation, "angle_deg": angle_deg}
+        render = functools.partial(spots, shape=(ny, nx), **form)  # type: ignore[arg-type]
+        step = 0.01 * number_between("size", size, 0.0, low_open=True)
+    else:
+        render = functools.partial(psf.images, shape=(ny, nx))
+        step = 0.01
+    spot = _with_derivatives(render, where, step)
+    blur = _noise(detector, (ny, nx), exact)
+    bound = np.empty((*flux.shape, 2))
+    for index in np.ndindex(flux.shape):
+        errors = _standard_errors(float(flux[index]), spot, blur, unknown_flux, unknown_background, prior)
+        bound[index] = errors.mean(axis=0)
+    return bound
+
+
+def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any) -> NDArray[np.float64]:
+    """Return the share of its light that an estimator would need if it reached the Cramer-Rao bound.
+
+    (flux at which the bound's slope error R equals the estimator's) / (flux that the estimator used). 1 is
+    the limit; more means a bias towards the truth, by a prior for example.
+
+    Parameters
+    ----------
+    error_px : float or array_like
+        Slope error R of the estimator: mean of the absolute errors in x and y, px, above 0. For a root mean
+        square error per axis, multiply it by `MEAN_ABSOLUTE`.
+    flux_e : float or array_like
+        Electrons that it used, counted as in `cramer_rao`; broadcast with `error_px`.
+    **conditions
+        Spot, detector, positions and unknowns, as for `cramer_rao`. With `prior_std_px`, errors that the
+        prior alone attains have efficiency 0.
+
+    Returns
+    -------
+    ndarray, float64, shape of error_px and flux_e broadcast
+        Solved on a grid of fluxes with interpolation; good to 1e-3.
+
+    Raises
+    ------
+    InputError
+        As `cramer_rao`, and when the bound reaches the error nowhere between 1e-12 and 1e12 e-.
+
+    Examples
+    --------
+    >>> import faintspot as fs
+    >>> round(float(fs.photon_efficiency(0.1, 100.0)), 2)
+    0.31
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    error: Floats = numbers_between("error_px", error_px, 0.0, low_open=True)
+    used: Floats = numbers_between("flux_e", flux_e, 0.0, low_open=True)
+    try:
+        error, used = np.broadcast_arrays(error, used)
+    except ValueError:
+        raise InputError(f"error_px, flux_e: shapes {error.shape} and {used.shape} do not fit") from None
+
+    def slope_error(flux: Floats) -> Floats:
+        bound: Floats = MEAN_ABSOLUTE * cramer_rao(flux, **conditions).mean(axis=-1)
+        return bound
+
+    low, high = _bracket(slope_error, float(error.min()), float(error.max()), float(np.median(used)))
+    steps = 3 + math.ceil(_FLUX_STEPS_PER_DECADE * math.log10(high / low))
+    grid = np.geomspace(low, high, steps)
+    bounds = slope_error(grid)
+    # A prior alone keeps the bound level up to some flux: the last level one is where the curve starts.
+    first = int(np.argmax(bounds < bounds[0] * (1 - 1e-9))) - 1
+    inverse = PchipInterpolator(-np.log(bounds[first:]), np.log(grid[first:]))
+    needed = np.where(error >= bounds[0], 0.0, np.exp(inverse(-np.log(np.minimum(error, bounds[0])))))
+    efficiency: Floats = needed / used
+    return efficiency
+
+
+def _bracket(slope_error: Any, smallest: float, largest: float, start: float) -> tuple[float, float]:
+    """Return two fluxes: slope errors above `largest` (unless a prior prevents it) and below `smallest`."""
+    low = high = start
+    while slope_error(np.array(low)) < 1.01 * largest and low > 1 / _BRACKET:
+        low /= 10
+    while slope_error(np.array(high)) > 0.99 * smallest:
+        high *= 10
+        if high > _BRACKET:
+            raise InputError(f"error_px = {smallest:g}: expected an error that {_BRACKET:g} e- can reach")
+    return low, high
+
+
+def _positions(positions: Any, position_range_px: float | None) -> Floats:
+    """Return positions (m, 2); for a range, the nodes of a regular grid that stands for it."""
+    if position_range_px is None:
+        array = np.asarray(positions)
+        return position_array(array[None] if array.ndim == 1 else array)
+    half = number_between("position_range_px", position_range_px, 0.0)
+    count = min(4 + math.ceil(4 * half), 24)
+    line = half * ((2 * np.arange(count) + 1) / count - 1)
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+
+
+def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
+    """Return images and their derivatives by four-point differences, good to 1e-7 at this step."""
+    centred = float(np.sum(render(np.zeros((1, 2)))))
+    if not centred > 0:
+        raise InputError("psf: expected images with light in them")
+
+    def flat(shift: Floats) -> Floats:
+        return np.reshape(render(positions + shift), (len(positions), -1)) / centred
+
+    along_x, along_y = (
+        (8 * (flat(axis) - flat(-axis)) - (flat(2 * axis) - flat(-2 * axis))) / (12 * step)
+        for axis in np.eye(2) * step
+    )
+    image = flat(np.zeros(2))
+    # The wings of a learnt spot scatter around zero: where no light is left its slope tells nothing.
+    lit = image > 0
+    return _Spot(np.where(lit, image, 0.0), along_x * lit, along_y * lit)
+
+
+def _noise(detector: Any, shape: tuple[int, int], exact: bool) -> _Noise:
+    """Return the noise of each pixel in photo-electrons, flattened."""
+    if detector is None:
+        detector = Detector(read_noise_e=0.1)
+    if not isinstance(detector, Detector):
+        raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
+    excess = detector.excess_noise_factor
+    # The detector's own account of its noise: electrons of the background are what is left of the variance.
+    dark = detector.variance(np.zeros(shape))
+    converter = detector.gain_e_per_adu**2 / 12 if detector.bits is not None else 0.0
+    read_variance = (np.square(detector.read_noise_e) + converter) / detector.em_gain**2
+    background = np.maximum(dark - read_variance, 0.0) / excess
+    read_noise = np.broadcast_to(np.sqrt(read_variance), shape)
+    return _Noise(read_noise.ravel(), background.ravel(), excess, exact and excess == 1)
+
+
+def _standard_errors(
+    flux: float, spot: _Spot, noise: _Noise, unknown_flux: bool, unknown_background: bool, prior: float
+) -> Floats:
+    """Return the bound on x and y at each position, (m, 2)."""
+    weight = _pixel_information(flux * spot.image + noise.background_e, noise)
+    derivatives = [flux * spot.along_x, flux * spot.along_y]
+    if unknown_flux:
+        derivatives.append(spot.image)
+    if unknown_background:
+        derivatives.append(np.ones_like(spot.image))
+    stack = np.stack(derivatives, axis=1)
+    information = np.einsum("map,mbp,mp->mab", stack, stack, weight, optimize=True)
+    information[:, [0, 1], [0, 1]] += 1 / prior**2
+    # In units of each unknown's own error the matrix is well conditioned at any flux.
+    scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    lit = np.all(scale > 0, axis=1)
+    errors = np.full((len(scale), 2), prior)
+    if lit.any():
+        scale = scale[lit]
+        inverse = np.linalg.inv(information[lit] / (scale[:, :, None] * scale[:, None, :]))
+        errors[lit] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)[:, :2]) / scale[:, :2]
+    return errors
+
+
+def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:
+    """Return the Fisher information of each pixel's value about its mean, 1 / e-^2; (m, pixels)."""
+    if not noise.exact:
+        # The floor keeps pixels without any noise from dividing by zero.
+        variance = noise.excess * mean_e + np.square(noise.read_noise_e)
+        return 1 / np.maximum(variance, _SMALLEST_MEAN_E)
+    information = np.empty_like(mean_e)
+    for read_noise in np.unique(noise.read_noise_e):
+        pixels = noise.read_noise_e == read_noise
+        information[:, pixels] = poisson_gaussian_information(mean_e[:, pixels], float(read_noise))
+    return information
+
+
+def poisson_gaussian_information(mean_e: Floats, read_noise_e: float) -> Floats:
+    """Return the Fisher information about the mean of Poisson electrons with Gaussian read noise, 1 / e-^2.
+
+    With v = mean + read_noise^2 it tends to 1 / v + (read_noise^2 / v)^2 / (2 v^2) at large v, where the
+    second term is the little that the variance tells, and to 1 / mean at small read noise. Tabulated
+    between; good to 5e-4.
+
+    Parameters
+    ----------
+    mean_e : (...) array
+        Mean electrons, from 0.
+    read_noise_e : float
+        Standard deviation of the read noise, from 0.
+    """
+    mean = np.maximum(mean_e, _SMALLEST_MEAN_E)
+    if read_noise_e < _SMALLEST_TABLED_NOISE_E:
+        return 1 / mean
+    variance = mean + read_noise_e**2
+    information: Floats = 1 / variance + np.square(read_noise_e**2 / variance) / (2 * variance**2)
+    low = variance < _LARGEST_TABLED_VARIANCE
+    if low.any():
+        spline = _information_table(read_noise_e)
+        information[low] = np.exp(spline(np.log(mean[low])))
+    return information
+
+
+@functools.lru_cache(maxsize=64)
+def _information_table(read_noise_e: float) -> Any:
+    """Return log information as a spline of log mean.
+
+    p(g) is a sum over electrons k of Poisson(k) Normal(g - k). Since d Poisson(k) / d mean is
+    Poisson(k - 1) - Poisson(k), dp/dmean = p(g - 1) - p(g), and the information, the integral of its square
+    over p, is the integral of p(g - 1)^2 / p(g), minus 1.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.special import gammaln
+
+    log_mean = np.linspace(math.log(_SMALLEST_MEAN_E), math.log(_LARGEST_TABLED_VARIANCE), 160)
+    mean = np.exp(log_mean)
+    per_electron = math.ceil(8 / min(read_noise_e, 1.0))  # samples: the integrand is smooth at this step
+    highest = _LARGEST_TABLED_VARIANCE + 10 * math.sqrt(_LARGEST_TABLED_VARIANCE) + 10 * read_noise_e
+    lowest = -math.ceil(10 * read_noise_e) - 1
+    values = np.arange(lowest * per_electron, math.ceil(highest) * per_electron) / per_electron
+    # More electrons than the largest value, so that p does not end before the integral does.
+    electrons = np.arange(math.ceil(highest + 10 * read_noise_e) + 3)
+    poisson = np.exp(electrons * log_mean[:, None] - mean[:, None] - gammaln(electrons + 1))
+    normal = np.exp(-0.5 * np.square((values - electrons[:, None]) / read_noise_e))
+    density = poisson @ normal / (read_noise_e * math.sqrt(2 * math.pi))
+    before, here = density[:, :-per_electron], density[:, per_electron:]
+    ratio = np.divide(before, here, out=np.zeros_like(before), where=here > 1e-280)
+    information = np.sum(np.square(ratio - 1) * here, axis=1) / per_electron
+    return CubicSpline(log_mean, np.log(information))

@@ -1,0 +1,270 @@
+"""Fixed weights: a slope as a linear combination of the pixels of a sub-aperture, for estimator "window"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.base.checks import finite_array, number_between, numbers_between
+from faintspot.base.errors import InputError
+from faintspot.base.npz import load_fields, save_fields
+
+Floats = NDArray[np.float64]
+
+_FIELDS = ("x", "y", "mean_spot", "light", "index")
+_LARGEST = 1e6  # px, or fractions of the light, for one pixel: beyond, float32 sums say nothing
+_SMALLEST_GAIN = 0.02
+_LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
+_SAME = 1e-6  # of the largest weight: what sums in float32 do not tell apart
+_RIDGE = 1e-6  # of the mean variance of a pixel: keeps the solution finite where there is no noise
+
+
+class WeightedCentre(NamedTuple):
+    """Fixed weights as a centre of gravity c of weighted pixels: the slope is gain (c - reference)."""
+
+    weights: Floats
+    """(n_kinds, ny, nx): of every pixel, at most 1."""
+    gain: Floats
+    """(n_kinds, 2): px, x and y, for a centre of gravity that moves by 1 px."""
+    reference: Floats
+    """(n_kinds, 2): centre of gravity where the slope is 0, px from the window's middle."""
+
+
+@dataclass(frozen=True, eq=False)
+class FixedWeights:
+    """Weights of the pixels of a sub-aperture whose sums are its slopes; immutable.
+
+    A spot whose image is g, in fractions of its light, is at ``sum x (g - mean_spot)`` px from its reference
+    position, and the same in y. Hand-made weights, quad cells and the best linear estimate for a known
+    distribution of spots are all of this form.
+
+    Parameters
+    ----------
+    x, y : (n_kinds, ny, nx) array, or (ny, nx)
+        px, for all of the light in one pixel.
+    mean_spot : (n_kinds, ny, nx) array
+        Fraction of the light that is in each pixel of a spot at the reference.
+    light : (n_kinds, ny, nx) array, optional
+        Weights whose sum is the light. Default: 1 in every pixel where x or y count, over what of the mean
+        spot is there.
+    index : (n_subapertures,) array of int, optional
+        Kind of each sub-aperture. Default: one kind for all.
+
+    Raises
+    ------
+    InputError
+        For a value that is not finite or out of range, or arrays that do not fit together.
+
+    Examples
+    --------
+    >>> import numpy as np, faintspot as fs
+    >>> cell = np.array([[-1.0, 1.0], [-1.0, 1.0]])
+    >>> quad_cell = fs.FixedWeights(0.8 * cell, 0.8 * cell.T, np.full((2, 2), 0.25))
+    """
+
+    x: Any
+    y: Any
+    mean_spot: Any
+    light: Any = None
+    index: Any = None
+
+    def __post_init__(self) -> None:
+        values: dict[str, Any] = {}
+        for name in ("x", "y", "mean_spot"):
+            maps = numbers_between(f"weights.{name}", getattr(self, name), -_LARGEST, _LARGEST)
+            values[name] = (maps[None] if maps.ndim == 2 else maps).astype(np.float64)
+        shape = values["x"].shape
+        if len(shape) != 3:
+            raise InputError(f"weights.x: expected shape (n_kinds, ny, nx), got {shape}")
+        for name in ("y", "mean_spot"):
+            if values[name].shape != shape:
+                raise InputError(f"weights.{name}: expected shape {shape} as x, got {values[name].shape}")
+        values["light"] = _light_weights(values) if self.light is None else self._checked_light(shape)
+        if self.index is not None:
+            kinds = numbers_between("weights.index", self.index, 0, shape[0] - 1, integer=True)
+            if kinds.ndim != 1:
+                raise InputError(f"weights.index: expected shape (n_subapertures,), got {kinds.shape}")
+            values["index"] = kinds.astype(np.int64)
+        for name, array in values.items():
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def _checked_light(self, shape: tuple[int, ...]) -> Floats:
+        maps = numbers_between("weights.light", self.light, -_LARGEST, _LARGEST).astype(np.float64)
+        maps = maps[None] if maps.ndim == 2 else maps
+        if maps.shape != shape:
+            raise InputError(f"weights.light: expected shape {shape} as x, got {maps.shape}")
+        return maps
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """ny, nx of the sub-apertures that they are for, px."""
+        return int(self.x.shape[1]), int(self.x.shape[2])
+
+    def kinds(self, n_subapertures: int) -> NDArray[np.int64]:
+        """Return the kind of each of n sub-apertures.
+
+        Raises
+        ------
+        InputError
+            When they are for another number.
+        """
+        if self.index is None:
+            return np.zeros(n_subapertures, np.int64)
+        if len(self.index) != n_subapertures:
+            raise InputError(
+                f"weights.index: expected {n_subapertures} numbers, one per sub-aperture, "
+                f"got {len(self.index)}"
+            )
+        kinds: NDArray[np.int64] = self.index
+        return kinds
+
+    def weighted_centre(self) -> WeightedCentre:
+        """Return the same as a weighted centre of gravity, divided by the light of the frame.
+
+        Raises
+        ------
+        InputError
+            When x and y do not follow from one map of weights: those of a Gaussian window do.
+        """
+        rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in self.window)
+        counted = (self.x != 0) | (self.y != 0) | (self.light != 0)
+        largest = np.abs(self.light).max(axis=(1, 2), keepdims=True)
+        gains, references = [], []
+        for maps, along in ((self.x, columns), (self.y, rows[:, None])):
+            moved = self.light * along
+            # The best gain and offset of each kind, by least squares.
+            parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.light)]
+            seen = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.light)]
+            determinant = parts[0] * parts[2] - parts[1] ** 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                gain = (parts[2] * seen[0] - parts[1] * seen[1]) / determinant
+                offset = (parts[0] * seen[1] - parts[1] * seen[0]) / determinant
+                rest = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.light)
+                spot = (maps * self.mean_spot).sum(axis=(1, 2))
+                reference = (spot - offset) / gain
+            if not (np.isfinite(gain) & np.isfinite(reference)).all() or not np.all(
+                rest <= _SAME * np.abs(maps).max()
+            ):
+                raise InputError(
+                    "weights: expected one map of weights whose centre of gravity is the slope, as of a "
+                    "Gaussian window, got others in x and y"
+                )
+            gains.append(gain)
+            references.append(reference)
+        weights = np.where(counted, self.light / largest, 0.0)
+        return WeightedCentre(weights, np.stack(gains, axis=1), np.stack(references, axis=1))
+
+    @classmethod
+    def best_linear(
+        cls,
+        images: ArrayLike,
+        positions: ArrayLike,
+        *,
+        flux_e: float,
+        read_noise_e: float,
+        excess_noise: float = 1.0,
+        background_e: float = 0.0,
+    ) -> FixedWeights:
+        """Return the weights with the least mean square error among all that are linear in the pixels.
+
+        The linear minimum-mean-square estimate (e.g. Kay 1993, chapter 12) of a spot's position for the
+        spots of a sample, divided by its gain, so that it measures 1 px for a displacement of 1 px of this
+        sample's spots. A Gaussian window of any width is a special case.
+
+        Parameters
+        ----------
+        images : (n_spots, ny, nx) array
+            Images without noise, or nearly so, in any unit: of simulated residual wavefronts, or recorded in
+            bright light.
+        positions : (n_spots, 2) array
+            Of these spots, px from the reference: what a slope should be.
+        flux_e, read_noise_e : float
+            Light of a spot and read noise to be prepared for, photo-electrons.
+        excess_noise : float
+            Factor on the photon noise's variance.
+        background_e : float
+            Mean photo-electrons per pixel whose mean is taken off and whose noise stays.
+
+        Raises
+        ------
+        InputError
+            For fewer than two spots, images without light, arrays that do not fit together, or positions
+            that do not vary.
+        """
+        spots = finite_array("images", images).astype(np.float64)
+        truth = finite_array("positions", positions).astype(np.float64)
+        if spots.ndim != 3 or len(spots) < 2 or truth.shape != (len(spots), 2):
+            raise InputError(
+                "images, positions: expected shapes (n, ny, nx) and (n, 2), "
+                f"got {spots.shape} and {truth.shape}"
+            )
+        flux = number_between("flux_e", flux_e, 0.0, low_open=True)
+        noise = number_between("read_noise_e", read_noise_e, 0.0)
+        dark = noise**2 + excess_noise * number_between("background_e", background_e, 0.0)
+        light = spots.sum(axis=(1, 2)).mean()
+        if light <= 0:
+            raise InputError(f"images: expected light, got a mean sum of {light:g}")
+        flat = spots.reshape(len(spots), -1) / light
+        mean = flat.mean(axis=0)
+        away, moved = flat - mean, truth - truth.mean(axis=0)
+        if not np.all(moved.std(axis=0) > 0):
+            raise InputError("positions: expected spots that move in x and y, got the same position always")
+        variance = dark + excess_noise * flux * np.maximum(mean, 0.0)
+        covariance = flux**2 * (away.T @ away) / len(flat)
+        covariance[np.diag_indices_from(covariance)] += variance + _RIDGE * variance.mean()
+        crossed = flux * away.T @ moved / len(flat)
+        weights = flux * np.linalg.solve(covariance, crossed)
+        gain = ((away @ weights) * moved).mean(axis=0) / moved.var(axis=0)
+        weights /= np.maximum(gain, _SMALLEST_GAIN)
+        shape = spots.shape[1:]
+        weights[np.abs(weights) < _LEAST_WEIGHT * np.abs(weights).max()] = 0.0
+        along, across = weights.T.reshape(2, *shape)
+        return cls(along, across, mean.reshape(shape), _best_light(mean, variance).reshape(shape))
+
+    def save(self, path: str | Path) -> None:
+        """Write the weights to a file (.npz).
+
+        Raises
+        ------
+        InputError
+            When the file cannot be written.
+        """
+        save_fields(path, self, _FIELDS)
+
+    @classmethod
+    def load(cls, path: str | Path) -> FixedWeights:
+        """Read weights that `save` wrote.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read or holds something else.
+        """
+        return load_fields(cls, path, "fixed weights", _FIELDS, optional=("light", "index"))
+
+
+def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
+    """Products of two maps that their normal equations need."""
+    return (first, first), (first, second), (second, second)
+
+
+def _light_weights(values: dict[str, Any]) -> Floats:
+    """1 where x or y count, over what of the mean spot is there."""
+    counted = ((values["x"] != 0) | (values["y"] != 0)).astype(np.float64)
+    there = (counted * values["mean_spot"]).sum(axis=(1, 2), keepdims=True)
+    if np.any(there <= 0):
+        raise InputError("weights.mean_spot: expected light in the pixels that count, got none")
+    light: Floats = counted / there
+    return light
+
+
+def _best_light(mean: Floats, variance: Floats) -> Floats:
+    """Weights of the light with the least noise, for a spot at its mean."""
+    weights = np.maximum(mean, 0.0) / variance
+    light: Floats = weights / (weights @ mean)
+    return light

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from faintspot.base import toml_files
+from faintspot.base.errors import InputError
+
+
+def refused(path: Path, content: bytes | None, if_missing: str = "") -> str:
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError) as error:
+        toml_files.parse_file(path, if_missing=if_missing)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    return str(error.value).removeprefix(f"{path}: ")
+
+
+def test_values(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text('# a comment\n[table]\nname = "é"\n', encoding="utf-8")
+    assert toml_files.parse_file(path) == {"table": {"name": "é"}}
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    assert refused(path, None) == "no such file"
+    assert refused(path, None, "`make demo` makes one") == "no such file; `make demo` makes one"
+    assert refused(path, b"\xff\xfe") == "not a TOML file: it is not UTF-8 text"
+    assert refused(path, b"a = 1\nb = [1,,2]") == "not a TOML file: Invalid value (at line 2, column 8)"
+    for content in (b"a = 2020-13-45", b"a = " + b"[" * 5000, b"a = " + b"9" * 5000):
+        assert refused(path, content).startswith("not a TOML file: ")
+    assert refused(tmp_path, None) == "cannot be read (Is a directory)"
+
+
+def test_files_that_are_too_large_or_have_no_end(tmp_path: Path) -> None:
+    corners = b"corners = [" + b"[1, 2]," * 10**6 + b"]"
+    assert "expected a TOML file of at most" in refused(tmp_path / "a.toml", corners)
+    os.mkfifo(tmp_path / "pipe.toml")
+    assert refused(tmp_path / "pipe.toml", None) == "expected a regular file, got a named pipe"
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    assert "expected a regular file" in refused(tmp_path / "zero.toml", None)
+
+
+def test_text() -> None:
+    assert toml_files.parse_text("a = 1", "there") == {"a": 1}
+    with pytest.raises(InputError, match=r"^there: not a TOML file"):
+        toml_files.parse_text("a = ", "there")
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"noise_std": 1, "nois_std": 1}, "settings.nois_std: unknown key; did you mean noise_std?"),
+        ({"noise_std": 1, "zzz": 1}, "settings.zzz: unknown key; known: noise_std, rule"),
+        ({"rule": 1}, "settings.noise_std: expected a value, found none"),
+    ],
+)
+def test_keys(table: dict[str, int], message: str) -> None:
+    toml_files.check_keys("settings.", {"noise_std": 1}, ("noise_std", "rule"), required=["noise_std"])
+    with pytest.raises(InputError) as error:
+        toml_files.check_keys("settings.", table, ("noise_std", "rule"), required=["noise_std"])
+    assert str(error.value) == message
+
+
+def test_names() -> None:
+    toml_files.check_known("a.toml: ", "layout", ["layout"], "table")
+    with pytest.raises(InputError, match=r"^a\.toml: layuot: unknown table; did you mean layout\?$"):
+        toml_files.check_known("a.toml: ", "layuot", (name for name in ["layout"]), "table")
+
+
+def test_tables() -> None:
+    assert toml_files.checked_table("psf", {"a": 1}) == {"a": 1}
+    with pytest.raises(InputError, match=r"^psf: expected a table, got 'text'$"):
+        toml_files.checked_table("psf", "text")
