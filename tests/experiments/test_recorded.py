@@ -51,7 +51,7 @@ def test_a_learnt_psf_is_used_and_the_trained_arm_left_out() -> None:
     question = question_from_frames(frames, darks, layout=LAYOUT, flux_e=100.0)
     answer = tune(question, **QUICK)
     assert "trained" in answer.left_out
-    assert answer["ml"].psf is question.psf
+    assert answer["ml"].arm.psf is question.psf
     assert answer["ml"].settings.weight_floor == 1e-3
 
 

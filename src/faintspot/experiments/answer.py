@@ -22,8 +22,6 @@ from faintspot.experiments.statistics import Estimate, SlopeStatistics
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
 from faintspot.sensor.calibration import Calibration
-from faintspot.spots.psf import PSF
-from faintspot.spots.score import Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,16 +51,6 @@ class ArmResult:
     def settings(self) -> Settings:
         """The best settings."""
         return self.arm.settings
-
-    @property
-    def psf(self) -> PSF | None:
-        """What the arm knows of the spot."""
-        return self.arm.psf
-
-    @property
-    def score(self) -> Score | None:
-        """What the arm has learnt."""
-        return self.arm.score
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +186,7 @@ class Answer:
             When the file cannot be written.
         """
         best = self.best
-        for item in (self.question.layout, best.settings, self.calibration, best.psf, best.score):
+        for item in (self.question.layout, best.settings, self.calibration, best.arm.psf, best.arm.score):
             if item is not None:
                 configuration.save(path, item)
         save_tables(path, {"promise": None if self.promise is None else self.promise.to_table()})

@@ -20,8 +20,8 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.loop_arms import ArmKind, Choice
 from faintspot.experiments.loop_results import BudgetResult
-from faintspot.experiments.magnitude import checked_arms, quick_run, tuned_choices, unit_store
-from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
+from faintspot.experiments.magnitude import checked_arms, quick_run, scored, tuned_choices
+from faintspot.experiments.running import Advance, WorkerPool
 from faintspot.experiments.search import QUICK, Search
 
 KIND = "budget"
@@ -121,34 +121,14 @@ def run_budget(
     folder = make_folder(folder)
     flux = configuration.photons
     choices = tuned_choices(configuration, kinds, [flux], search, folder, KIND, place, overwrite=overwrite)
-    runs = range(configuration.run.realisations)
-    units = [
-        Unit(
-            _key(kind, term, run),
-            (kind, configuration, choices[kind.name, flux], term, run),
-            configuration.run.frames,
-        )
-        for kind in kinds
-        for term in TERMS
-        for run in runs
+    columns = [
+        (term, lambda kind, term=term: (configuration, choices[kind.name, flux], term)) for term in TERMS
     ]
-    store = unit_store(folder, KIND, (configuration, search), units, overwrite=overwrite)
-    place.say("scoring")
-    results = run_units(budget_run, units, store, place)
-
-    def of(variable: str) -> Floats:
-        return np.array(
-            [[[results[_key(kind, term, run)][variable] for run in runs] for term in TERMS] for kind in kinds]
-        )
-
+    of = scored(budget_run, kinds, columns, (configuration, search), folder, KIND, place, overwrite=overwrite)
     names, labels = (tuple(getattr(kind, what) for kind in kinds) for what in ("name", "label"))
     result = BudgetResult(names, tuple(TERMS), labels, of("strehl"), of("residual_nm"))
     result.save(folder / BUDGET_FILE)
     return result
-
-
-def _key(kind: ArmKind, term: str, realisation: int) -> str:
-    return f"{kind.name}-{term}-{realisation}"
 
 
 def budget_run(

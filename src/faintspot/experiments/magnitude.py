@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -96,19 +96,23 @@ def run_magnitude(
     )
     folder = make_folder(folder)
     choices = tuned_choices(configuration, kinds, fluxes, search, folder, KIND, place, overwrite=overwrite)
-    units = [
-        Unit(
-            _key(kind, flux, realisation),
-            (kind, with_flux(configuration, flux), choices[kind.name, flux], realisation),
-            configuration.run.frames,
-        )
-        for kind in kinds
+    columns = [
+        (f"{flux:g}", lambda kind, flux=flux: (with_flux(configuration, flux), choices[kind.name, flux]))
         for flux in fluxes
-        for realisation in range(configuration.run.realisations)
     ]
-    store = unit_store(folder, KIND, (configuration, search), units, overwrite=overwrite)
-    place.say("scoring")
-    result = _gathered(configuration, kinds, fluxes, choices, run_units(scored_run, units, store, place))
+    of = scored(scored_run, kinds, columns, (configuration, search), folder, KIND, place, overwrite=overwrite)
+    result = MagnitudeResult(
+        tuple(kind.name for kind in kinds),
+        tuple(kind.label for kind in kinds),
+        np.array(fluxes),
+        configuration.photometry.magnitude(fluxes),
+        of("strehl"),
+        of("centroid_gain"),
+        of("settings")[:, :, 0],
+        np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
+        of("psf").mean(axis=2),
+        configuration.to_text(),
+    )
     result.save(folder / MAGNITUDE_FILE)
     return result
 
@@ -184,6 +188,40 @@ def unit_store(
     )
 
 
+def scored(
+    function: Callable[..., Arrays],
+    kinds: Sequence[ArmKind],
+    columns: Sequence[tuple[str, Callable[[ArmKind], tuple[Any, ...]]]],
+    experiment: tuple[LoopConfiguration, Any],
+    folder: Path,
+    name: str,
+    place: WorkerPool,
+    *,
+    overwrite: bool,
+) -> Callable[[str], NDArray[Any]]:
+    """Run every arm in every column and realisation; return what gathers a variable, (arms, columns, runs).
+
+    A column is its name and what makes the function's arguments between the arm and the realisation.
+    """
+    configuration, _ = experiment
+    runs = range(configuration.run.realisations)
+    units = [
+        Unit(f"{kind.name}-{column}-{run}", (kind, *arguments(kind), run), configuration.run.frames)
+        for kind in kinds
+        for column, arguments in columns
+        for run in runs
+    ]
+    place.say("scoring")
+    store = unit_store(folder, name, experiment, units, overwrite=overwrite)
+    results = run_units(function, units, store, place)
+
+    def gathered(variable: str) -> NDArray[Any]:
+        values = np.array([results[unit.key][variable] for unit in units])
+        return values.reshape(len(kinds), len(columns), len(runs), *values.shape[1:])
+
+    return gathered
+
+
 def scored_run(
     kind: ArmKind,
     configuration: LoopConfiguration,
@@ -241,38 +279,3 @@ def _checked_fluxes(photons: Sequence[float], quick: bool) -> list[float]:
         chosen = np.linspace(0, len(fluxes) - 1, _QUICK_FLUXES).round().astype(int)
         return [fluxes[place] for place in chosen]
     return fluxes
-
-
-def _key(kind: ArmKind, flux: float, realisation: int) -> str:
-    return f"{kind.name}-{flux:g}-{realisation}"
-
-
-def _gathered(
-    configuration: LoopConfiguration,
-    kinds: Sequence[ArmKind],
-    fluxes: Sequence[float],
-    choices: Mapping[tuple[str, float], Choice],
-    results: Mapping[str, Arrays],
-) -> MagnitudeResult:
-    runs = range(configuration.run.realisations)
-
-    def of(variable: str) -> NDArray[Any]:
-        return np.array(
-            [
-                [[results[_key(kind, flux, run)][variable] for run in runs] for flux in fluxes]
-                for kind in kinds
-            ]
-        )
-
-    return MagnitudeResult(
-        tuple(kind.name for kind in kinds),
-        tuple(kind.label for kind in kinds),
-        np.array(fluxes),
-        configuration.photometry.magnitude(fluxes),
-        of("strehl"),
-        of("centroid_gain"),
-        of("settings")[:, :, 0],
-        np.array([[json.dumps(choices[kind.name, flux]) for flux in fluxes] for kind in kinds]),
-        of("psf").mean(axis=2),
-        configuration.to_text(),
-    )
