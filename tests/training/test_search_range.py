@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from faintspot.experiments.search_range import Images, SpotRange, spot_range
 from faintspot.simulate import Detector, subapertures
 from faintspot.spots.psf import PSF
+from faintspot.training.search_range import Images, SpotRange, spot_range
 
 SHAPE, SPOTS = (12, 12), 600
 ANYWHERE = 4.0  # px: as far as spots of this window can be told

@@ -33,7 +33,7 @@ class SpotRange:
 
     Examples
     --------
-    >>> from faintspot.experiments.search_range import SpotRange
+    >>> from faintspot.training.search_range import SpotRange
     >>> SpotRange(quantile_px=1.2, flux_scale=0.9, told=True).told
     True
     """
