@@ -1,4 +1,4 @@
-"""From telemetry to advice, from advice to what is tried, and the journal of both."""
+"""What telemetry of a closed loop tells of star, camera, turbulence and loop, and the journal of it."""
 
 from __future__ import annotations
 
@@ -6,49 +6,118 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.advice.centroid_gain import electrons_of
+from faintspot.advice.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
 from faintspot.advice.known import Known, of_air, of_images
-from faintspot.advice.proposals import Progress, Proposal, Sensor, new_estimators, new_gain, new_light
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
 from faintspot.advice.seen import seen_in_telemetry
-from faintspot.advice.trial import Loop, Verdict, try_on
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, parse_json, write_atomically
-from faintspot.control.configuration import load_control
-from faintspot.control.learnt import INTEGRATOR
+from faintspot.base.toml_files import parse_text
+from faintspot.control.configuration import Control, load_control, prior_std_px
 from faintspot.experiments.statistics import Estimate, mean_by_blocks
-from faintspot.io.telemetry import Telemetry
+from faintspot.io.telemetry import Telemetry, stored_names
 from faintspot.pipeline import configuration
-from faintspot.pipeline.settings import Settings
+from faintspot.pipeline.settings import Settings, option_names
+from faintspot.pipeline.slope_pipeline import SlopePipeline
+from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
+from faintspot.realtime.control_loop import CLOSED
+from faintspot.realtime.private_socket import socket_path
+from faintspot.realtime.telemetry import TelemetryReader
+from faintspot.sensor.calibration import Calibration
+from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 JOURNAL = ".advice.json"
 """After the configuration's name."""
 _MOST_ENTRIES = 1000
 _BLOCK_FRAMES = 50
+_LOOK_S = 0.05
+_MOST_IMAGES = 400
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A loop as its configuration describes it, and the engine that runs it."""
+
+    name: str
+    control: Control
+    layout: Layout
+    calibration: Calibration
+    written: Settings
+    """Settings in the configuration."""
+    known: dict[str, Any]
+    """PSF, score and reference slopes of `SlopePipeline`."""
+
+    @classmethod
+    def load(cls, path: str | Path, name: str) -> Loop:
+        """Read a configuration.
+
+        Raises
+        ------
+        InputError
+            When it has no [control], or cannot be read.
+        """
+        control = load_control(path)
+        if control is None:
+            raise InputError(f"{path}: expected a table [control], as of `faintspot realtime calibrate`")
+        layout, settings, calibration, psf, score = configuration.load_all(path)
+        control.check_fits(len(layout))
+        known = {"psf": psf, "score": score, "reference": control.reference}
+        return cls(name, control, layout, calibration, settings, known)
+
+    def ask(self, command: str, **fields: Any) -> dict[str, Any]:
+        """Ask the engine."""
+        return request(socket_path(self.name), command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
+
+    def running(self, seconds: float, stop: threading.Event) -> tuple[Telemetry, Settings]:
+        """Return telemetry of the running engine from now on, and its settings.
+
+        Raises
+        ------
+        InputError
+            When there is no engine, arms take turns, the loop is not closed, or the engine ends.
+        """
+        if len(self.ask("status")["arms"]) > 1:
+            raise InputError(
+                f"{self.name}: expected no arms in turn; faintspot realtime interleave set ends it"
+            )
+        status = self.ask("loop", action="status")["loop"]
+        if status["state"] != CLOSED:
+            why = status.get("opened_because") or "this engine makes no commands"
+            raise InputError(f"{self.name}: expected a closed loop, it is {status['state']}: {why}")
+        telemetry = _watched(self.name, seconds, stop)
+        values = self.ask("get", names=None)["settings"]
+        given = {name: value for name, value in values.items() if value is not None}
+        return telemetry, Settings(given.pop("estimator"), **given)
+
+    def centroid_gain(self, settings: Settings, frames_e: NDArray[np.float32]) -> Estimate | None:
+        """Return by how much slopes grow with the spots' motion, after the control has divided them."""
+        plain = calibration_of_electrons(self.calibration)
+        pipeline = SlopePipeline(self.layout, settings, plain, threads=1, **self.known)
+        found = shifted_gain(pipeline, frames_e, prior_std_px(settings, self.layout))
+        divisor = self.control.options.centroid_gain
+        if found is None:
+            return None
+        return Estimate(found.value / divisor, found.standard_error / divisor, count=found.count)
+
+
+@dataclass(frozen=True, eq=False)
 class Advice:
-    """What telemetry tells, what may be better, and what has become of it."""
+    """Measurements of a closed loop."""
 
     frames: int
     known: list[Known]
-    proposals: list[Proposal]
-    verdicts: list[Verdict] = field(default_factory=list)
-    """Of the proposals, in their order, as far as they were tried."""
 
-    def entry(self, name: str, unit: str) -> dict[str, Any]:
+    def entry(self, name: str) -> dict[str, Any]:
         """Return it as plain values, for the journal."""
-        entry: dict[str, Any] = {
+        return {
             "unix_time_s": time.time(),
             "name": name,
             "frames": self.frames,
@@ -57,115 +126,64 @@ class Advice:
                 | {"unit": each.unit, "remark": each.remark}
                 for each in self.known
             ],
-            "proposals": [{"change": each.text, "promise": each.promise} for each in self.proposals],
         }
-        for proposal, verdict in zip(entry["proposals"], self.verdicts, strict=False):
-            difference = verdict.difference
-            proposal["tried"] = {
-                "leaves_more": _plain(difference.value),
-                "error": _plain(difference.standard_error),
-                "interval": [_plain(difference.low), _plain(difference.high)],
-                "of": _plain(verdict.left),
-                "unit": f"({unit})^2",
-                "kept": verdict.kept,
-                "words": verdict.in_words(unit),
-            }
-        return entry
 
 
-def loop_of(path: str | Path, name: str) -> tuple[Loop, Settings]:
-    """Return the loop that a configuration describes, and the settings in the file.
-
-    Raises
-    ------
-    InputError
-        When it has no [control], or cannot be read.
-    """
-    control = load_control(path)
-    if control is None:
-        raise InputError(f"{path}: expected a table [control], as of `faintspot realtime calibrate`")
-    layout, settings, calibration, psf, score = configuration.load_all(path)
-    control.check_fits(len(layout))
-    modes, unit = wavefront_modes(layout)
-    sensor = Sensor(layout, calibration, psf, score, control.reference)
-    return Loop(name, control, sensor, modes, unit), settings
-
-
-def advise(
-    loop: Loop,
-    telemetry: Telemetry,
-    settings: Settings,
-    gain: float | None,
-    progress: Progress | None = None,
-) -> Advice:
-    """Say what telemetry of a closed loop tells, and what may be better.
+def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
+    """Measure flux, noise, spots, centroid gain, turbulence and residual wavefront from telemetry.
 
     Parameters
     ----------
     loop : Loop
     telemetry : faintspot.io.Telemetry
-        Of one arm.
+        Of a closed loop, with one state of the settings.
     settings : Settings
         With which it was measured.
-    gain : float, optional
-        The loop gain; None where the controller has none.
-    progress : callable, optional
-        Called with the planner's finished steps and all of them.
 
     Raises
     ------
     InputError
-        For telemetry that tells nothing of a closed loop.
+        For telemetry without frames of a closed loop, or of several arms.
     """
     arms = np.unique(telemetry.arm)
     if not len(arms):
         raise InputError(f"{loop.name}: expected frames of a closed loop, none came")
     if len(arms) != 1:
         raise InputError(f"telemetry: expected one state of the settings, found {len(arms)} in turn")
-    sensor, layout = loop.sensor, loop.sensor.layout
-    prior = loop.prior_px(settings)
-    seen = seen_in_telemetry(telemetry, loop.control, [prior] * (int(arms[0]) + 1))
-    frames = electrons_of(telemetry.raw, sensor.calibration)
+    layout, number = loop.layout, int(arms[0]) + 1
+    seen = seen_in_telemetry(telemetry, loop.control, [prior_std_px(settings, layout)] * number)
+    frames = electrons_of(telemetry.raw, loop.calibration)
     shifted = loop.centroid_gain(settings, frames)
-    known, psf = of_images(frames, layout, sensor.calibration)
+    known, _ = of_images(frames, layout, loop.calibration)
     gain_known = Known("centroid gain", "", remark="too few images")
     if shifted is not None:
         remark = "over the one that the control divides by"
         gain_known = Known("centroid gain", "", shifted.value, shifted.standard_error, remark)
-    gains = [shifted.value if shifted is not None and shifted.value > 0 else 1.0] * (int(arms[0]) + 1)
-    left = residual_wavefront(seen, loop.modes, gains)
-    known += [gain_known, *of_air(seen, layout, gains), _residual(left, loop.unit)]
-    light = known[0]
-    proposals: list[Proposal | None] = []
-    if math.isfinite(light.value):
-        proposals.append(new_light(settings, light.value, light.error))
-    if gain is not None and loop.control.options.controller == INTEGRATOR:
-        proposals.append(new_gain(seen, loop.control.plant, loop.modes, gain, loop.unit, gains[0]))
-    if math.isfinite(light.value):
-        residual, _ = seen.weighted(gains)
-        rms = float(np.sqrt(np.median(np.square(residual).mean(axis=1))))
-        answers = gains[0] * loop.control.options.centroid_gain
-        proposals += new_estimators(settings, sensor, frames, light.value, psf, rms, answers, progress)
-    return Advice(len(seen), known, [each for each in proposals if each is not None])
+    gains = [shifted.value if shifted is not None and shifted.value > 0 else 1.0] * number
+    modes, unit = wavefront_modes(layout)
+    left = residual_wavefront(seen, modes, gains)
+    return Advice(len(seen), [*known, gain_known, *of_air(seen, layout, gains), _residual(left, unit)])
 
 
-def apply(
-    loop: Loop, advice: Advice, seconds: float, stop: threading.Event, say: Callable[[str], None]
-) -> None:
-    """Try the proposals on the running loop, one after the other; each builds on those that were kept.
+def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Settings]:
+    """Return a recording without a closed loop before its last change, and its last settings.
 
-    Raises
-    ------
-    InputError
-        When the engine ends or is not as it is expected.
+    Parameters
+    ----------
+    telemetry : faintspot.io.Telemetry
+    gain : float
+        Loop gain to begin with.
     """
-    for proposal in advice.proposals:
-        if stop.is_set():
-            return
-        say(f"trying {proposal.text} for at most {seconds:g} s")
-        verdict = try_on(loop, proposal, seconds, stop)
-        advice.verdicts.append(verdict)
-        say(f"  {verdict.in_words(loop.unit)}")
+    document = parse_text(telemetry.attributes["settings"], "settings of the recording")
+    settings, first = Settings.from_tables("settings of the recording", document), -1
+    for change in telemetry.changes:
+        values = change["changes"]
+        if values.get("gain") not in (None, gain):
+            gain, first = values["gain"], max(first, change["frame"])
+        if values and set(values) <= set(option_names()):
+            settings = settings.replace(where=change["where"], **values)
+            first = max(first, change["frame"])
+    return replace(telemetry, loop=np.where(telemetry.frame > first, telemetry.loop, 0)), settings
 
 
 def write_journal(path: str | Path, entry: dict[str, Any]) -> Path:
@@ -188,6 +206,33 @@ def write_journal(path: str | Path, entry: dict[str, Any]) -> Path:
     text = json.dumps([*entries, entry][-_MOST_ENTRIES:], indent=1)
     write_atomically(place, text)
     return place
+
+
+def _watched(name: str, seconds: float, stop: threading.Event) -> Telemetry:
+    """Return what an engine measures from now on, for so long or until `stop` is set."""
+    reader = TelemetryReader.attach(name)
+    try:
+        cursors = [reader.newest, reader.newest_image]
+        records: list[NDArray[Any]] = [np.empty(0, reader.record_type)]
+        images: list[NDArray[Any]] = [np.empty(0, reader.image_type)]
+        end, going_on = time.monotonic() + seconds, True
+        while going_on:
+            going_on = not stop.wait(_LOOK_S) and time.monotonic() < end
+            some, cursors[0], _ = reader.records_since(cursors[0])
+            records.append(some)
+            if sum(map(len, images)) < _MOST_IMAGES:
+                some, cursors[1], _ = reader.images_since(cursors[1])
+                images.append(some)
+            if reader.stale and not stop.is_set():
+                raise InputError(f"{name}: the engine has ended")
+        arrays = {
+            field: np.concatenate([each[field] for each in parts])
+            for parts in (records, images)
+            for field in stored_names(parts[0].dtype)
+        }
+        return Telemetry(**arrays, changes=[], attributes=dict(reader.description))
+    finally:
+        reader.close()
 
 
 def _residual(left: Floats, unit: str) -> Known:
