@@ -19,18 +19,14 @@ from benchmarks import rivals
 from benchmarks.measuring import Row, Table, Times, absolute_spread
 from faintspot.base.errors import InputError, MissingExtraError
 
-N, SENSORS = 4616, 6
-RATE_HZ, SECONDS = 1000.0, 5.0
+N = 4616
 KERNEL_US, HOST_US, FAST_US = 60.0, 150.0, 45.0
-TURNS = 20
 COMMAND = "pip install 'faintspot[gpu]' && python -m benchmarks gpu"
 
 
-def _seconds(
-    run: Callable[[], Any], wait: Callable[[], None], turns: int = TURNS, warm_up: int = 3
-) -> NDArray[np.float64]:
+def _seconds(run: Callable[[], Any], wait: Callable[[], None], turns: int) -> NDArray[np.float64]:
     """Time calls one after the other, each until the GPU has done it."""
-    for _ in range(warm_up):
+    for _ in range(3):
         run()
     wait()
     times = np.empty(turns)
@@ -50,8 +46,8 @@ def _kernel_seconds(pipeline: fs.SlopePipeline, frame: NDArray[Any], launches: i
     assert work is not None
     frames, variants = cuda.to_device(frame[None]), cuda.to_device(np.zeros(1, np.int32))
     results, stream = work.new_results(1), cuda.stream()
-    times = np.empty(TURNS)
-    for turn in range(-1, TURNS):  # the first one warms up
+    times = np.empty(20)
+    for turn in range(-1, len(times)):  # the first one warms up
         start, stop = cuda.event(), cuda.event()
         start.record(stream)
         for _ in range(launches):
@@ -68,31 +64,6 @@ def _stream(pipeline: fs.SlopePipeline, frame: NDArray[Any]) -> Any:
     stream = FrameStream(pipeline, frame.dtype)
     stream.frame[:] = frame
     return stream
-
-
-def _sustained(pipeline: fs.SlopePipeline, frame: NDArray[Any]) -> Row:
-    """Several sensors, at a fixed rate; a frame is late that is not done before the next."""
-    streams = [_stream(pipeline, frame) for _ in range(SENSORS)]
-    count = int(SECONDS * RATE_HZ)
-    taken = np.empty((count, SENSORS))
-    begin = time.perf_counter() + 0.01
-    for i in range(count):
-        due = begin + i / RATE_HZ
-        while time.perf_counter() < due:
-            pass
-        for stream in streams:
-            stream.submit()
-        for k, stream in enumerate(streams):
-            stream.wait()
-            taken[i, k] = time.perf_counter() - due
-    late = int(np.count_nonzero(taken > 1.0 / RATE_HZ))
-    values = {
-        "median us": float(np.median(taken)) * 1e6,
-        "p99.9 us": float(np.quantile(taken, 0.999)) * 1e6,
-        "frames": float(taken.size),
-        "late": float(late),
-    }
-    return Row(f"{SENSORS} sensors at {RATE_HZ:g} Hz", values, "late <= 0", late == 0, better="lower")
 
 
 def _timed(case: rivals.Problem, frame: NDArray[Any], preset: str) -> list[Row]:
@@ -132,9 +103,7 @@ def _measured() -> list[Row]:
     """Measure on the GPU that is here."""
     case = rivals.problem(N)
     frame = np.clip(np.rint(case.frame), 0, 65535).astype(np.uint16)
-    rows, fast = (_timed(case, frame, preset) for preset in ("accurate", "fast"))
-    pipeline = fs.SlopePipeline(case.layout, case.pipeline.settings, device="cuda")
-    return [*rows, *fast, _sustained(pipeline, frame)]
+    return [row for preset in ("accurate", "fast") for row in _timed(case, frame, preset)]
 
 
 def _missing() -> str | None:
@@ -154,8 +123,4 @@ def run() -> list[Table]:
     missing = _missing()
     if missing is not None:
         return [Table("gpu", title, [], [f"not measured: {missing}", f"on a machine with a GPU: {COMMAND}"])]
-    notes = ["ratio: time of the other program to that of faintspot's kernel"]
-    notes += [
-        f"not installed: {package}" for package in ("cupy", "torch", "cucim") if not rivals.available(package)
-    ]
-    return [Table("gpu", title, _measured(), notes)]
+    return [Table("gpu", title, _measured())]

@@ -17,7 +17,6 @@ PACKAGES = (
     "numba",
     "llvmlite",
     "jax",
-    "torch",
     "scikit-image",
     "pyrtcao",
     "hcipy",

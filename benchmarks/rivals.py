@@ -8,7 +8,7 @@ handed the stack of images, ready made.
   does not solve the constrained problem, so that something else would have to find the weight). It makes 20
   iterations of Chambolle's algorithm (`eps=0`, the last update is not used), which come less close to the
   solution than 20 of faintspot's; its positions are therefore compared where both have converged.
-- NumPy, JAX and PyTorch: faintspot's algorithm, see rival_numpy.py, rival_jax.py and rival_torch.py. All
+- NumPy and JAX: faintspot's algorithm, see rival_numpy.py and rival_jax.py. All
   images at once, and in blocks that fit the cache; the faster one counts.
 - C++: only the sweep, see sweep.cpp.
 
@@ -35,11 +35,9 @@ from faintspot.estimators import estimator_named
 ITERATIONS, KEEP, NOISE_STD, FLUX_E = 20, 12, 0.45, 200.0
 NUMPY_BLOCKS = (64, 128, 256, 512)
 JAX_BLOCKS = (64, 128, 256)
-TORCH_BLOCKS = (64,)  # each takes half a minute to compile; 128 and 256 cost 3 and 25 % more
 MODULES = {
     "skimage": "scikit-image",
     "jax": "jax",
-    "torch": "torch",
 }
 """Optional rivals: what to import, and what to install."""
 SKIMAGE_IMAGES = 36  # takes one image after the other: so many tell the time of one
@@ -133,13 +131,6 @@ def jax_rival(case: Problem, block: int) -> Callable[[], Any]:
     return make(case.images, block, NOISE_STD, KEEP, ITERATIONS)
 
 
-def torch_rival(case: Problem, block: int) -> Callable[[], Any]:
-    """Return the PyTorch version, in blocks of `block` images."""
-    from benchmarks.rival_torch import torch_rival as make
-
-    return make(case.images, block, NOISE_STD, KEEP, ITERATIONS)
-
-
 def skimage_rival(images: NDArray[Any], weights: NDArray[Any], iterations: int) -> Callable[[], NDArray[Any]]:
     """Return scikit-image's denoising in a loop, then the same NumPy code as in the NumPy version."""
     from skimage.restoration import denoise_tv_chambolle
@@ -169,7 +160,6 @@ def skimage_difference(case: Problem, count: int = 4, iterations: int = 2000) ->
 SAME_ALGORITHM: dict[str, tuple[str, Callable[[Problem, int], Candidate], tuple[int, ...]]] = {
     "NumPy": ("numpy", numpy_rival, NUMPY_BLOCKS),
     "JAX": ("jax", jax_rival, JAX_BLOCKS),
-    "PyTorch": ("torch", torch_rival, TORCH_BLOCKS),
 }
 """What to import, how to make it run, and its block sizes."""
 
@@ -198,9 +188,7 @@ def _check(name: str, differs: float, limit: float) -> float:
 def _fastest(case: Problem, name: str, make: Callable[[Problem, int], Candidate], blocks: Any) -> Any:
     """Return the fastest of a rival's block sizes, in words and ready to run; all are shown to be right."""
     n = len(case.images)
-    sizes = [b for b in blocks if b < n]
-    if name != "PyTorch" or not sizes:  # it takes too long to compile for what is never the fastest
-        sizes.append(n)
+    sizes = [*(b for b in blocks if b < n), n]
     rivals = {block: make(case, block) for block in sizes}
     for rival in rivals.values():
         _check(name, difference(case, rival), SAME_POSITION_PX)
@@ -210,7 +198,7 @@ def _fastest(case: Problem, name: str, make: Callable[[Problem, int], Candidate]
 
 
 def _same_algorithm(n: int) -> tuple[list[Row], list[str]]:
-    """Compare with NumPy, JAX and PyTorch; also return in words which block sizes were the fastest."""
+    """Compare with NumPy and JAX; also return in words which block sizes were the fastest."""
     case, rivals, fastest = problem(n), {}, []
     for name, (module, make, blocks) in SAME_ALGORITHM.items():
         if available(module):
@@ -294,6 +282,6 @@ def run() -> list[Table]:
         if available("jax"):
             used = _threads_used(jax_rival(problem(36), 36))
             notes.append(f"JAX used {used:.2f} threads")
-        notes += _missing("skimage", "jax", "torch")
+        notes += _missing("skimage", "jax")
         title = "Frame to slopes, one thread: faintspot against others"
         return [Table("rivals", title, rows, notes), _against_cpp()]

@@ -6,7 +6,6 @@ import shutil
 
 import pytest
 from benchmarks import rivals, study, sweeps
-from benchmarks.rival_torch import torch_rival
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +22,6 @@ def test_numpy_gives_the_same_positions(case: rivals.Problem, block: int) -> Non
 def test_jax_gives_the_same_positions(case: rivals.Problem, block: int) -> None:
     pytest.importorskip("jax")
     assert rivals.difference(case, rivals.jax_rival(case, block)) <= rivals.SAME_POSITION_PX
-
-
-@pytest.mark.parametrize("block", [8, 20])
-def test_torch_gives_the_same_positions(case: rivals.Problem, block: int) -> None:
-    pytest.importorskip("torch")
-    rival = torch_rival(
-        case.images, block, rivals.NOISE_STD, rivals.KEEP, rivals.ITERATIONS, compiled=False
-    )  # compiling takes half a minute, and changes nothing but rounding
-    assert rivals.difference(case, rival) <= rivals.SAME_POSITION_PX
 
 
 @pytest.mark.parametrize("n", list(rivals.GRIDS))
