@@ -154,7 +154,7 @@ def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
     seen = seen_in_telemetry(telemetry, loop.control, [prior_std_px(settings, layout)] * number)
     frames = electrons_of(telemetry.raw, loop.calibration)
     shifted = loop.centroid_gain(settings, frames)
-    known, _ = of_images(frames, layout, loop.calibration)
+    known = of_images(frames, layout, loop.calibration)
     gain_known = Known("centroid gain", "", remark="too few images")
     if shifted is not None:
         remark = "over the one that the control divides by"

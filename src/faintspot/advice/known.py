@@ -16,7 +16,6 @@ from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
 from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import learn_psf_from_images
 from faintspot.turbulence.seeing import estimate_r0
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
@@ -58,10 +57,8 @@ class Known:
         return f"{self.name}: {self.value:.3g}{error} {self.unit}".rstrip() + remark
 
 
-def of_images(
-    frames_e: NDArray[np.float32], layout: Layout, calibration: Calibration
-) -> tuple[list[Known], PSF | None]:
-    """Return light, read noise and width of the spots from frames in electrons; and the PSF learnt.
+def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibration) -> list[Known]:
+    """Return flux, read noise and spot width from frames in electrons.
 
     Parameters
     ----------
@@ -74,7 +71,7 @@ def of_images(
     noise, width = ("read noise", "e-"), ("width of the spots", "px, with the pixel and the mean speckles")
     if len(frames_e) < _FEWEST_IMAGES:
         why = f"{len(frames_e)} images in telemetry, expected {_FEWEST_IMAGES}: images-every"
-        return [Known(*each, remark=why) for each in (light, noise, width)], None
+        return [Known(*each, remark=why) for each in (light, noise, width)]
     images = layout.images(frames_e)
     pixels = images.shape[-2] * images.shape[-1]
     background = calibration.background_e * pixels
@@ -93,8 +90,8 @@ def of_images(
         spots = images.reshape(-1, *images.shape[-2:])
         psf = learn_psf_from_images(spots, calibration=plain, rng=np.random.default_rng(1)).psf
     except InputError as error:
-        return [*found, Known(*width, remark=str(error))], None
-    return [*found, Known(*width, float(psf.fwhm_px.mean()))], psf
+        return [*found, Known(*width, remark=str(error))]
+    return [*found, Known(*width, float(psf.fwhm_px.mean()))]
 
 
 def of_air(seen: Seen, layout: Layout, gains: Sequence[float] | None = None) -> list[Known]:
