@@ -59,7 +59,7 @@ def _kernel_seconds(pipeline: fs.SlopePipeline, frame: NDArray[Any], launches: i
 
 
 def _stream(pipeline: fs.SlopePipeline, frame: NDArray[Any]) -> Any:
-    from faintspot.cuda import FrameStream
+    from faintspot.pipeline.device_stream import FrameStream
 
     stream = FrameStream(pipeline, frame.dtype)
     stream.frame[:] = frame

@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import faintspot as fs
+from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.data import mmt_frame
 from faintspot.sensor.found_layout import find_layout
-from faintspot.sensor.hot_pixels import find_hot_pixels
 
 frame = mmt_frame()
 hot = find_hot_pixels(frame)

@@ -33,7 +33,7 @@ print(answer.best.settings)
 # The slope error of every estimator against magnitude, with the limit that the photons set (Cramer-Rao),
 # and where a small change of magnitude changes the choice:
 
-figure = answer.figure()
+figure = fs.experiments.tune_figure(answer)
 
 # %%
 # What a magnitude means on the sky

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from faintspot.base.lazy import lazy_attributes
+from faintspot.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from faintspot import estimators as estimators
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from faintspot.base.errors import InputError as InputError
     from faintspot.base.errors import MissingExtraError as MissingExtraError
     from faintspot.base.flags import SubapertureFlag as SubapertureFlag
+    from faintspot.camera.calibration import Calibration as Calibration
+    from faintspot.camera.photon_transfer import measure_detector as measure_detector
     from faintspot.experiments import tune as tune
     from faintspot.pipeline.images import measure_images as measure_images
     from faintspot.pipeline.mean_flux import MeanFlux as MeanFlux
@@ -24,9 +27,7 @@ if TYPE_CHECKING:
     from faintspot.pipeline.slope_pipeline import SlopePipeline as SlopePipeline
     from faintspot.pipeline.slopes import Slopes as Slopes
     from faintspot.pipeline.slopes import Stages as Stages
-    from faintspot.sensor.calibration import Calibration as Calibration
     from faintspot.sensor.layout import Layout as Layout
-    from faintspot.sensor.photon_transfer import measure_detector as measure_detector
     from faintspot.spots.bounds import cramer_rao as cramer_rao
     from faintspot.spots.bounds import photon_efficiency as photon_efficiency
     from faintspot.spots.fixed_weights import FixedWeights as FixedWeights
@@ -38,11 +39,9 @@ if TYPE_CHECKING:
     from faintspot.wavefront import Wavefront as Wavefront
     from faintspot.wavefront import fit_wavefront as fit_wavefront
 
-__version__ = "0.1.0"
-
 # Where each public name lives. They are imported at first use: `import faintspot` itself stays fast.
 _HOMES = {
-    "Calibration": "faintspot.sensor.calibration",
+    "Calibration": "faintspot.camera.calibration",
     "Denoised": "faintspot.algorithms.total_variation",
     "FixedWeights": "faintspot.spots.fixed_weights",
     "InputError": "faintspot.base.errors",
@@ -66,7 +65,7 @@ _HOMES = {
     "fit_wavefront": "faintspot.wavefront",
     "learn_psf": "faintspot.training",
     "measure_images": "faintspot.pipeline.images",
-    "measure_detector": "faintspot.sensor.photon_transfer",
+    "measure_detector": "faintspot.camera.photon_transfer",
     "photon_efficiency": "faintspot.spots.bounds",
     "simulate": "faintspot.simulate",
     "train_estimator": "faintspot.training",

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from faintspot import __version__
 from faintspot.base.extras import EXTRAS, SHARED_MEMORY, present
+from faintspot.base.version import __version__
 
 _REQUIRED = ("numpy", "scipy", "numba", "llvmlite", "tomlkit", "click", "rich")
 _NETWORK = ("nfs", "cifs", "smb", "lustre", "gpfs", "beegfs", "ceph", "afs", "fuse.sshfs", "9p")

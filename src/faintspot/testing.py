@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.flags import INVALID
+from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.registry import estimator_named
 from faintspot.estimators.scene import Scene
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score

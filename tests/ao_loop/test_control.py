@@ -61,15 +61,15 @@ def test_never_below_the_integrator(told: float, kinds: list[str]) -> None:
 
 
 def test_the_filter_s_certainty_is_the_estimator_s_prior() -> None:
-    arm, learnt = learnt_control(FAINT, _arm("kalman"), 1)
+    arm, learnt = learnt_control(FAINT, _arm("kalman"), 1, simulate_loop)
     assert learnt is not None
     assert learnt.expected_std_px is not None
     prior = getattr(arm.settings, PRIOR)
     np.testing.assert_allclose(
         np.square(prior), np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0)
     )
-    assert learnt_control(FAINT, _arm("kalman"), 1)[1] is learnt  # learnt once
-    assert learnt_control(FAINT, _arm(), 1)[1] is None
+    assert learnt_control(FAINT, _arm("kalman"), 1, simulate_loop)[1] is learnt  # learnt once
+    assert learnt_control(FAINT, _arm(), 1, simulate_loop)[1] is None
 
 
 def test_telemetry_knows_what_was_expected() -> None:

@@ -11,6 +11,7 @@ from tests.cli.cli_cases import CONFIGURATION, Commands, simulated
 
 from faintspot import Layout
 from faintspot.io import read_slopes
+from faintspot.pipeline.slopes import Slopes
 from faintspot.wavefront import fit_wavefront
 
 SCALES = ("--pixel-scale", 0.4, "--diameter", 4.2)
@@ -31,7 +32,7 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
     assert "mean wavefront" in out
     assert f"picture: {slopes.parent / 'slopes_wavefront.png'}" in out
     layout = Layout.grid((4, 4), pixels=8, pixel_scale_arcsec=0.4, diameter_m=4.2)
-    expected = fit_wavefront(read_slopes(slopes).slopes, layout)
+    expected = fit_wavefront(Slopes.from_variables(read_slopes(slopes).variables), layout)
     written = json.loads(Path("w.json").read_text())
     assert written["unit"] == "nm"
     assert [mode["noll"] for mode in written["mean"]["modes"]] == list(range(2, 11))

@@ -10,12 +10,12 @@ import pytest
 from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
 
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman
 from faintspot.control.configuration import Control, ControlOptions
 from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
 from faintspot.control.learnt import Learnt, Model
-from faintspot.sensor.calibration import Calibration
 
 KINDS = [kind for kind in CONTROLS if kind != INTEGRATOR]
 FRAMES = telemetry(600, 0.3)

@@ -11,7 +11,8 @@ from tests.experiments.planner_cases import answered
 from faintspot import Calibration, InputError, Layout, Settings, SlopePipeline
 from faintspot.estimators import estimators
 from faintspot.experiments import answer_text
-from faintspot.experiments.answer import Answer
+from faintspot.experiments.answer import Answer, settings_in_words
+from faintspot.experiments.answer_figures import tune_figure
 from faintspot.experiments.statistics import Estimate, slope_error
 from faintspot.simulate import Detector, sensor_frames
 
@@ -100,9 +101,9 @@ def test_gains_beyond_the_range_are_said_to_be_so() -> None:
 
 
 def test_settings_in_words_name_what_is_not_the_default() -> None:
-    tv = answer_text.settings_in_words(Settings("tv", noise_std=1.5, keep_brightest=12, preset="fast"))
+    tv = settings_in_words(Settings("tv", noise_std=1.5, keep_brightest=12, preset="fast"))
     assert tv == 'estimator "tv", keep_brightest 12, noise_std 1.5, preset "fast"'
-    assert answer_text.settings_in_words(Settings("brightest")) == 'estimator "brightest"'
+    assert settings_in_words(Settings("brightest")) == 'estimator "brightest"'
 
 
 def test_the_limit_is_sought_beyond_the_plot() -> None:
@@ -125,7 +126,7 @@ def test_a_budget_that_no_star_is_too_faint_for() -> None:
 
 def test_the_figure_shows_every_arm_and_the_limit() -> None:
     answer = answered(budget="0.1")
-    axes = answer.figure().axes[0]
+    axes = tune_figure(answer).axes[0]
     labels = axes.get_legend_handles_labels()[1]
     assert len(labels) == len(answer.results) + 2  # the bound, and no estimate at all
     assert any("recommended" in label for label in labels)

@@ -20,6 +20,7 @@ from tests.experiments.loop_answer_cases import (
 from faintspot.ao_loop.configuration import load_loop
 from faintspot.base.errors import InputError
 from faintspot.experiments import loop_text
+from faintspot.experiments.answer_figures import loop_figure
 from faintspot.experiments.loop_answer import LoopAnswer
 from faintspot.experiments.loop_question import MODEL_ERROR, sky_coverage
 from faintspot.pipeline import configuration as configuration_file
@@ -186,7 +187,7 @@ def test_saved_settings_and_loop_can_be_loaded(tmp_path: Path) -> None:
 
 def test_figure() -> None:
     pytest.importorskip("matplotlib")
-    figure = made_up().figure()
+    figure = loop_figure(made_up())
     left, right = sorted(figure.axes, key=lambda axes: axes.get_position().x0)
     assert left.get_ylabel() == "Strehl ratio at 1.65 µm"
     assert len(right.patches) == 3 * len(SHIFTS)

@@ -21,9 +21,9 @@ from tests.io.slope_files import result, write
 
 from faintspot.base.errors import InputError
 from faintspot.base.npz import read_arrays
+from faintspot.camera.calibration import Calibration
 from faintspot.io import inflation, open_frames, raw, read_array, read_slopes, slopes_format
 from faintspot.io.references import read_reference
-from faintspot.sensor.calibration import Calibration
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore
 

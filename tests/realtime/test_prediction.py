@@ -39,7 +39,9 @@ def test_the_kalman_filter_s_loop_is_the_simulated_one(sky: Sky, tmp_path: Path)
     path, control = configured(tmp_path, SETTINGS, run, "kalman")
     assert (control.prediction, control.options.centroid_gain) == ("controller", 1.0)
     arm = Arm("-", SETTINGS, predict_prior=True, correct_gain=False, control="kalman")
-    told, _ = learnt_control(run, arm, run.run.seed)  # the first frame's prior, too, is as wide
+    told, _ = learnt_control(
+        run, arm, run.run.seed, simulate_loop
+    )  # the first frame's prior, too, is as wide
     record = simulate_loop(run, [arm])
     sky.start(make_engine(sky.name, path, control, settings=told.settings))
     sky.loop.close()

@@ -37,8 +37,8 @@ from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.private_socket import TELESCOPE, socket_path
-from faintspot.realtime.telescope import TRUTH, SimulatedTelescope
-from faintspot.realtime.telescope_orders import ORDERS, Conditions, commands_of
+from faintspot.realtime.telescope import TRUTH, SimulatedTelescope, commands_of
+from faintspot.realtime.telescope_orders import ORDERS, Conditions
 
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")

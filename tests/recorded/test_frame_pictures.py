@@ -62,7 +62,7 @@ def test_invalid_positions_are_not_marked() -> None:
 
 
 def test_raw_in_electrons_is_recognised() -> None:
-    from faintspot.sensor.calibration import Calibration
+    from faintspot.camera.calibration import Calibration
 
     layout = sensor()
     frame = simulated(layout, 1)[0][0]

@@ -12,7 +12,7 @@ from tests.cli.cli_cases import CONFIGURATION, LAYOUT, assert_equal, expected, s
 import faintspot
 from faintspot import InputError, SubapertureFlag
 from faintspot.io import read_slopes
-from faintspot.recorded import Summary, measure_recorded, slopes_as_variables
+from faintspot.recorded import Summary, measure_recorded
 
 
 @pytest.fixture
@@ -148,7 +148,7 @@ def test_summary_counts_flags() -> None:
     assert summary.flag_counts[SubapertureFlag.NO_LIGHT] == 16
     assert summary.bad_frames == 1
     assert summary.measured == 480
-    assert set(slopes_as_variables(expected(frames))) == {
+    assert set(expected(frames).variables) == {
         *("x", "y", "flux", "valid", "flags", "iterations", "bad_pixels"),
         *("standard_error_x", "standard_error_y"),
     }

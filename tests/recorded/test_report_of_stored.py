@@ -13,13 +13,13 @@ import pytest
 from tests.recorded.recorded_cases import SETTINGS, Page, sensor, simulated
 
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.io import create_writer
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.recorded import measure_recorded, slopes_as_variables
+from faintspot.recorded import measure_recorded
 from faintspot.recorded.report_of_stored import report_of_stored
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector
 from faintspot.spots.psf import PSF
@@ -58,7 +58,7 @@ def store(
         attributes={name: value for name, value in attributes.items() if value is not None},
         coordinates={"centre_x": layout.centres[:, 0], "centre_y": layout.centres[:, 1]},
     ) as writer:
-        writer.append(0, {**slopes_as_variables(slopes), **errors})
+        writer.append(0, {**slopes.variables, **errors})
     return path
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import image_stack
 from faintspot.training.registration import Tables, register, start

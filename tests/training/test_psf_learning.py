@@ -10,7 +10,7 @@ from tests.shared_data import shared_file
 from tests.training.psf_cases import simulated, slope_error, true_psf
 
 from faintspot.base.errors import InputError
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import image_stack, learn_psf, learn_psf_from_images

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.training.psf_cases import SHAPES, simulated, true_psf
 
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.training.psf_learning import image_stack
 from faintspot.training.registration import Tables, register, start
 

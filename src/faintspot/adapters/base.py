@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table
+from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import read_tables
 from faintspot.pipeline import configuration
 from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.spots.psf import PSF

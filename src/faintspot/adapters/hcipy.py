@@ -11,10 +11,10 @@ from faintspot.adapters.base import Options, ToolSlopes, largest_window, layout_
 from faintspot.adapters.checks import check_version, predicted
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 
 try:

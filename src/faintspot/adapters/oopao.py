@@ -13,8 +13,8 @@ from faintspot.adapters.base import Options, ToolSlopes
 from faintspot.adapters.checks import check_version
 from faintspot.adapters.spots import Spots
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
 
 TESTED = "1.0.0", "1.0.0"
 _LEAST_UNIT = 1e-6  # of OOPAO's slopes, that of a tilt of one pixel being about 1

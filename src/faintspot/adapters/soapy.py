@@ -12,8 +12,8 @@ from faintspot.adapters.base import Options, ToolSlopes
 from faintspot.adapters.checks import check_version
 from faintspot.adapters.spots import Spots
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
 
 TESTED = "0.15.0", "0.15.0"
 

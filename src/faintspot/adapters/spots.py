@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from faintspot.adapters.base import Options, ToolSlopes
 from faintspot.adapters.checks import predicted
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.camera.calibration import Calibration
 from faintspot.control.telemetry import without_prior
 from faintspot.experiments.statistics import Estimate
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.calibration import Calibration
 
 Floats = NDArray[np.float64]
 

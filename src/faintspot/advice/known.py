@@ -14,7 +14,7 @@ from faintspot.advice.seen import Seen
 from faintspot.algorithms.noise import pixel_noise
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.training.psf_learning import learn_psf_from_images
 from faintspot.turbulence.seeing import estimate_r0

@@ -15,11 +15,11 @@ from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
 from faintspot.ao_loop.mirror import DeformableMirror
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 

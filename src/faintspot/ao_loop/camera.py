@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import LoopConfiguration
-from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.detector import Detector
+from faintspot.camera.calibration import Calibration
+from faintspot.camera.detector import Detector
 
 
 class Exposing(Protocol):

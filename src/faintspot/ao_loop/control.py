@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from faintspot.ao_loop.observatory import LoopOptics
 
 Floats = NDArray[np.float64]
+Simulate = Callable[..., LoopRecord]
 
 FIRST_TELEMETRY_REALISATION = 2000
 """The realisation of the air that control learns from; never scored, nor tuned on."""
@@ -55,7 +57,11 @@ def make_controller(
 
 
 def learnt_control(
-    configuration: LoopConfiguration, arm: Arm, seed: int, learns_on: LoopConfiguration | None = None
+    configuration: LoopConfiguration,
+    arm: Arm,
+    seed: int,
+    simulate: Simulate,
+    learns_on: LoopConfiguration | None = None,
 ) -> tuple[Arm, Learnt | None]:
     """Return what the control of an arm has learnt, None: it need not; and the arm with what follows.
 
@@ -66,6 +72,8 @@ def learnt_control(
     configuration : LoopConfiguration
     arm : Arm
     seed : int
+    simulate : function
+        `simulate_loop`, which makes the telemetry.
     learns_on : LoopConfiguration, optional
         Of the loop that telemetry is taken from. Default: the same.
 
@@ -79,7 +87,9 @@ def learnt_control(
     if configuration.control.mode != CLOSED:
         raise InputError(f"arm.control = {arm.control!r}: expected {INTEGRATOR!r} in open loop")
     on = configuration if learns_on is None else learns_on
-    learnt = _learnt(replace(on, name="-", run=Run()), _Known.of(arm), arm.control, arm.noise_scale, seed)
+    learnt = _learnt(
+        replace(on, name="-", run=Run()), _Known.of(arm), arm.control, arm.noise_scale, seed, simulate
+    )
     if learnt.expected_std_px is not None and _has_prior(arm):
         std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
         arm = _with_prior(arm, std)
@@ -135,15 +145,20 @@ class _Known:
 
 @lru_cache(maxsize=8)
 def _learnt(
-    configuration: LoopConfiguration, known: _Known, kind: str, noise_scale: float, seed: int
+    configuration: LoopConfiguration,
+    known: _Known,
+    kind: str,
+    noise_scale: float,
+    seed: int,
+    simulate: Simulate,
 ) -> Learnt:
     from faintspot.ao_loop.observatory import prepare
 
     if kind == KALMAN and noise_scale != 1.0:  # learning takes long
-        usual = _learnt(configuration, known, kind, 1.0, seed)
+        usual = _learnt(configuration, known, kind, 1.0, seed, simulate)
         return replace(usual, model=usual.model.with_noise(noise_scale))
     optics, control = prepare(configuration), configuration.control
-    telemetry = _telemetry(_without_told(configuration), known, seed)
+    telemetry = _telemetry(_without_told(configuration), known, seed, simulate)
     told = slope_turbulence(configuration, optics.sensor.layout.cells)
     frame_s = 1 / control.frame_rate_hz
     theories = {
@@ -155,13 +170,11 @@ def _learnt(
 
 
 @lru_cache(maxsize=8)
-def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int) -> Telemetry:
+def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int, simulate: Simulate) -> Telemetry:
     """Run the loop with an integrator on air that is never scored."""
-    from faintspot.ao_loop.simulation import simulate_loop
-
     frames = configuration.control.telemetry_frames
     run = configuration.replace("run", frames=frames, settle_frames=0)
-    record = simulate_loop(run, [known.arm], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
+    record = simulate(run, [known.arm], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)
     return telemetry_of(record, known.arm)
 
 

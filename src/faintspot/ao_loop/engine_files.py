@@ -14,7 +14,7 @@ from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.ao_loop.control import learnt_control
 from faintspot.ao_loop.observatory import prepare
-from faintspot.ao_loop.simulation import measure_gains
+from faintspot.ao_loop.simulation import measure_gains, simulate_loop
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.config.tables import read_tables
 from faintspot.control import configuration as control_file
@@ -89,7 +89,7 @@ def write_engine_files(
     if arm.correct_gain:
         pipeline = make_pipeline(configuration, optics.sensor, arm)
         measured["centroid_gain"] = float(measure_gains(configuration, [pipeline], seed=seed)[0])
-    _, learnt = learnt_control(configuration, arm, seed)
+    _, learnt = learnt_control(configuration, arm, seed, simulate_loop)
     if learnt is not None:
         learnt.model.save(folder / MODEL)
         measured |= {"controller": control, "model": MODEL}

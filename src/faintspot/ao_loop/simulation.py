@@ -136,7 +136,7 @@ def simulate_loop(
     number = int(number_between("realisation", realisation, 0, integer=True))
     switches = DisabledErrors() if idealised is None else idealised
     ready = [
-        learnt_control(switches.configuration(configuration), arm, start, learns_on)
+        learnt_control(switches.configuration(configuration), arm, start, simulate_loop, learns_on)
         for arm in map(switches.arm, arms)
     ]
     what = configuration, ready, which, start, number, switches

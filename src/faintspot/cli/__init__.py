@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from faintspot import __version__
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.version import __version__
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
+from faintspot.camera.calibration import Calibration
+from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
@@ -20,9 +22,7 @@ from faintspot.experiments.first_settings import FirstSettings, first_settings
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.found_layout import FoundLayout, find_layout
-from faintspot.sensor.hot_pixels import find_hot_pixels
 from faintspot.sensor.known_grid import KnownGrid
 from faintspot.sensor.layout import GEOMETRIES, Layout
 

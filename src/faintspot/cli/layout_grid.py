@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.cli import layout_options
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.known_grid import KnownGrid, find_illuminated
 from faintspot.sensor.layout import Layout
 

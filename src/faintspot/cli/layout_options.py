@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration, read_map
 from faintspot.config.tables import read_tables
 from faintspot.pipeline import configuration
-from faintspot.sensor.calibration import Calibration, read_map
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW
 

@@ -63,9 +63,9 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
     """
     import numpy as np
 
+    from faintspot.camera.calibration import Calibration
     from faintspot.realtime.camera import Camera, SpotMotion, readout_type
     from faintspot.realtime.pixel_ring import PixelRing
-    from faintspot.sensor.calibration import Calibration
     from faintspot.sensor.layout import Layout
     from faintspot.simulate import Detector
 

@@ -75,8 +75,7 @@ def telescope(
     from faintspot.ao_loop.engine_files import write_engine_files
     from faintspot.realtime.control import ControlServer
     from faintspot.realtime.scheduling import real_time
-    from faintspot.realtime.telescope import SimulatedTelescope
-    from faintspot.realtime.telescope_orders import LENGTHY, commands_of
+    from faintspot.realtime.telescope import LENGTHY, SimulatedTelescope, commands_of
 
     observed = load_loop(configuration)
     if rate is not None:

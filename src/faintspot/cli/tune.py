@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.cli import tune_loop
 from faintspot.cli.layout_options import grid_shape
 from faintspot.cli.needs import suggested_slopes
@@ -24,7 +25,6 @@ from faintspot.experiments import answer_text
 from faintspot.experiments.question import PROFILES, TABLES, read_camera
 from faintspot.io.frames import open_frames
 from faintspot.pipeline import configuration
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.simulate.photometry import (
     DEFAULT_BAND,
@@ -307,7 +307,9 @@ def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str
     """Write configuration and picture, and say what comes next."""
     answer.save(target)
     click.echo(f"{target}: written")
-    write_picture(answer, picture)
+    from faintspot.experiments.answer_figures import tune_figure
+
+    write_picture(answer, picture, tune_figure)
     if answer.question.layout is None:
         pixels = answer.question.pixels
         click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")

@@ -11,6 +11,7 @@ import click
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
 from faintspot.cli.needs import can_make
+from faintspot.pipeline.slopes import Slopes
 from faintspot.recorded.stored_run import open_run
 from faintspot.sensor.layout import Layout
 from faintspot.wavefront import Wavefront, fit_wavefront, save_wavefront
@@ -71,7 +72,7 @@ def command(
     scales: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     layout = replace(run.layout, **scales)
     try:
-        wavefront = fit_wavefront(run.stored.slopes, layout, modes=modes)
+        wavefront = fit_wavefront(Slopes.from_variables(run.stored.variables), layout, modes=modes)
     except InputError as error:
         raise InputError(f"{slopes}: {error}") from None
     _print(wavefront)

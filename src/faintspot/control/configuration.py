@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
+from faintspot.camera.calibration import Calibration
 from faintspot.config.options import Options, option
 from faintspot.config.tables import errors_of_table, read_tables, save_tables
 from faintspot.control.base import Controller
@@ -23,7 +24,6 @@ from faintspot.control.learnt import CONTROLS, INTEGRATOR, KALMAN, MODAL, POLC, 
 from faintspot.control.reconstructor import Reconstructor, make_reconstructor
 from faintspot.io.frames import read_array
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]

@@ -8,6 +8,8 @@ from faintspot.base.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from faintspot.experiments.answer import Answer as Answer
+    from faintspot.experiments.answer_figures import loop_figure as loop_figure
+    from faintspot.experiments.answer_figures import tune_figure as tune_figure
     from faintspot.experiments.budget import run_budget as run_budget
     from faintspot.experiments.cell import measure_cell as measure_cell
     from faintspot.experiments.interleaved import run_interleaved as run_interleaved
@@ -35,6 +37,8 @@ _HOMES = {
     "Question": "faintspot.experiments.question",
     "StudySpecification": "faintspot.experiments.specification",
     "Sweep": "faintspot.experiments.sweep",
+    "loop_figure": "faintspot.experiments.answer_figures",
+    "tune_figure": "faintspot.experiments.answer_figures",
     "check_promises": "faintspot.experiments.promise",
     "measure_cell": "faintspot.experiments.cell",
     "open_study": "faintspot.experiments.study",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.ao_loop.arms import Arm
 from faintspot.base.errors import InputError
 from faintspot.base.notebook import table
+from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import save_tables
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.curves import Curve
@@ -21,11 +21,6 @@ from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate, SlopeStatistics
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 Floats = NDArray[np.float64]
 
@@ -150,8 +145,6 @@ class Answer:
         )
 
     def _repr_html_(self) -> str:
-        from faintspot.experiments.answer_text import settings_in_words
-
         rows = {"recommended": f"{self.best.arm.label} ({settings_in_words(self.best.settings)})"}
         for result in sorted(self.results, key=lambda each: _finite(each.statistics.corrected_rms.value)):
             rows[result.arm.label] = (
@@ -191,17 +184,13 @@ class Answer:
                 configuration.save(path, item)
         save_tables(path, {"promise": None if self.promise is None else self.promise.to_table()})
 
-    def figure(self) -> Figure:
-        """Draw R against the star's brightness.
 
-        Raises
-        ------
-        MissingExtraError
-            Without matplotlib.
-        """
-        from faintspot.experiments.answer_figures import tune_figure
-
-        return tune_figure(self)
+def settings_in_words(settings: Settings) -> str:
+    """Return the settings that are not at their defaults as `name value` pairs."""
+    pairs = [f'estimator "{settings.estimator.name}"']
+    for name, value in settings.chosen().items():
+        pairs.append(f'{name} "{value}"' if isinstance(value, str) else f"{name} {value:g}")
+    return ", ".join(pairs)
 
 
 def _finite(value: float) -> float:

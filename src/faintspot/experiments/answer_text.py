@@ -7,10 +7,9 @@ from typing import Any
 
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.experiments.answer import Answer, ArmResult
+from faintspot.experiments.answer import Answer, ArmResult, settings_in_words
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.statistics import Estimate
-from faintspot.pipeline.settings import Settings
 
 BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
 
@@ -36,14 +35,6 @@ def situation(answer: Answer) -> str:
         f"{star}; {kind} of {question.fwhm_px:.2f} px FWHM in {question.shape[0]} x {question.shape[1]} px, "
         f"within ±{question.search_range_px:.3g} px; read noise {question.read_noise_photoelectrons:.3g} e-"
     )
-
-
-def settings_in_words(settings: Settings) -> str:
-    """Return the settings that are not at their defaults as `name value` pairs."""
-    pairs = [f'estimator "{settings.estimator.name}"']
-    for name, value in settings.chosen().items():
-        pairs.append(f'{name} "{value}"' if isinstance(value, str) else f"{name} {value:g}")
-    return ", ".join(pairs)
 
 
 def recommendation(answer: Answer) -> list[str]:

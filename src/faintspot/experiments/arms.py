@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from faintspot.algorithms.brightest import RULES
 from faintspot.ao_loop.arms import Arm
 from faintspot.base.errors import InputError
+from faintspot.camera.detector import Detector
 from faintspot.config.options import AUTO, option
 from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.brightest import BrightestPixels
@@ -24,7 +25,6 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.thresholded import Thresholded
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.detector import Detector
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score, TrainedScore
 from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX

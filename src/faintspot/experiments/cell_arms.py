@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.arms import Arm
+from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.scene import Scene
@@ -21,7 +22,6 @@ from faintspot.kernels import scoring
 from faintspot.pipeline.images import measure_images
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.simulate import Detector
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from faintspot.algorithms.noise import suggested_strength
 from faintspot.base.checks import number_between
+from faintspot.camera.calibration import Calibration
 from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_flux
 from faintspot.experiments.statistics import Estimate, absolute_errors
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, sensor_frames
 

@@ -13,9 +13,9 @@ from faintspot.algorithms.automatic import automatic_kept_pixels, automatic_smoo
 from faintspot.algorithms.noise import pixel_noise
 from faintspot.algorithms.spot_width import SeenSpots, seen_spots
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 
 _PIXEL_BLUR_PX2 = 0.46  # that a pixel adds to the square of a spot's full width at half maximum

@@ -37,7 +37,7 @@ from faintspot.pipeline import configuration as configuration_file
 from faintspot.spots.psf import PSF
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 
 Floats = NDArray[np.float64]
@@ -290,18 +290,6 @@ class LoopAnswer:
         if math.isfinite(strehl.standard_error):
             table["strehl_error"] = round(strehl.standard_error, 4)
         return table
-
-    def figure(self) -> Figure:
-        """Draw Strehl ratios against magnitude, and what they open of the sky.
-
-        Raises
-        ------
-        MissingExtraError
-            Without matplotlib.
-        """
-        from faintspot.experiments.answer_figures import loop_figure
-
-        return loop_figure(self)
 
     def _from_bright(self, name: str) -> tuple[Floats, Floats]:
         """Return rising magnitudes (F,), and the Strehl ratios (F, R) there."""

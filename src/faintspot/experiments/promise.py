@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from faintspot.ao_loop.arms import Arm
 from faintspot.base.generators import spawn
+from faintspot.camera.calibration import Calibration
 from faintspot.experiments.question import Question
 from faintspot.experiments.statistics import Estimate
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import LearntPSF, fit_spots

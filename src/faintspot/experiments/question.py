@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table, parse_file
+from faintspot.camera.calibration import Calibration
+from faintspot.camera.detector import Detector
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
-from faintspot.sensor.calibration import Calibration
-from faintspot.sensor.detector import Detector
 from faintspot.sensor.layout import GRID_KEYS, Layout
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.simulate.photometry import (

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.algorithms.noise import pixel_noise
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
+from faintspot.camera.photon_transfer import DetectorMeasurement, measure_detector
 from faintspot.experiments.promise import frames_to_check
 from faintspot.experiments.question import Question, check_not_quad_cells, default_search_range_px
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.photon_transfer import DetectorMeasurement, measure_detector
 from faintspot.spots.psf import PSF
 from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 from faintspot.training.search_range import Images, SpotRange, spot_range

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any
 
-from faintspot import __version__
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.version import __version__
 from faintspot.experiments.store import Arrays, UnitStore
 from faintspot.kernels.parallel import available_cpus
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot import __version__
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import output_errors, parse_json
+from faintspot.base.version import __version__
 from faintspot.io.locations import one_line
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot import __version__
 from faintspot.base.errors import InputError, MissingExtraError
+from faintspot.base.version import __version__
 from faintspot.experiments.cell import measure_cell
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.specification import StudySpecification

@@ -19,7 +19,7 @@ from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import parse_json
 from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.io.fits_files import AOT_VERSION, units_of, whole_units
+from faintspot.io.fits_units import AOT_VERSION, units_of, whole_units
 from faintspot.io.locations import one_line
 from faintspot.sensor.layout import Layout
 

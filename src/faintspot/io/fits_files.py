@@ -8,11 +8,7 @@ physical = BZERO + BSCALE * stored, and BLANK marks integers without a value, wh
 from __future__ import annotations
 
 import gzip
-import io
-import math
 import warnings
-import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast
@@ -22,16 +18,14 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_bytes
+from faintspot.io.aot_reading import frames_of_aot
 from faintspot.io.file_format import FileFormat
+from faintspot.io.fits_units import AOT_VERSION, Unit, units_of, whole_units
 from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import GZIP_SIGNATURE, RawArray, is_gzip, open_plain_or_gzip
 from faintspot.io.slopes_format import REQUIRED, VARIABLES, StoredSlopes, check_stated, most_slopes_bytes
 
-AOT_VERSION = "AOT-VERS"
-"""Keyword of the primary header of a file of the Adaptive Optics Telemetry standard."""
-_BLOCK_BYTES = 2880
-_MOST_HEADER_BYTES, _MOST_PADDING_BYTES = 1 << 24, 1 << 20
 _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 
@@ -50,8 +44,6 @@ class Fits(FileFormat):
         if AOT_VERSION in next(units_of(path)).header:
             names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
             if key is None or key.strip().upper() not in names:
-                from faintspot.io.aot_reading import frames_of_aot
-
                 key = frames_of_aot(path, key)
         return _find_fits(path, key)
 
@@ -89,35 +81,6 @@ class FitsGz(Fits):
         """Write without a time stamp, so that equal slopes give equal files."""
         with gzip.GzipFile(filename="", mode="wb", compresslevel=1, fileobj=stream, mtime=0) as compressed:
             super().write(cast(IO[bytes], compressed), slopes)
-
-
-@dataclass(frozen=True)
-class _Unit:
-    """One header-and-data unit (HDU); `shape` is the image's in NumPy's order, () when it is no image."""
-
-    index: int
-    name: str
-    header: Any
-    compressed: bool
-    shape: tuple[int, ...]
-    data_start: int
-    data_bytes: int
-
-    @classmethod
-    def of(cls, index: int, header: Any, data_start: int) -> _Unit:
-        """Understand a header; a wrong one raises whatever astropy makes of it."""
-        axes = _axes(header, "NAXIS")
-        groups = int(header.get("GCOUNT", 1)) * (int(header.get("PCOUNT", 0)) + math.prod(axes))
-        data_bytes = abs(int(header["BITPIX"])) // 8 * groups if axes else 0
-        compressed = bool(header.get("ZIMAGE", False))
-        if compressed:
-            shape = _axes(header, "ZNAXIS")
-        else:
-            shape = axes if index == 0 or str(header.get("XTENSION", "")).strip() == "IMAGE" else ()
-        if min((data_bytes, *shape)) < 0:
-            raise ValueError("negative size")
-        name = str(header.get("EXTNAME", "PRIMARY" if index == 0 else index))
-        return cls(index, name, header, compressed, shape, data_start, data_bytes)
 
 
 def _find_fits(path: Path, key: str | None) -> StoredArray:
@@ -226,12 +189,7 @@ class _TileCompressedImage:
             self._file = None
 
 
-def _axes(header: Any, keyword: str) -> tuple[int, ...]:
-    """Return the lengths of the axes in NumPy's order, the last FITS axis first."""
-    return tuple(int(header[f"{keyword}{axis}"]) for axis in range(int(header[keyword]), 0, -1))
-
-
-def _find_unit(path: Path, key: str | None) -> _Unit:
+def _find_unit(path: Path, key: str | None) -> Unit:
     """Return the first image, or the unit named `key`."""
     names = []
     for unit in units_of(path):
@@ -244,63 +202,3 @@ def _find_unit(path: Path, key: str | None) -> _Unit:
             return unit
     wanted = "an image" if key is None else f"an extension {key!r}"
     raise InputError(f"{path}: expected {wanted}, the file has only: {', '.join(names)}")
-
-
-def whole_units(path: Path) -> list[_Unit]:
-    """Return all units of a file, behind which nothing else may follow, of which astropy would read all.
-
-    Raises
-    ------
-    InputError
-        When something does.
-    """
-    units = list(units_of(path))
-    with open_plain_or_gzip(path) as stream:
-        stream.seek(max((unit.data_start + unit.data_bytes for unit in units), default=0))
-        if len(stream.read(_MOST_PADDING_BYTES)) == _MOST_PADDING_BYTES:
-            raise InputError(f"{path}: expected the end of the file after {units[-1].name}, more follows")
-    return units
-
-
-def units_of(path: Path) -> Iterator[_Unit]:
-    """Yield the file's header-and-data units in order, skipping over the data."""
-    with open_plain_or_gzip(path) as stream:
-        index = 0
-        while (header := _read_header(path, stream, index)) is not None:
-            try:
-                unit = _Unit.of(index, header, stream.tell())
-            except Exception as error:  # cards are parsed when they are asked for, and may be broken
-                raise InputError(f"{path}: header {index} is not valid FITS ({one_line(error)})") from None
-            yield unit
-            padded = -(-unit.data_bytes // _BLOCK_BYTES) * _BLOCK_BYTES
-            try:
-                stream.seek(unit.data_start + padded)
-            except (OSError, EOFError, zlib.error):
-                return
-            index += 1
-
-
-def _header_blocks(stream: IO[bytes], index: int) -> bytes:
-    """Return the blocks of a header up to that with END; ValueError where there is none."""
-    start = b"SIMPLE" if index == 0 else b"XTENSION"
-    text = bytearray()
-    while len(text) < _MOST_HEADER_BYTES and (block := stream.read(_BLOCK_BYTES)):
-        text += block
-        if not text.startswith(start):
-            raise ValueError(f"it does not start with {start.decode()}")
-        if any(block[place : place + 8] == b"END     " for place in range(0, len(block), 80)):
-            return bytes(text)
-    raise ValueError(f"its header does not end within {len(text)} bytes")
-
-
-def _read_header(path: Path, stream: IO[bytes], index: int) -> Any:
-    """Return the header at the stream's position, or None at its end."""
-    fits = load_fits()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return fits.Header.fromfile(io.BytesIO(_header_blocks(stream, index)))
-    except Exception as error:  # a broken header makes astropy raise many things
-        if index > 0:
-            return None
-        raise InputError(f"{path}: expected a FITS file ({one_line(error)})") from None

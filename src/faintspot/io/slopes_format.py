@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_bytes, memory_bytes
-from faintspot.pipeline.slopes import Slopes
 
 
 @dataclass(frozen=True)
@@ -92,15 +91,6 @@ class StoredSlopes:
     attributes: Mapping[str, Any]
     complete: bool
     n_finished: int
-
-    @property
-    def slopes(self) -> Slopes:
-        """The variables as a pipeline gives them."""
-        return self.first(self.n_finished)
-
-    def first(self, n_frames: int) -> Slopes:
-        """Return the slopes of the first frames."""
-        return Slopes(**{item.name: self.variables[item.name][:n_frames] for item in fields(Slopes)})
 
 
 def most_slopes_bytes() -> int:

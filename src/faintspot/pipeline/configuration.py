@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
 from faintspot.base.toml_files import check_keys
+from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import errors_of_table, read_tables, save_tables, tables_as_text
 from faintspot.pipeline.settings import Settings
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score, load_score

@@ -28,8 +28,8 @@ from faintspot.estimators.gravity import GravityPrepared
 from faintspot.estimators.registry import estimators
 
 if TYPE_CHECKING:
+    from faintspot.camera.calibration import Calibration
     from faintspot.pipeline.plan import Plan
-    from faintspot.sensor.calibration import Calibration
     from faintspot.sensor.layout import Layout
 
 MOST_FRAMES = 65535

@@ -6,11 +6,11 @@ from numpy.typing import ArrayLike
 
 from faintspot.base.checks import real_array
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator, Prepared
 from faintspot.estimators.python import PythonPrepared
 from faintspot.estimators.sensor import Sensor
@@ -16,7 +17,6 @@ from faintspot.kernels import groups
 from faintspot.kernels.compiling import Direct
 from faintspot.kernels.groups import Task
 from faintspot.pipeline.settings import Settings, spot_fwhm_px
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score

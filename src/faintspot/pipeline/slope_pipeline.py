@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between, one_of, real_array
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPrepared
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
@@ -24,7 +25,6 @@ from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.plan import Plan, packed_calibration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes, Stages
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score

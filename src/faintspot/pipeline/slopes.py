@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.flags import INVALID
-from faintspot.base.notebook import slopes_in_words, table
+from faintspot.base.notebook import table
+from faintspot.io.slopes_format import VARIABLES
+from faintspot.pipeline.labelled import dataset_of, table_of_slopes
 
 if TYPE_CHECKING:
     import pandas
@@ -65,11 +68,35 @@ class Slopes:
         """All x, then all y, along the last axis: what a reconstructor multiplies."""
         return np.concatenate([self.x, self.y], axis=-1)
 
+    @classmethod
+    def from_variables(cls, variables: Mapping[str, NDArray[Any]], n_frames: int | None = None) -> Slopes:
+        """Return the slopes of a file's variables, all frames or the first `n_frames`."""
+        return cls(**{item.name: variables[item.name][:n_frames] for item in fields(cls)})
+
+    @property
+    def variables(self) -> dict[str, NDArray[Any]]:
+        """The quantities that files of slopes hold, by name."""
+        return {name: getattr(self, name) for name in VARIABLES}
+
+    def _in_words(self) -> dict[str, str]:
+        """Return the numbers of frames and sub-apertures, the valid fraction, rms and flux, by name."""
+        valid = self.valid
+        found = {
+            "frames": f"{1 if self.x.ndim == 1 else len(self.x)}",
+            "sub-apertures": f"{self.x.shape[-1]}",
+            "valid": f"{100 * float(np.mean(valid)):.4g} %" if valid.size else "none",
+        }
+        if valid.any():
+            x, y, flux = (values[valid].astype(np.float64) for values in (self.x, self.y, self.flux))
+            found["rms of x, y"] = f"{np.sqrt(np.mean(x**2)):.3g}, {np.sqrt(np.mean(y**2)):.3g} px"
+            found["median flux"] = f"{np.median(flux):.4g} e-"
+        return found
+
     def __repr__(self) -> str:
-        return f"Slopes({', '.join(f'{name} {value}' for name, value in slopes_in_words(self).items())})"
+        return f"Slopes({', '.join(f'{name} {value}' for name, value in self._in_words().items())})"
 
     def _repr_html_(self) -> str:
-        return table("Slopes", slopes_in_words(self))
+        return table("Slopes", self._in_words())
 
     def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
         """Return an xarray.Dataset with dimensions frame and subaperture, units as attributes.
@@ -88,9 +115,7 @@ class Slopes:
         MissingExtraError
             When xarray is not installed.
         """
-        from faintspot.io.labelled import dataset_of
-
-        return dataset_of(self, layout, unit)
+        return dataset_of(self.variables, layout, unit)
 
     def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
         """Return a pandas.DataFrame with a row for each frame and sub-aperture, its index.
@@ -98,9 +123,7 @@ class Slopes:
         Columns have the names of .csv files, as x_px; `layout` and `unit` are those of `to_xarray`, and so
         are the errors.
         """
-        from faintspot.io.labelled import table_of_slopes
-
-        return table_of_slopes(self, layout, unit)
+        return table_of_slopes(self.variables, layout, unit)
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ def check_real_time(pipeline: SlopePipeline) -> None:
     if pipeline.on_device is not None:
         raise InputError(
             f"pipeline: device = {pipeline.device!r}, but the real-time engine measures on the CPU; leave "
-            "device out, or measure frames on the GPU with faintspot.cuda.FrameStream"
+            "device out, or measure frames on the GPU with faintspot.pipeline.device_stream.FrameStream"
         )
     if pipeline.needs_light:
         raise InputError(

@@ -150,7 +150,7 @@ def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...
 
     Raises
     ------
-    Unfit
+    IncompatibleStreamError
         Where something does not fit.
     """
     if kind == ISIO and bytes(metadata["version"]) != VERSION:

@@ -38,9 +38,9 @@ from faintspot.realtime.image_layout import (
 )
 from faintspot.realtime.pixel_segment import identity_of
 from faintspot.realtime.processes import process_start
+from faintspot.realtime.publication import LARGEST_NUMBER, Publication
 from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
 from faintspot.realtime.semaphores import Semaphore
-from faintspot.realtime.stream import LARGEST_NUMBER, Publication
 
 _NAP_S = 5e-4
 _OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # of a pipe we want nothing
@@ -84,7 +84,7 @@ class ImageStream:
     ------
     FileNotFoundError
         When there is none.
-    Unfit
+    IncompatibleStreamError
         When there is something else.
     InputError
         For a name that cannot be one.

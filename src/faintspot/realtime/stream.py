@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.realtime.image_layout import DAO, ISIO, IncompatibleStreamError, path_of
+from faintspot.realtime.image_stream import ImageStream
+from faintspot.realtime.publication import LARGEST_NUMBER, Publication
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
 _NAP_S = 5e-4
-LARGEST_NUMBER = 2**63 - 1
-"""Of a frame."""
-
-
-class Publication(NamedTuple):
-    """What was published at once."""
-
-    values: NDArray[Any]
-    number: int
-    """Of the frame, as its producer has it."""
-    total: int
-    """How many there were, with it."""
 
 
 class Stream(Protocol):
@@ -68,7 +58,7 @@ class PyshmemStream:
     ------
     FileNotFoundError
         When there is none.
-    Unfit
+    IncompatibleStreamError
         When it cannot be opened.
     InputError
         When the folder of pyshmem's locks is not private.
@@ -173,13 +163,11 @@ def open_stream(name: str) -> Stream:
     ------
     FileNotFoundError
         When there is none of that name.
-    Unfit
+    IncompatibleStreamError
         When there is something else, with the reason.
     """
     kind, rest = split_name(name)
     if kind:
-        from faintspot.realtime.image_stream import ImageStream
-
         try:
             return ImageStream(kind, rest)
         except FileNotFoundError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -17,8 +17,10 @@ from faintspot.ao_loop.camera import make_detector
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.observatory import TelescopeModel
 from faintspot.base.closing import Closing
+from faintspot.base.errors import InputError
 from faintspot.realtime.camera import CameraReport, Readout, StopEvent, readout_type
 from faintspot.realtime.command_stream import CommandStream
+from faintspot.realtime.control import Handler
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.shared_streams import create_stream, held
 from faintspot.realtime.telescope_orders import Conditions
@@ -30,6 +32,9 @@ Strehl ratio and rms of the wavefront after the mirror, r0, the middle of the ex
 when the exposure began (CLOCK_MONOTONIC), the frame number with which the commands that acted were stamped
 (-1: none yet), photo-electrons of a fully lit sub-aperture.
 """
+LENGTHY = ("set",)
+"""Commands that wait for the next exposure: other commands are answered meanwhile."""
+_EFFECT_TIMEOUT_S = 0.5  # for an order to take effect, before the reply says that no exposure has begun yet
 _BETWEEN_COMPLAINTS_S = 10.0
 
 
@@ -252,3 +257,20 @@ class SimulatedTelescope(Readout, Closing):
             f"{self.late} frames were late"
         )
         self._complained_of, self._complained_s = self.overruns, now
+
+
+def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
+    """Return the commands: status and set."""
+
+    def status(fields: dict[str, Any]) -> Mapping[str, Any]:
+        return telescope.status()
+
+    def change(fields: dict[str, Any]) -> Mapping[str, Any]:
+        changes = fields.get("changes")
+        if not isinstance(changes, dict) or not changes:
+            raise InputError("changes: expected values by name, got none")
+        order = telescope.order(changes)
+        frame = order.frame if order.in_effect.wait(_EFFECT_TIMEOUT_S) else None
+        return {"frame": frame, "conditions": asdict(order.conditions)}
+
+    return {"status": status, "set": change}

@@ -1,10 +1,10 @@
-"""What a simulated telescope can be told while it runs, and what it answers on its control channel."""
+"""Conditions of a simulated telescope that can be changed while it runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.base.checks import number_between, numbers_between
@@ -12,14 +12,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys
 from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
 
-if TYPE_CHECKING:
-    from faintspot.realtime.control import Handler
-    from faintspot.realtime.telescope import SimulatedTelescope
-
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")
-LENGTHY = ("set",)
-"""Commands that wait for the next exposure: other commands are answered meanwhile."""
-_EFFECT_TIMEOUT_S = 0.5  # for an order to take effect, before the reply says that no exposure has begun yet
 _FWHM = 0.976  # of a long exposure, in wavelength / r0, without outer scale (Roddier 1981)
 _LARGEST_PHOTONS = 1e9
 
@@ -85,20 +78,3 @@ def _two_ends(name: str, value: Any, low: float, high: float) -> tuple[float, fl
         raise InputError(f"{name}: expected one number, or two to drift between, got {value!r:.80}")
     first, last = ends.flat[0], ends.flat[-1]
     return float(first), float(last)
-
-
-def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
-    """Return the commands: status and set."""
-
-    def status(fields: dict[str, Any]) -> Mapping[str, Any]:
-        return telescope.status()
-
-    def change(fields: dict[str, Any]) -> Mapping[str, Any]:
-        changes = fields.get("changes")
-        if not isinstance(changes, dict) or not changes:
-            raise InputError("changes: expected values by name, got none")
-        order = telescope.order(changes)
-        frame = order.frame if order.in_effect.wait(_EFFECT_TIMEOUT_S) else None
-        return {"frame": frame, "conditions": asdict(order.conditions)}
-
-    return {"status": status, "set": change}

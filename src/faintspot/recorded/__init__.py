@@ -9,12 +9,10 @@ from faintspot.base.lazy import lazy_attributes
 if TYPE_CHECKING:
     from faintspot.recorded.measuring import Summary as Summary
     from faintspot.recorded.measuring import measure_recorded as measure_recorded
-    from faintspot.recorded.measuring import slopes_as_variables as slopes_as_variables
 
 _HOMES = {
     "Summary": "faintspot.recorded.measuring",
     "measure_recorded": "faintspot.recorded.measuring",
-    "slopes_as_variables": "faintspot.recorded.measuring",
 }
 
 __all__ = sorted(_HOMES)

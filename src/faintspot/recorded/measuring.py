@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import faintspot
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
+from faintspot.base.version import __version__
+from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import read_tables
 from faintspot.io.aot_reading import is_aot, read_aot
 from faintspot.io.frames import FrameSource, open_frames
-from faintspot.io.labelled import layout_coordinates
 from faintspot.io.locations import split_location
 from faintspot.io.references import read_reference
 from faintspot.io.slopes import create_writer
-from faintspot.io.slopes_format import UNITS, VARIABLES, pixels_in, scaled_positions
+from faintspot.io.slopes_format import UNITS, pixels_in, scaled_positions
 from faintspot.pipeline import configuration
+from faintspot.pipeline.labelled import layout_coordinates
 from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.settings import Settings, with_preset, without_denoising
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
@@ -180,7 +180,7 @@ def measure_recorded(
             summary.resumed_at = writer.finished()
             for start, block in source.blocks(summary.resumed_at, source.n_frames, size):
                 slopes = pipeline(block)
-                writer.append(start, scaled_positions(slopes_as_variables(slopes), factor))
+                writer.append(start, scaled_positions(slopes.variables, factor))
                 summary.add(slopes)
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
@@ -266,11 +266,6 @@ def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
         raise InputError(f"{output}: expected a name for the slopes, got a file of the frames")
 
 
-def slopes_as_variables(slopes: Slopes) -> dict[str, NDArray[Any]]:
-    """Return the slopes of several frames as a file's variables."""
-    return {name: getattr(slopes, name) for name in VARIABLES}
-
-
 def _version(path: Path) -> str:
     """What changes when somebody writes to a file of frames between two calls."""
     status = path.stat()
@@ -290,7 +285,7 @@ def _attributes(
     paths = [str(Path(path).resolve()) for path in frames]
     state = hashlib.sha256()
     for part in (
-        faintspot.__version__,
+        __version__,
         text,
         str(key),
         *([] if unit == "px" else [unit]),
@@ -310,7 +305,7 @@ def _attributes(
         **_files_of_the_spot(configuration_file),
         "sources": paths,
         "source_key": key or "",
-        "faintspot_version": faintspot.__version__,
+        "faintspot_version": __version__,
         "fingerprint": state.hexdigest(),
     }
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.io import open_frames
-from faintspot.pipeline.slopes import Stages
+from faintspot.pipeline.slopes import Slopes, Stages
 from faintspot.recorded.page import slopes_report
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.stored_run import StoredRun, open_run
@@ -175,7 +175,9 @@ def _wavefronts(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> 
     found: dict[str, Wavefront | str] = {}
     for store, arm in zip(stores, arms, strict=True):
         try:
-            found[arm.name] = fit_wavefront(store.stored.first(arm.n_frames), layout)
+            found[arm.name] = fit_wavefront(
+                Slopes.from_variables(store.stored.variables, arm.n_frames), layout
+            )
         except InputError as error:
             found[arm.name] = str(error)
     return found

@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 from tomlkit.exceptions import TOMLKitError
 
 from faintspot.base.errors import InputError
+from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import read_tables
 from faintspot.estimators.base import Estimator
 from faintspot.io import StoredSlopes, read_slopes
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score, load_score

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
-import faintspot
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import derived, write_atomically
+from faintspot.base.version import __version__
 from faintspot.report.figure_data import FigureWithData
 
 POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."
@@ -232,7 +232,7 @@ def _render(page: Page, drawn: Mapping[str, Sequence[DrawnFigure]]) -> str:
         raise MissingExtraError("jinja2", "web", "Making a report page") from None
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     template = environment.from_string(_template("page.html"))
-    return template.render(page=page, drawn=drawn, style=style(), version=faintspot.__version__)
+    return template.render(page=page, drawn=drawn, style=style(), version=__version__)
 
 
 def _template(name: str) -> str:

@@ -138,9 +138,9 @@ class Layout:
         )
 
     def _repr_html_(self) -> str:
-        from faintspot.base.notebook import layout_picture
+        from faintspot.base.notebook import windows_picture
 
-        return layout_picture(self)
+        return windows_picture(self.corners, self.window, self.frame_shape)
 
     def __len__(self) -> int:
         """Return the number of sub-apertures."""

@@ -1,6 +1,6 @@
 """Images with a known truth: spots, detectors, whole sensors."""
 
-from faintspot.sensor.detector import Detector
+from faintspot.camera.detector import Detector
 from faintspot.simulate.frames import sensor_frames, subapertures
 from faintspot.simulate.photometry import Photometry
 from faintspot.spots.shapes import spots

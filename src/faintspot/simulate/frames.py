@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
-from faintspot.sensor.detector import Detector
+from faintspot.camera.detector import Detector
 from faintspot.spots.shapes import image_shape, per_spot, spots
 from faintspot.spots.speckled import LARGEST_D_OVER_R0, speckled_images
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.sensor.detector import Detector
+from faintspot.camera.detector import Detector
 from faintspot.spots.shapes import image_shape, position_array, spots
 
 Floats = NDArray[np.float64]

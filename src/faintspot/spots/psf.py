@@ -115,9 +115,10 @@ class PSF:
         return f"PSF({n} of {size}{of}, oversampling {self.oversampling})"
 
     def _repr_html_(self) -> str:
-        from faintspot.base.notebook import psf_picture
+        from faintspot.base.notebook import image_picture
 
-        return psf_picture(self)
+        side = min(max(self.samples.shape[1:]) // self.oversampling, 22) - 1 | 1  # odd
+        return image_picture(self.images([[0.0, 0.0]], (side, side), 1.0)[0], repr(self))
 
     @classmethod
     def analytic(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.algorithms.noise import pixel_noise
 from faintspot.base.checks import number_between, numbers_between, one_of, real_array
 from faintspot.base.errors import InputError
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_fit import Form

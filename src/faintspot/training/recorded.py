@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, number_between, numbers_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
+from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.score import STARTS, TrainedScore, smoothed_peak, table_sums
 from faintspot.training.fitting import Sample, fit_passes

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import checked_options, frame_stack, image_stack

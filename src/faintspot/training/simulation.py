@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import finite_array, number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
-from faintspot.sensor.detector import Detector
+from faintspot.camera.detector import Detector
 from faintspot.spots.score import STARTS, TrainedScore, smoothed_peak
 from faintspot.spots.shapes import SMALLEST_SIZE, image_shape, per_spot, spots
 from faintspot.spots.speckled import LARGEST_D_OVER_R0, speckled_spots

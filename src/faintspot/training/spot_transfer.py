@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import image_stack, number_between
-from faintspot.sensor.calibration import Calibration
+from faintspot.camera.calibration import Calibration
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import LearntPSF, learn_psf_from_images
 

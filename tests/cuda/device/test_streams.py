@@ -28,7 +28,7 @@ def assert_equal(found: Any, expected: fs.Slopes) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])
 def test_a_stream_measures_as_the_pipeline_does(dtype: Any) -> None:
-    from faintspot.cuda import FrameStream
+    from faintspot.pipeline.device_stream import FrameStream
 
     work = pipeline()
     stream = FrameStream(work, dtype)
@@ -43,7 +43,7 @@ def test_a_stream_measures_as_the_pipeline_does(dtype: Any) -> None:
 
 
 def test_steps_without_a_graph() -> None:
-    from faintspot.cuda import FrameStream
+    from faintspot.pipeline.device_stream import FrameStream
 
     work = pipeline()
     stream = FrameStream(work, capture=False)
@@ -54,7 +54,7 @@ def test_steps_without_a_graph() -> None:
 
 
 def test_sensors_do_not_disturb_each_other() -> None:
-    from faintspot.cuda import FrameStream
+    from faintspot.pipeline.device_stream import FrameStream
 
     first, second = pipeline(), pipeline(reference=np.full((2, 2), 0.25))
     streams = [FrameStream(first), FrameStream(second)]
@@ -66,7 +66,7 @@ def test_sensors_do_not_disturb_each_other() -> None:
 
 
 def test_what_a_stream_cannot_measure() -> None:
-    from faintspot.cuda import FrameStream
+    from faintspot.pipeline.device_stream import FrameStream
 
     with pytest.raises(fs.InputError, match='expected one made with device="cuda"'):
         FrameStream(fs.SlopePipeline(LAYOUT, SETTINGS))

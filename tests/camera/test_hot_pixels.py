@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import faintspot as fs
-from faintspot.sensor.hot_pixels import find_hot_pixels
+from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.simulate import Detector, sensor_frames
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from tests.shared_data import shared_file
 
 from faintspot.base.errors import InputError
+from faintspot.camera.photon_transfer import measure_detector
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.photon_transfer import measure_detector
 from faintspot.simulate import Detector, sensor_frames
 
 CAMERA = Detector(5.0, gain_e_per_adu=2.0, offset_adu=100.0, bits=14)

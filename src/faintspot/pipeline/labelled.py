@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,15 +19,16 @@ from faintspot.io.slopes_format import (
     scaled_positions,
     unit_of,
 )
-from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
+Variables = Mapping[str, NDArray[Any]]
 
-def dataset_of(slopes: Slopes, layout: Layout | None, unit: str) -> xarray.Dataset:
+
+def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Dataset:
     """Return what `Slopes.to_xarray` does."""
     try:
         import xarray
@@ -51,7 +53,7 @@ def dataset_of(slopes: Slopes, layout: Layout | None, unit: str) -> xarray.Datas
     )
 
 
-def table_of_slopes(slopes: Slopes, layout: Layout | None, unit: str) -> pandas.DataFrame:
+def table_of_slopes(slopes: Variables, layout: Layout | None, unit: str) -> pandas.DataFrame:
     """Return what `Slopes.to_pandas` does."""
     try:
         import pandas
@@ -79,10 +81,10 @@ def layout_coordinates(layout: Layout) -> dict[str, NDArray[Any]]:
 
 
 def _parts(
-    slopes: Slopes, layout: Layout | None, unit: str
+    slopes: Variables, layout: Layout | None, unit: str
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return variables (n_frames, n_subapertures) in a unit, and coordinates."""
-    variables = {name: np.atleast_2d(getattr(slopes, name)) for name in VARIABLES}
+    variables = {name: np.atleast_2d(slopes[name]) for name in VARIABLES}
     n = variables["x"].shape[1]
     if layout is not None and len(layout) != n:
         raise InputError(f"layout: expected {n} sub-apertures, as in the slopes, got {len(layout)}")

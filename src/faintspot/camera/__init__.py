@@ -1,0 +1,1 @@
+"""The camera: calibration, its measurement, and a simulated detector."""
