@@ -20,6 +20,7 @@ from faintspot.advice.seen import seen_in_telemetry
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, parse_json, write_atomically
 from faintspot.base.toml_files import parse_text
+from faintspot.camera.calibration import Calibration
 from faintspot.control.configuration import Control, load_control, prior_std_px
 from faintspot.experiments.statistics import Estimate, mean_by_blocks
 from faintspot.io.telemetry import Telemetry, stored_names
@@ -30,7 +31,6 @@ from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.control_loop import CLOSED
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.telemetry import TelemetryReader
-from faintspot.sensor.calibration import Calibration
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
