@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from tests.cli.cli_cases import Commands, command_line
 
-from faintspot.experiments import StudySpecification, Sweep, estimators, open_study, run
+from faintspot.experiments import StudySpecification, Sweep, open_study, run
+from faintspot.experiments import built_in_studies as estimators
 
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")
