@@ -36,7 +36,6 @@ NOT_RUN = {
     'LoopRecord.load("canary': "needs half an hour of results",
     "simulate_loop(": "the tutorial on loops runs it",
     "open_study(": "needs a study's results",
-    "study.run(": "starts processes of its own",
     "PixelRing.create": "needs a camera",
     "pyshmem.open": "needs a running engine",
 }

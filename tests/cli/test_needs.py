@@ -130,6 +130,6 @@ def test_extras_are_those_of_the_package() -> None:
     declared = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for extra, packages in EXTRAS.items():
         names = {line.partition(">")[0].partition("[")[0].replace("-", "_") for line in declared[extra]}
-        imported = {"pyrtcao": "pyrtc"}  # where a package is not named like what it installs
+        imported = {"pillow": "pil", "pyrtcao": "pyrtc"}  # where a package is not named like what it installs
         expected = {imported.get(name, name) for name in names - {"faintspot"}}
         assert {package.lower() for package in packages} == expected

@@ -334,7 +334,7 @@ def test_counters_that_are_mad(folder: Path, name: str) -> None:
         file.write(np.ones((3, 5), np.uint16))
         wait_for(bridge.step)
     assert (bridge.counters.frames, bridge.counters.not_ahead) == (2, 1)
-    assert bridge.counters.missed == 2**64 - 2
+    assert (bridge.counters.missed, bridge.counters.restarts) == (0, 1)  # the jump, not what lies between
     bridge.close()
 
 

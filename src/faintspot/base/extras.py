@@ -9,7 +9,7 @@ from pathlib import Path
 from faintspot.base.errors import InputError, MissingExtraError
 
 EXTRAS = {
-    "io": ("astropy", "tifffile", "zarr"),
+    "io": ("astropy", "h5py", "PIL", "tifffile", "zarr"),
     "web": ("matplotlib", "jinja2"),
     "study": ("xarray", "dask", "distributed", "bokeh"),
     "realtime": ("pyshmem", "aotpy"),
