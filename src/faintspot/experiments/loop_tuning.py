@@ -21,7 +21,7 @@ from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
 
 _SEARCH = Search(
-    coarse_frames=120, frames=120, settle_frames=40, realisations=1, finalists=1, climbs=1, rounds=1
+    coarse_frames=120, frames=120, settle_frames=40, realisations=2, finalists=3, climbs=1, rounds=1
 )
 
 
