@@ -160,6 +160,12 @@ def mounts(folder: Path) -> bool:
     return tried.returncode == 0
 
 
+@pytest.fixture(autouse=True)
+def small_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the PSF out of recordings: it alone would fill the disk of these tests."""
+    monkeypatch.setattr("faintspot.realtime.engine.packed", lambda *parts: None)
+
+
 @pytest.mark.parametrize("full", ["disk", "file"])
 def test_no_space_for_a_recording(sky: Sky, files: tuple[Path, Control], full: str, tmp_path: Path) -> None:
     """A file system of 300 kB is full, or files may not be larger than 20 kB.

@@ -142,6 +142,7 @@ class Telemetry:
         return (self.last_row_time_ns + offset) / 1e9
 
 
+_PARTS = "parts"
 _ARRAYS = tuple(field.name for field in fields(Telemetry) if field.name not in ("changes", "attributes"))
 
 
@@ -278,6 +279,8 @@ def attributes_of(store: Path) -> dict[str, Any]:
         raise InputError(
             f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
         )
+    if (store / _PARTS).is_dir():
+        attributes |= stored_attributes(store / _PARTS)
     return attributes
 
 
@@ -291,7 +294,10 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
     hidden = path.with_name(f".{path.name}.new")
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir()
-    group = zarr.create_group(str(hidden), zarr_format=3, attributes=dict(attributes))
+    rest = {name: value for name, value in attributes.items() if name != _PARTS}
+    group = zarr.create_group(str(hidden), zarr_format=3, attributes=rest)
+    # Large, and written once: the attributes of the store are replaced with every block of frames.
+    group.create_group(_PARTS, attributes={_PARTS: attributes.get(_PARTS)})
     for kind in kinds:
         for name, values in _columns(np.empty(0, kind)):
             row = values.shape[1:]
