@@ -24,6 +24,8 @@ from faintspot.realtime.commands import LENGTHY, commands_of
 from faintspot.realtime.control import ControlServer
 from faintspot.realtime.private_socket import socket_path
 
+pytestmark = pytest.mark.machine_time("runs a loop in real time")
+
 RATE_HZ = 150.0
 
 

@@ -26,6 +26,8 @@ from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.private_socket import socket_path
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 PATIENCE_S = 240.0  # the engine may have to compile its code
 OPEN, CLOSED = 1, 2
 COUNTERS = {"processed": 600, "dropped": 2, "skipped": 1}

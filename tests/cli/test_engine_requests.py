@@ -9,6 +9,8 @@ import pytest
 
 from faintspot.cli import engine_requests
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 
 @pytest.mark.parametrize(("patience_s", "takes_s", "says"), [(0.0, 0.2, True), (60.0, 0.0, False)])
 def test_reason_for_waiting(

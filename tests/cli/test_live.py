@@ -20,6 +20,8 @@ from tests.live_page.cases import LAYOUT, N, records
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.realtime.telemetry_segment import image_type, layout_values
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 COMMAND = [sys.executable, "-m", "faintspot", "live"]
 
 

@@ -15,6 +15,8 @@ from faintspot.pipeline import configuration
 pytest.importorskip("hcipy")
 pytest.importorskip("matplotlib")
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 
 @pytest.fixture(autouse=True)
 def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ from tests.cli.cli_cases import Commands, command_line
 
 import faintspot
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 COMMANDS = ("demo", "layout", "report", "slopes")
 
 

@@ -15,6 +15,8 @@ from tests.cli.cli_cases import Commands
 from faintspot.base.extras import EXTRAS, present, require
 from faintspot.cli import group
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 OPTIONAL = sorted({package for packages in EXTRAS.values() for package in packages})
 NEEDING = {
     "report slopes.npz": "web",

@@ -24,6 +24,8 @@ pytest.importorskip("pyshmem")
 
 from tests.realtime.bench import LAYOUT, Bench, simulated
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 MATRIX = np.random.default_rng(1).standard_normal((2 * len(LAYOUT), 10))
 
 

@@ -7,9 +7,12 @@ import signal
 import threading
 
 import numpy as np
+import pytest
 
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.kernels import streaming
+
+pytestmark = pytest.mark.machine_time("starts other processes")
 
 PATIENCE_S = 20.0
 

@@ -16,6 +16,8 @@ from faintspot.io import read_slopes
 fits = pytest.importorskip("astropy.io.fits")
 zarr = pytest.importorskip("zarr")
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 
 @pytest.mark.portable
 @pytest.mark.parametrize("name", ["a.fits", "a.fits.gz", "a.npy", "a.npz", "a.zarr"])

@@ -18,6 +18,8 @@ from faintspot import Settings, SlopePipeline, Slopes
 
 pytest.importorskip("zarr")
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 N_FRAMES = 12_000  # three chunks of a store
 ITERATIONS = 800  # so that a run takes some seconds, and no signal comes after its end
 SETTINGS = Settings(noise_std=2.0, keep_brightest=10, tolerance=0.0, max_iterations=ITERATIONS)

@@ -15,6 +15,8 @@ from faintspot.experiments import built_in_studies as estimators
 pytest.importorskip("zarr")
 pytest.importorskip("xarray")
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 SMALL = """
 name = "small"
 realisations = 200

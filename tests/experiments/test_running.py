@@ -22,6 +22,8 @@ from faintspot.experiments import running
 from faintspot.experiments.running import Unit, WorkerPool, run_units
 from faintspot.experiments.store import MemoryStore, ZarrStore
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 UNITS = [Unit(f"unit {number}", (number,), 10) for number in range(4)]
 
 

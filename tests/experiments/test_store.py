@@ -25,6 +25,8 @@ from faintspot.experiments.store import (
 
 pytest.importorskip("zarr")
 
+pytestmark = pytest.mark.machine_time("starts other processes")
+
 RESULT = {
     "number": np.asarray(3.5),
     "image": np.arange(6, dtype=np.float32).reshape(2, 3),

@@ -12,7 +12,10 @@ from tests.fuzz.__main__ import PARTS
 
 from faintspot.kernels.host import lanes_for
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pages are protected as Linux does it")
+pytestmark = [
+    pytest.mark.skipif(sys.platform != "linux", reason="pages are protected as Linux does it"),
+    pytest.mark.machine_time("starts other processes"),
+]
 _ROOT = Path(__file__).parents[2]
 
 

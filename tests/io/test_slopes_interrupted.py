@@ -20,6 +20,8 @@ from faintspot.io import read_slopes, slopes_folder, slopes_writer, slopes_zarr,
 pytest.importorskip("astropy")
 pytest.importorskip("zarr")
 
+pytestmark = pytest.mark.machine_time("starts and kills other processes")
+
 
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,3 +153,35 @@ def test_killed_again_and_again(tmp_path: Path, name: str) -> None:
     write(path, whole, 100)
     assert_stored(path, whole)
     assert [entry.name for entry in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.usefixtures("small_chunks")
+@pytest.mark.parametrize("line", range(14))
+def test_ctrl_c_at_any_line_of_the_writer(tmp_path: Path, line: int) -> None:
+    """Whichever line is reached when the signal comes, no frame is stored twice or lost."""
+    whole, seen = result(), -1
+    own = slopes_writer.__file__
+
+    def trace(frame: Any, event: str, _: Any) -> Any:
+        nonlocal seen
+        if frame.f_code.co_filename != own or frame.f_code.co_name not in ("append", "_store"):
+            return None
+        if event == "line" and (seen := seen + 1) == line + 20:  # in the second block, which fills a chunk
+            sys.settrace(None)
+            raise KeyboardInterrupt
+        return trace
+
+    def interrupted() -> None:
+        with writer_for(tmp_path / "slopes.zarr") as writer:
+            sys.settrace(trace)
+            for start in range(0, 50, 8):
+                writer.append(start, part(whole, start, min(start + 8, 50)))
+
+    before = sys.gettrace()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+    finally:
+        sys.settrace(before)
+    write(tmp_path / "slopes.zarr", whole)
+    assert_stored(tmp_path / "slopes.zarr", whole)

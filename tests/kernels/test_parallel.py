@@ -13,7 +13,7 @@ from tests.patience import LIMIT_S, not_emulated
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import available_cpus, run_groups
 
-pytestmark = pytest.mark.portable
+pytestmark = [pytest.mark.portable, pytest.mark.machine_time("threads and their clocks")]
 
 
 @pytest.mark.parametrize("threads", [None, 1, 2, 5])

@@ -31,7 +31,10 @@ from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.recorder import Recorder
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt install chromium"),
+    pytest.mark.machine_time("a server, its clients and their clocks"),
+]
 PATIENCE_MS = 30_000
 DESKTOP, TELEPHONE = {"width": 1400, "height": 900}, {"width": 360, "height": 740}
 

@@ -19,6 +19,8 @@ from faintspot.realtime.control import ControlServer
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.telemetry import TelemetryRing
 
+pytestmark = pytest.mark.machine_time("a server, its clients and their clocks")
+
 NAME = f"fs_test_{uuid4().hex[:12]}"
 
 

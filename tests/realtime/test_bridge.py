@@ -25,7 +25,10 @@ from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+    pytest.mark.machine_time("clocks, threads and other processes"),
+]
 SHAPE, PATIENCE_S = (6, 5), 60.0
 
 

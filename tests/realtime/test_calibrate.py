@@ -22,6 +22,8 @@ pyshmem = pytest.importorskip("pyshmem")
 
 from tests.realtime.closed_loop import COMMANDS, CONFIGURATION, Sky, configured, make_engine  # noqa: E402
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 STILL = CONFIGURATION.replace("control", frame_rate_hz=400.0)
 
 

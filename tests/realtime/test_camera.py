@@ -29,7 +29,10 @@ from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.simulate import Detector, sensor_frames
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+    pytest.mark.machine_time("clocks, threads and other processes"),
+]
 
 LAYOUT = Layout.grid((3, 4), pixels=8)
 CONFIGURATION = "[layout.grid]\nshape = [3, 4]\npixels = 8\n"

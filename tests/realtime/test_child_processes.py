@@ -16,6 +16,8 @@ from faintspot.base.errors import InputError
 from faintspot.realtime.child_processes import ChildProcesses
 
 pytest.importorskip("pyshmem")
+
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 PATIENCE_S = 60.0
 # A bridge waits for a stream that never comes.
 PARENT = """

@@ -29,6 +29,8 @@ pyshmem = pytest.importorskip("pyshmem")
 
 from tests.realtime.closed_loop import COMMANDS, CONFIGURATION, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 FRAMES = 60
 
 

@@ -26,6 +26,8 @@ from faintspot.realtime import control
 from faintspot.realtime.control import LARGEST_REQUEST, ControlServer, request
 from faintspot.realtime.private_socket import socket_path
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 SOURCE = Path(__file__).resolve().parents[2] / "src"
 
 

@@ -19,6 +19,8 @@ pytest.importorskip("pyshmem")
 
 from tests.realtime.closed_loop import CONFIGURATION, Sky, configured, make_engine
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 EVERY, FRAMES = 8, 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)
 ARMS = Interleaving.parse("window+integrator,map+kalman", EVERY)

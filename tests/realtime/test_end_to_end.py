@@ -22,6 +22,8 @@ from faintspot.realtime.private_socket import socket_path
 
 pyshmem = pytest.importorskip("pyshmem")
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 CONFIGURATION = """
 [layout.grid]
 shape = [4, 4]

@@ -26,6 +26,8 @@ from faintspot.realtime.replay import Replay
 
 pyshmem = pytest.importorskip("pyshmem")
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 
 @pytest.mark.portable
 def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:

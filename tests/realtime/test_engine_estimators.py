@@ -24,6 +24,8 @@ from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.trial import Trial
 
 pytest.importorskip("pyshmem")
+
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 BRIGHT = 60000
 FAILING = f"if {BRIGHT / 2} < images.max() < {BRIGHT}:\n    {{}}\nreturn sensor.zero + 0.25"
 

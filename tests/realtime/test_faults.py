@@ -21,6 +21,8 @@ from faintspot.realtime.pixel_segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 
 def test_a_short_frame(bench: Bench) -> None:
     """The next frame begins before the last row was there: it is not measured, and the next one is."""

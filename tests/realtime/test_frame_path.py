@@ -15,6 +15,8 @@ from faintspot.kernels.ordered import store
 from faintspot.realtime.frame_path import FramePath, Progress, last_rows_of_groups
 from faintspot.realtime.workers import Workers
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 LAYOUT = fs.Layout.grid((6, 6), pixels=8, pitch=(9, 8))
 NOISE = fs.Calibration(dark=0.0, read_noise_e=1.0)
 SLOTS = 3

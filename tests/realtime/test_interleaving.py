@@ -14,6 +14,8 @@ from faintspot.pipeline.settings import without_denoising
 from faintspot.realtime.commands import commands_of
 from faintspot.realtime.interleaving import Interleaving, arms_after
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 
 def test_texts() -> None:
     found = Interleaving.parse("none, tv,ml,noise_std=2+keep_brightest=20,set", 50)

@@ -22,6 +22,8 @@ from tests.realtime.estimator_files import write
 
 from faintspot.realtime.trial import Trial
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 TIMES = int(os.environ.get("FAINTSPOT_LEAK_TIMES", "1"))
 FEW = max(50, 20 * TIMES)
 PATIENCE_S = 10.0  # for threads that are about to end

@@ -13,6 +13,8 @@ import faintspot as fs
 from faintspot.base.errors import InputError
 from faintspot.realtime.live import LiveSettings
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 LAYOUT = fs.Layout.grid((2, 3), pixels=8)
 N = len(LAYOUT)
 SETTINGS = fs.Settings(noise_std=0.5, keep_brightest=9)

@@ -24,6 +24,8 @@ pyshmem = pytest.importorskip("pyshmem")
 
 from tests.realtime.closed_loop import COMMANDS, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:

@@ -26,6 +26,7 @@ from faintspot.realtime.pixel_ring import ARRIVALS, CLOSED, FRAME, ROWS, PixelRi
 from faintspot.realtime.pixel_segment import FOLDER
 
 pytestmark = [
+    pytest.mark.machine_time("clocks, threads and other processes"),
     pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]

@@ -23,6 +23,8 @@ pyshmem = pytest.importorskip("pyshmem")
 
 from tests.realtime.closed_loop import CONFIGURATION, Sky, configured, make_engine  # noqa: E402
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 FRAMES = 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)
 

@@ -22,6 +22,8 @@ from faintspot.realtime.prior import Prior
 from faintspot.realtime.python_path import PythonPath, tried
 from faintspot.realtime.time_limit import call_within
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 GENEROUS_S = 5.0
 BRIGHT = 60000
 

@@ -29,7 +29,10 @@ from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.recorder import Recorder
 from faintspot.realtime.telemetry import TelemetryRing
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+    pytest.mark.machine_time("clocks, threads and other processes"),
+]
 
 PATIENCE_S = 60.0
 

@@ -29,7 +29,10 @@ from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.replay import Replay, ring_type
 from faintspot.realtime.scheduling import quick_switching
 
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it")
+pytestmark = [
+    pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
+    pytest.mark.machine_time("clocks, threads and other processes"),
+]
 SHAPE = (6, 5)
 
 

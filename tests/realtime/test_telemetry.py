@@ -24,6 +24,7 @@ from faintspot.realtime.telemetry import TelemetryReader, TelemetryRing
 from faintspot.sensor.layout import Layout
 
 pytestmark = [
+    pytest.mark.machine_time("clocks, threads and other processes"),
     pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]

@@ -10,6 +10,8 @@ import pytest
 import faintspot as fs
 from faintspot.realtime.time_limit import call_is_under_way, call_within, end_thread
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 PATIENCE_S = 10.0
 
 

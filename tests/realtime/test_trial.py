@@ -16,6 +16,8 @@ from faintspot.estimators.registry import restore
 from faintspot.realtime.estimator_file import load_estimators
 from faintspot.realtime.trial import Trial
 
+pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
+
 
 def trial(path: Path, limit_s: float = 60.0) -> Trial:
     # With a value that differs between sub-apertures, too.

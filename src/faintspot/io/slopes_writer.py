@@ -117,11 +117,21 @@ class BlockWriter(Closing):
         self._next_mark = 0.0
         with output_errors(path):
             storage.open()
-            self._stored = storage.marked()[1]
+            # One attribute, so that an interruption finds both parts of it changed or neither.
+            self._state: tuple[int, list[dict[str, NDArray[Any]]]] = (storage.marked()[1], [])
             self._marks = {self._stored}
-            self._waiting: list[dict[str, NDArray[Any]]] = []
             if self._stored < run.n_frames and self._stored % storage.chunk:
                 self._take_back_last_chunk()
+
+    @property
+    def _stored(self) -> int:
+        """Frames that are stored."""
+        return self._state[0]
+
+    @property
+    def _waiting(self) -> list[dict[str, NDArray[Any]]]:
+        """Blocks that follow the stored frames."""
+        return self._state[1]
 
     def finished(self) -> int:
         """Return how many frames it has, stored or waiting: the next block starts there."""
@@ -132,8 +142,8 @@ class BlockWriter(Closing):
         if not self._is_open:
             raise InputError(f"{self._path}: expected no more slopes after close(), got frame {start}")
         arrays = checked_block(self._run, self.finished(), start, block)
-        before = self._waiting
-        self._waiting = [*before, {name: array.copy() for name, array in arrays.items()}]
+        before = self._state
+        self._state = (self._stored, [*self._waiting, {name: array.copy() for name, array in arrays.items()}])
         try:
             waiting = self.finished() - self._stored
             if self.finished() == self._run.n_frames:
@@ -141,7 +151,7 @@ class BlockWriter(Closing):
             elif waiting >= self._storage.chunk:
                 self._store(waiting - waiting % self._storage.chunk)
         except InputError:
-            self._waiting = before
+            self._state = before
             raise
 
     def close(self) -> None:
@@ -172,16 +182,15 @@ class BlockWriter(Closing):
             self._storage.write(self._stored, {name: array[:count] for name, array in joined.items()})
             if finished == self._run.n_frames or time.monotonic() >= self._next_mark:
                 self._mark(finished)
-        self._stored = finished
         rest = {name: array[count:] for name, array in joined.items()}
-        self._waiting = [rest] if len(rest["x"]) else []
+        self._state = finished, [rest] if len(rest["x"]) else []
 
     def _take_back_last_chunk(self) -> None:
         """Take frames of a chunk that is not full back into memory, so that it is written again whole."""
         start = self._stored - self._stored % self._storage.chunk
-        self._waiting = [self._storage.read(start, self._stored)]
+        taken_back = self._storage.read(start, self._stored)
         self._mark(start)
-        self._stored = start
+        self._state = start, [taken_back]
 
     def _mark(self, finished: int) -> None:
         self._marks.add(finished)  # interrupted in between, either may be on the disk
