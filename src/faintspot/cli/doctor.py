@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import click
 
-from faintspot.doctor import examine
+from faintspot.cli.examination import examine
 
 
 @click.command(short_help="Say what is installed, what this machine allows, and what to do.")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from faintspot.experiments.answer import Answer
     from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
 
 
@@ -25,10 +26,17 @@ _TICKS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3, 5)
 
 
 @styled
-def tune_figure(answer: Any) -> Figure:
-    """Draw R of every arm and the bound against the star's magnitude, and the limiting magnitude.
+def tune_figure(answer: Answer) -> Figure:
+    """Draw the slope error of every estimator, and the bound, against the star's magnitude.
 
-    `answer` is a `faintspot.experiments.Answer`, whose module calls this one.
+    Parameters
+    ----------
+    answer : Answer
+
+    Examples
+    --------
+    >>> from faintspot.experiments import tune_figure
+    >>> figure = tune_figure(answer)  # of faintspot.tune  # doctest: +SKIP
     """
     figure = new_figure(_WIDTH, _HEIGHT)
     axes = figure.subplots()
@@ -135,7 +143,17 @@ _LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 @styled
 def loop_figure(answer: LoopAnswer) -> Figure:
-    """Draw Strehl ratios with errors and limiting magnitudes; where there is a radius, bars of the sky."""
+    """Draw Strehl ratios with errors and limiting magnitudes, and the sky coverage if its radius is given.
+
+    Parameters
+    ----------
+    answer : LoopAnswer
+
+    Examples
+    --------
+    >>> from faintspot.experiments import loop_figure
+    >>> figure = loop_figure(answer)  # of tune_loop  # doctest: +SKIP
+    """
     figure = new_figure(_LOOP_WIDTH, _LOOP_HEIGHT)
     if answer.question.radius is None:
         left = figure.subplots()

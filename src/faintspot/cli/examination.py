@@ -47,7 +47,7 @@ def examine() -> list[Finding]:
 
     Examples
     --------
-    >>> from faintspot.doctor import examine
+    >>> from faintspot.cli.examination import examine
     >>> [finding.name for finding in examine()][:2]
     ['faintspot', 'Python']
     """

@@ -13,9 +13,9 @@ import pytest
 from tests.cli.cli_cases import Commands
 
 import faintspot
-from faintspot import doctor
 from faintspot.base.extras import EXTRAS
-from faintspot.doctor import Finding, examine, file_system
+from faintspot.cli import examination as doctor
+from faintspot.cli.examination import Finding, examine, file_system
 
 NAMES = [
     "faintspot",
