@@ -28,7 +28,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 NOT_RUN = {
     'device="cuda"': "needs a GPU",
-    "faintspot.cuda": "needs a GPU",
+    "FrameStream": "needs a GPU",
     "import hcipy": "run by the adapter's own tests",
     "adapter.calibrating": "a sketch of what adapters share",
     "oopao.attach": "in examples/oopao_loop.py",

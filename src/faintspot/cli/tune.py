@@ -307,9 +307,10 @@ def _write(answer: Answer, target: Path, picture: Path | None, frames: tuple[str
     """Write configuration and picture, and say what comes next."""
     answer.save(target)
     click.echo(f"{target}: written")
-    from faintspot.experiments.answer_figures import tune_figure
+    if picture is not None:
+        from faintspot.experiments.answer_figures import tune_figure
 
-    write_picture(answer, picture, tune_figure)
+        write_picture(tune_figure(answer), picture)
     if answer.question.layout is None:
         pixels = answer.question.pixels
         click.echo(f"Next: faintspot layout FRAME --pixels {pixels} -o {shlex.quote(str(target))}")

@@ -71,7 +71,6 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
     picture = picture_file(target, options["picture"])
     question = _question(config, options)
     from faintspot.ao_loop.engine_files import CONFIGURATION as ENGINE_FILE
-    from faintspot.experiments.answer_figures import loop_figure
     from faintspot.experiments.loop_tuning import tune_loop
     from faintspot.experiments.running import WorkerPool
 
@@ -82,7 +81,10 @@ def tune_for_loop(config: str, options: dict[str, Any]) -> None:
     show(answer)
     loop = answer.save(target)
     click.echo(f"{target}: written, and {loop}, the loop with this star and gain")
-    write_picture(answer, picture, loop_figure)
+    if picture is not None:
+        from faintspot.experiments.answer_figures import loop_figure
+
+        write_picture(loop_figure(answer), picture)
     best, photons = answer.best.name, f"{answer.photons[answer.at_star]:g}"
     command = shlex.join(["faintspot", "loop", "magnitude", str(loop), "--arms", f"brightest,window,{best}"])
     click.echo(f"Next, a long search and long runs: {command} --photons {photons}")

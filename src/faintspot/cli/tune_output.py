@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +43,9 @@ def picture_file(target: Path, picture: str | None) -> Path | None:
     return Path(picture) if picture else derived(target, "-tune.png")
 
 
-def write_picture(answer: Any, path: Path | None, draw: Callable[[Any], Any]) -> None:
-    """Write the figure that `draw` makes of an answer, unless there is no path."""
-    if path is not None:
-        from faintspot.report.drawing import png
+def write_picture(figure: Any, path: Path) -> None:
+    """Write a figure as PNG."""
+    from faintspot.report.drawing import png
 
-        write_atomically(path, png(draw(answer)))
-        click.echo(f"{path}: picture")
+    write_atomically(path, png(figure))
+    click.echo(f"{path}: picture")
