@@ -273,14 +273,14 @@ def attributes_of(store: Path) -> dict[str, Any]:
     try:
         attributes = stored_attributes(store)
         known = attributes["format"] == FORMAT and attributes["version"] == 1
+        if (store / _PARTS).is_dir():
+            attributes[_PARTS] = stored_attributes(store / _PARTS)[_PARTS]
     except (OSError, ValueError, KeyError, TypeError):
         known = False
     if not (known and is_store(store)):
         raise InputError(
             f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
         )
-    if (store / _PARTS).is_dir():
-        attributes |= stored_attributes(store / _PARTS)
     return attributes
 
 
