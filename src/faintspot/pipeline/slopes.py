@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from faintspot.base.flags import INVALID
 from faintspot.base.notebook import table
 from faintspot.io.slopes_format import VARIABLES
-from faintspot.pipeline.labelled import dataset_of, table_of_slopes
 
 if TYPE_CHECKING:
     import pandas
@@ -115,6 +114,8 @@ class Slopes:
         MissingExtraError
             When xarray is not installed.
         """
+        from faintspot.pipeline.labelled import dataset_of
+
         return dataset_of(self.variables, layout, unit)
 
     def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
@@ -123,6 +124,8 @@ class Slopes:
         Columns have the names of .csv files, as x_px; `layout` and `unit` are those of `to_xarray`, and so
         are the errors.
         """
+        from faintspot.pipeline.labelled import table_of_slopes
+
         return table_of_slopes(self.variables, layout, unit)
 
 
