@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from faintspot.realtime.stream_out import StreamOut
 
 _HEAD_START_S = 0.5
+_DEFAULT_RATE_HZ = 500.0
 _ENDS_S = 5.0  # a thread looks at whether to stop many times a second
 _RING = name_option("Name of the pixel ring.")
 _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
@@ -28,7 +29,12 @@ _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="F
 @click.command("replay", short_help="Publish recorded frames as a camera would.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
 @_RING
-@click.option("--rate", type=float, metavar="HZ", default=500.0, show_default=True, help="Frames a second.")
+@click.option(
+    "--rate",
+    type=float,
+    metavar="HZ",
+    help="Frames a second, measured in time or not. Default: up to 500, as the engine measures them.",
+)
 @click.option("--repeat", is_flag=True, help="Begin again at the end, until Ctrl-C.")
 @click.option(
     "--rows-per-block", type=int, metavar="K", help="Row by row, K at a time. Default: whole frames."
@@ -40,7 +46,7 @@ _SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="F
 def replay(
     frames: tuple[str, ...],
     name: str,
-    rate: float,
+    rate: float | None,
     repeat: bool,
     rows_per_block: int | None,
     first: int,
@@ -48,13 +54,16 @@ def replay(
     key: str | None,
     slots: int,
 ) -> None:
-    """Publish recorded frames in the pixel ring NAME at a given rate, for `faintspot realtime run`.
+    """Publish recorded frames in the pixel ring NAME, for `faintspot realtime run`.
 
     FRAMES are FITS files (plain, .gz, .fz; images or cubes), .npy, .npz or Zarr, in the order given, as for
-    `faintspot slopes`; they are read ahead in blocks. Frames start on a fixed schedule, half a second after
-    the ring is there, so that an engine that waits for it misses none; a frame's number is its place in
-    the sequence. With --rows-per-block rows arrive at the pace of a read-out that takes 80 % of the frame
-    time. Ctrl-C ends it.
+    `faintspot slopes`; they are read ahead in blocks. A frame's number is its place in the sequence.
+
+    By default every frame is measured: replay waits for an engine, publishes up to 500 frames/s, waits where
+    the engine is slower, and ends when the engine ends. With --rate or --repeat (500 frames/s) frames start
+    on a fixed schedule, half a second after the ring is there, and those that the engine misses are counted.
+    With --rows-per-block rows arrive at the pace of a read-out that takes 80 % of the frame time. Ctrl-C
+    ends it.
 
     \b
     Examples:
@@ -66,6 +75,7 @@ def replay(
     from faintspot.realtime.replay import Replay, ring_type
     from faintspot.realtime.scheduling import quick_switching
 
+    waits = rate is None and not repeat
     with (
         stop_on_signal() as stop,
         quick_switching(),
@@ -74,27 +84,32 @@ def replay(
         Replay(
             source,
             ring,
-            frame_rate_hz=rate,
+            frame_rate_hz=_DEFAULT_RATE_HZ if rate is None else rate,
             first=first,
             n_frames=count,
             repeat=repeat,
             rows_per_block=rows_per_block,
+            waits=waits,
         ) as player,
     ):
         rows, columns = source.shape
         often = "repeatedly" if repeat else "once"
         played = count or source.n_frames - first
+        pace = "every one measured by an engine" if waits else f"{rate or _DEFAULT_RATE_HZ:g} frames/s"
         click.echo(
             f"{name}: {rows} x {columns} pixels ({source.dtype} as {ring.dtype}), {played} frames of "
-            f"{source.description} {often}, {rate:g} frames/s; Ctrl-C stops"
+            f"{source.description} {often}, {pace}; Ctrl-C stops"
         )
-        stop.wait(_HEAD_START_S)
+        if not waits:
+            stop.wait(_HEAD_START_S)
         with progress_bar("replay") if not repeat else nullcontext() as advance:
             report = player.run(None, stop, _telling(advance, played))
     click.echo(
         f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.late} started late, "
-        f"{report.overruns} frame times without a frame"
+        f"{report.overruns} frame times without a frame, {player.lost} not measured in time"
     )
+    if waits and report.frames < played and not stop.is_set():
+        click.echo(f"{name}: the engine ended before the last {played - report.frames} frames", err=True)
 
 
 def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable[[int], None] | None:

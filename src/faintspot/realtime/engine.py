@@ -240,7 +240,10 @@ class Engine:
                             (0, -1) if waited else (ring.arrivals, ring.progress()[0])
                         )
                         self.preparer.ring = ring
-                        self._follow(ring, n_frames)
+                        try:
+                            self._follow(ring, n_frames)
+                        finally:
+                            ring.unfollow()
                         self.preparer.ring = None
                     waited = True
         finally:
@@ -270,7 +273,7 @@ class Engine:
     def _attached(self) -> PixelRing | None:
         """Return the source's ring, None where there is none that lives and fits."""
         try:
-            ring = PixelRing.attach(self.name)
+            ring = PixelRing.attach(self.name, follows=True)
         except InputError:
             self._unfit = ""
             return None
@@ -289,6 +292,8 @@ class Engine:
     def _follow(self, ring: PixelRing, n_frames: int | None) -> None:
         """Measure the frames of a ring until it ends."""
         self._take(ring)  # made before the first frame is waited for
+        lost_before = self.counters.dropped
+        ring.follow(self._arrival)
         if self._workers is not None:
             self._workers.wake()
         while not self._done(n_frames):
@@ -304,6 +309,7 @@ class Engine:
                     break
                 if self._path is not None:
                     self._path.go_on()
+            ring.follow(self._arrival, self.counters.dropped - lost_before)
         if self._workers is not None:
             self._workers.park()
 

@@ -1,11 +1,13 @@
 """Pixels from a camera to the engine, row by row, through a ring of frames in shared memory.
 
-One process writes, any number of processes of the same user read. The writer never waits for a reader;
-a reader asks afterwards (`PixelRing.intact`) whether what it used was overwritten meanwhile.
+One process writes, any number of processes of the same user read. A camera never waits for a reader;
+a reader asks afterwards (`PixelRing.intact`) whether what it used was overwritten meanwhile. One reader, the
+engine, says how far it is (`PixelRing.follow`), so that a writer that can wait loses no frame.
 
 Memory, in bytes from the segment's start::
 
     0      header, written once, with a checksum: magic, version, creator, generation, shape, type, slots
+    128    written by the engine: arrivals it is done with, frames it lost, its process and when that started
     256    cells, 128 bytes apart, so that no two share a cache line or the pair that is fetched with it:
            frame that is arriving, rows of it that are complete, closed, arrivals (frames begun so far),
            then one cell a slot: frame number (-1 while it changes hands), arrival, time of its last row
@@ -36,7 +38,11 @@ from faintspot.realtime.pixel_segment import (
     CLOSED,
     FIRST_SLOT,
     FOLDER,
+    FOLLOWED,
+    FOLLOWER,
+    FOLLOWER_START,
     FRAME,
+    LOST,
     ROWS,
     SLOT_ARRIVAL,
     SLOT_FRAME,
@@ -44,12 +50,13 @@ from faintspot.realtime.pixel_segment import (
     Header,
     cells_of,
     create_segment,
+    follower_of,
     identity_of,
     new_header,
     open_segment,
     segment_path,
 )
-from faintspot.realtime.processes import process_lives
+from faintspot.realtime.processes import process_lives, process_start
 
 __all__ = [
     "ARRIVALS",
@@ -89,9 +96,18 @@ class PixelRing:
         neighbours.
     pixels : ndarray, shape (slots, rows, columns)
         All slots, read-only for a reader.
+    follower : ndarray, int64, shape (4,)
+        How far the engine is.
     """
 
-    def __init__(self, name: str, memory: mmap.mmap, header: Header, identity: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        name: str,
+        memory: mmap.mmap,
+        header: Header,
+        identity: tuple[int, int],
+        follower: NDArray[np.int64] | None = None,
+    ) -> None:
         """For `create` and `attach` only."""
         self.name, self.slots = name, header.slots
         self.shape, self.dtype = (header.rows, header.columns), np.dtype(header.dtype)
@@ -107,8 +123,9 @@ class PixelRing:
             offset=header.first_pixel,
             strides=(header.slot_bytes, header.columns * itemsize, itemsize),
         )
+        self.follower = follower_of(memory) if follower is None else follower
         self._writes = self.cells.flags.writeable
-        self._open = True
+        self._open, self._follows = True, False
 
     @classmethod
     def create(cls, name: str, shape: tuple[int, int], dtype: DTypeLike, *, slots: int = 4) -> PixelRing:
@@ -139,16 +156,15 @@ class PixelRing:
         return cls(name, memory, header, identity)
 
     @classmethod
-    def attach(cls, name: str) -> PixelRing:
-        """Open a ring to read from.
+    def attach(cls, name: str, *, follows: bool = False) -> PixelRing:
+        """Open a ring to read from; with `follows`, for the one reader that calls `follow`.
 
         Raises
         ------
         InputError
             When there is none of that name, or it is not a whole pixel ring of this version and this user.
         """
-        memory, header, identity = open_segment(segment_path(name))
-        return cls(name, memory, header, identity)
+        return cls(name, *open_segment(segment_path(name), follows))
 
     # ---- writer
 
@@ -208,7 +224,30 @@ class PixelRing:
         self.begin(frame_number)[...] = array
         self.end()
 
+    @property
+    def followed(self) -> tuple[int, int] | None:
+        """Arrivals that the engine is done with and how many of them it lost; None where there is no engine.
+
+        It asks the operating system, as `stale` does.
+        """
+        arrivals, lost, pid, start = (load(self.follower, place) for place in range(len(self.follower)))
+        return (arrivals, lost) if pid and process_lives(pid, start) else None
+
     # ---- reader
+
+    def follow(self, arrival: int, lost: int = 0) -> None:
+        """Say that this process is done with all frames up to this arrival, and lost so many of them."""
+        store(self.follower, LOST, lost)
+        store(self.follower, FOLLOWED, arrival)
+        if not self._follows:
+            self._follows = True
+            store(self.follower, FOLLOWER_START, process_start(os.getpid()))
+            store(self.follower, FOLLOWER, os.getpid())
+
+    def unfollow(self) -> None:
+        """Say that this process measures no more frames of this ring."""
+        self._follows = False
+        store(self.follower, FOLLOWER, 0)
 
     @property
     def arrivals(self) -> int:

@@ -28,11 +28,14 @@ FRAME, ROWS, CLOSED, ARRIVALS, FIRST_SLOT = range(5)
 """Rows of `PixelRing.cells`; the value is in column 0."""
 SLOT_FRAME, SLOT_ARRIVAL, SLOT_TIME = range(3)
 """Columns of `PixelRing.cells` from row FIRST_SLOT on."""
+FOLLOWED, LOST, FOLLOWER, FOLLOWER_START = range(4)
+"""Places in `PixelRing.follower`: arrivals done with, frames lost, the engine's process (or 0), its start."""
 
 _MAGIC, _VERSION = b"fspixels", 1
 _HEADER = struct.Struct("<8sIqqQqqq8s")
 _CRC = struct.Struct("<I")
 FIRST_CELL, CELL_BYTES, _ALIGNMENT = 256, 128, 4096
+_FOLLOWER_BYTE = 128
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW  # of a pipe or a link we want nothing
 _DTYPES = ("u1", "u2", "u4", "i2", "i4", "f4", "f8")
 _LARGEST_SIDE, _LARGEST_RING = 1 << 16, 1 << 36
@@ -157,8 +160,10 @@ def create_segment(path: Path, header: Header) -> tuple[mmap.mmap, tuple[int, in
         raise InputError(f"{path}: cannot be made, {size} ({error.strerror or error})") from None
 
 
-def open_segment(path: Path) -> tuple[mmap.mmap, Header, tuple[int, int]]:
-    """Open a segment read-only; return its memory, header and identity.
+def open_segment(path: Path, follows: bool) -> tuple[mmap.mmap, Header, tuple[int, int], NDArray[np.int64]]:
+    """Open a segment read-only; return its memory, header, identity and the follower's cells.
+
+    With `follows` the follower's cells can be written.
 
     Raises
     ------
@@ -166,7 +171,7 @@ def open_segment(path: Path) -> tuple[mmap.mmap, Header, tuple[int, int]]:
         When there is none of that name, or it is not a whole pixel ring of this version and this user.
     """
     try:
-        descriptor = os.open(path, _READ)
+        descriptor = os.open(path, _READ | os.O_RDWR if follows else _READ)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no pixel ring of that name; is the camera running?") from None
     except OSError as error:
@@ -177,9 +182,15 @@ def open_segment(path: Path) -> tuple[mmap.mmap, Header, tuple[int, int]]:
         if size != header.total_bytes:
             raise InputError(f"{path}: cut short: {size} of {header.total_bytes} bytes")
         memory = mmap.mmap(descriptor, header.total_bytes, access=mmap.ACCESS_READ)
-        return memory, header, identity_of(os.fstat(descriptor))
+        marks = mmap.mmap(descriptor, FIRST_CELL) if follows else memory
+        return memory, header, identity_of(os.fstat(descriptor)), follower_of(marks)
     finally:
         os.close(descriptor)
+
+
+def follower_of(memory: mmap.mmap) -> NDArray[np.int64]:
+    """Return the cells in which the engine that follows says how far it is."""
+    return np.ndarray(4, np.int64, memory, offset=_FOLLOWER_BYTE)
 
 
 def cells_of(memory: mmap.mmap, header: Header) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterator
 from itertools import chain
 from types import TracebackType
@@ -20,6 +21,7 @@ from faintspot.realtime.pixel_ring import PixelRing
 
 _BLOCK_BYTES, _BLOCKS_AHEAD = 4 << 20, 8
 _LOOK_S = 0.05  # between two looks at whether to stop, while waiting for the disk or for room
+_NAP_S = 5e-4  # between two looks at how far the engine is
 
 
 def ring_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
@@ -58,11 +60,16 @@ class Replay(Readout):
     rows_per_block : int, optional
         Rows that are published together, at the pace of a read-out that takes 80 % of the frame time.
         Default: whole frames.
+    waits : bool
+        Wait for an engine, and never overwrite a frame that it has not measured; end when the engine ends.
+        Default: keep the schedule, whether or not the engine does.
 
     Attributes
     ----------
     n_frames : int or None
         How many frames there are to publish; None with `repeat`.
+    lost : int
+        Frames that the engine could not measure in time, once `run` has ended.
 
     Raises
     ------
@@ -80,6 +87,7 @@ class Replay(Readout):
         n_frames: int | None = None,
         repeat: bool = False,
         rows_per_block: int | None = None,
+        waits: bool = False,
     ) -> None:
         begin = int(number_between("first", first, 0, source.n_frames - 1, integer=True))
         left = source.n_frames - begin
@@ -94,6 +102,7 @@ class Replay(Readout):
             first_number=begin,
         )
         self.n_frames = None if repeat else count
+        self._waits, self.lost = waits, 0
         self._source, self._range = source, (begin, begin + count)
         self._ahead: queue.Queue[NDArray[Any] | InputError | None] = queue.Queue(_BLOCKS_AHEAD)
         self._block: Iterator[NDArray[Any]] = iter(())
@@ -107,12 +116,22 @@ class Replay(Readout):
         stop: StopEvent | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
-        """Publish frames as `Readout.run` does; the schedule starts when the first one has been read."""
-        self._stop = self._ending if stop is None else stop
+        """Publish frames as `Readout.run` does; the schedule starts when the first one has been read.
+
+        With `waits` it also starts no earlier than the engine. It ends when the engine, if there is one, has
+        measured the last frame.
+        """
+        self._stop, ring = self._ending if stop is None else stop, self._ring
+        while self._waits and ring.followed is None and not self._stop.is_set():
+            _nap()
         frame = self._frame()
         if frame is not None:
             self._block = chain([frame], self._block)
-        return super().run(n_frames, stop, progress)
+        report = super().run(n_frames, stop, progress)
+        self._await_engine(ring.arrivals)
+        followed = ring.followed
+        self.lost = 0 if followed is None else followed[1]
+        return report
 
     def __enter__(self) -> Self:
         self._reader.start()
@@ -126,6 +145,8 @@ class Replay(Readout):
 
     def _frame(self) -> NDArray[Any] | None:
         """Return the next frame; None at the end."""
+        if self._waits and not self._await_engine(self._ring.arrivals + 1 - self._ring.slots):
+            return None
         while (frame := next(self._block, None)) is None:
             try:
                 block = self._ahead.get(timeout=_LOOK_S)
@@ -140,6 +161,14 @@ class Replay(Readout):
                 return None
             self._block = iter(block)
         return frame
+
+    def _await_engine(self, arrival: int) -> bool:
+        """Wait until the engine is done with that arrival; return False when it will not be."""
+        while (followed := self._ring.followed) is not None and not self._stop.is_set():
+            if followed[0] >= arrival:
+                return True
+            _nap()
+        return False
 
     def _read(self) -> None:
         """Read blocks ahead until the end, or until nobody wants them any more; in a thread of its own."""
@@ -167,3 +196,8 @@ class Replay(Readout):
                 continue
             return True
         return False
+
+
+def _nap() -> None:
+    """Give the engine time."""
+    time.sleep(_NAP_S)
