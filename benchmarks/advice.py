@@ -22,7 +22,7 @@ from faintspot.ao_loop.calibration import flat_psf, reference_slopes
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.ao_loop.control import prior_std_px
-from faintspot.ao_loop.observatory import prepare
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.experiments.statistics import paired_mean
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline

@@ -102,10 +102,10 @@ class Sky(Readout):
         self.squares += np.mean(disturbance**2), np.mean(left**2)
         places = np.clip(left + self._reference, -_LARGEST_PX, _LARGEST_PX).reshape(2, -1)
         across, along = self._profiles[np.rint((places + _LARGEST_PX) * _STEPS).astype(np.int64)]
-        light = np.float32(PHOTONS) * along[:, :, None] * across[:, None, :]
-        start = self._rng.integers(_POOL - light.size)
-        noise = self._noise[start : start + light.size].reshape(light.shape)
-        electrons = light + np.sqrt(light + self._read_noise_e**2) * noise
+        flux = np.float32(PHOTONS) * along[:, :, None] * across[:, None, :]
+        start = self._rng.integers(_POOL - flux.size)
+        noise = self._noise[start : start + flux.size].reshape(flux.shape)
+        electrons = flux + np.sqrt(flux + self._read_noise_e**2) * noise
         self._pixels.reshape(-1)[self._places] = np.maximum(
             np.rint(self._level + self._adu_per_e * electrons), 0
         )
@@ -179,8 +179,8 @@ class Changes:
         self.states: dict[str, int] = {}
         """How often the loop was found in which state, and why it was open."""
         turns = ",".join(arms), ",".join(arms[::-1]), ",".join(arms[:2])
-        light = (0.9 * PHOTONS, 1.1 * PHOTONS, PHOTONS)
-        self._turns, self._light, self._gains = cycle(turns), cycle(light), cycle((0.2, 0.3, 0.4))
+        flux = (0.9 * PHOTONS, 1.1 * PHOTONS, PHOTONS)
+        self._turns, self._flux, self._gains = cycle(turns), cycle(flux), cycle((0.2, 0.3, 0.4))
         self._kinds = cycle(("set", "gain", "set", "opened", "closed", "set", "refused", "set", "arms"))
 
     def next(self) -> None:
@@ -197,7 +197,7 @@ class Changes:
 
     def _change(self, kind: str) -> None:
         if kind == "set":
-            _ask(self._name, "set", changes={"flux_e": next(self._light)})
+            _ask(self._name, "set", changes={"flux_e": next(self._flux)})
         elif kind == "refused":
             _ask(self._name, "set", changes={"flux_e": -1.0})
         elif kind == "gain":

@@ -18,7 +18,7 @@ from scipy import sparse
 from benchmarks.measuring import Candidate, Row, Table, best, interleaved, pinned
 from faintspot.ao_loop import load_loop
 from faintspot.ao_loop.control import slope_turbulence
-from faintspot.ao_loop.observatory import prepare
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import CompiledKalman

@@ -16,7 +16,7 @@ import numpy as np
 import faintspot as fs
 from benchmarks.measuring import Candidate, Row, Table, Times, best, interleaved, pinned, ratio, spread
 from faintspot.estimators import estimator_named
-from faintspot.kernels.groups import Source, light_of_groups, new_scratch
+from faintspot.kernels.groups import Source, flux_of_groups, new_scratch
 from faintspot.kernels.host import lanes_for
 from faintspot.pipeline.plan import packed_calibration
 
@@ -67,12 +67,12 @@ def _gather(layout: fs.Layout, frame: Any) -> Candidate:
     lanes = lanes_for(np.float32)
     n, (ny, nx) = len(layout), layout.window
     calibration = packed_calibration(layout, fs.Calibration(), lanes.width)
-    scratch, light = new_scratch(lanes, ny, nx), np.empty((1, n), np.float32)
+    scratch, flux = new_scratch(lanes, ny, nx), np.empty((1, n), np.float32)
     groups = -(-n // lanes.width)
     source = Source(lanes, frame[None], layout.corners, ny, nx, calibration, np.inf)
 
     def run() -> None:
-        light_of_groups(source, 0, groups, scratch, light)
+        flux_of_groups(source, 0, groups, scratch, flux)
 
     return run
 

@@ -20,8 +20,8 @@ from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.camera import make_detector
-from faintspot.ao_loop.observatory import LoopOptics, prepare
 from faintspot.ao_loop.telescope import pupil_grid, require_hcipy
+from faintspot.ao_loop.telescope_model import LoopOptics, prepare
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.integrator import Integrator
 
@@ -59,14 +59,14 @@ class Linear(MovingLayers):
 def hcipy_layers(configuration: LoopConfiguration, kind: str) -> Any:
     """Return layers of HCIPy: "infinite" (interpolated by splines), "whole" (without) or "finite"."""
     hcipy = require_hcipy("the benchmark of the loop")
-    air, grid = configuration.atmosphere, pupil_grid(configuration)
-    r0 = air.r0_m if isinstance(air.r0_m, float) else air.r0_m[0]
+    atmosphere, grid = configuration.atmosphere, pupil_grid(configuration)
+    r0 = atmosphere.r0_m if isinstance(atmosphere.r0_m, float) else atmosphere.r0_m[0]
     strength = hcipy.Cn_squared_from_fried_parameter(r0)
     layers = []
-    for number, part in enumerate(air.fraction):
-        angle = np.deg2rad(air.wind_direction_deg[number])
-        velocity = air.wind_speed_m_per_s[number] * np.array([np.cos(angle), np.sin(angle)])
-        common = (grid, strength * part, air.outer_scale_m, velocity)
+    for number, part in enumerate(atmosphere.fraction):
+        angle = np.deg2rad(atmosphere.wind_direction_deg[number])
+        velocity = atmosphere.wind_speed_m_per_s[number] * np.array([np.cos(angle), np.sin(angle)])
+        common = (grid, strength * part, atmosphere.outer_scale_m, velocity)
         if kind == "finite":
             layers.append(hcipy.FiniteAtmosphericLayer(*common, oversampling=8, seed=number))
         else:
@@ -75,7 +75,9 @@ def hcipy_layers(configuration: LoopConfiguration, kind: str) -> Any:
     return hcipy.MultiLayerAtmosphere(layers)
 
 
-def strehl_with_true_slopes(optics: LoopOptics, air: MovingLayers, configuration: LoopConfiguration) -> float:
+def strehl_with_true_slopes(
+    optics: LoopOptics, atmosphere: MovingLayers, configuration: LoopConfiguration
+) -> float:
     """Return the mean Strehl ratio of a loop without noise, whose slopes are the mean gradients."""
     control = configuration.control
     line = CommandDelayLine(optics.mirror.commands, control.delay_frames)
@@ -83,7 +85,7 @@ def strehl_with_true_slopes(optics: LoopOptics, air: MovingLayers, configuration
     errors = np.ones(len(optics.interaction))
     strehl = np.zeros(FRAMES)
     for frame in range(FRAMES):
-        wavefront = air.wavefront_nm((frame + 0.5) / configuration.control.frame_rate_hz)
+        wavefront = atmosphere.wavefront_nm((frame + 0.5) / configuration.control.frame_rate_hz)
         wavefront = wavefront + optics.mirror.wavefront_nm(line.acting)
         field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
         strehl[frame] = optics.pupil.strehl(field)
@@ -91,7 +93,7 @@ def strehl_with_true_slopes(optics: LoopOptics, air: MovingLayers, configuration
     return float(strehl[50:].mean())
 
 
-def air_table(configuration: LoopConfiguration) -> Table:
+def atmosphere_table(configuration: LoopConfiguration) -> Table:
     """Compare ways to move the air."""
     optics = prepare(configuration)
     airs = [make_atmosphere(configuration, 1, number) for number in range(3)]
@@ -100,15 +102,15 @@ def air_table(configuration: LoopConfiguration) -> Table:
         "linear": Linear,
         "whole points": WholePoints,
     }
-    moved = {name: [kind(**vars(air)) for air in airs] for name, kind in kinds.items()}
+    moved = {name: [kind(**vars(atmosphere)) for atmosphere in airs] for name, kind in kinds.items()}
     theirs = {f"HCIPy {kind}": hcipy_layers(configuration, kind) for kind in ("infinite", "whole", "finite")}
     clock = iter(range(10**9))
 
     def step_of(layers: Any) -> Any:
         return lambda: (layers.evolve_until(next(clock) / 250 / 20), layers.phase_for(1e-6))
 
-    def ours(air: MovingLayers) -> Any:
-        return lambda: air.wavefront_nm(next(clock) / 250)
+    def ours(atmosphere: MovingLayers) -> Any:
+        return lambda: atmosphere.wavefront_nm(next(clock) / 250)
 
     candidates = {name: ours(each[0]) for name, each in moved.items()}
     with pinned():
@@ -117,26 +119,28 @@ def air_table(configuration: LoopConfiguration) -> Table:
     for name in times:
         values = {"ms a frame": best(times, name) * 1e3}
         if name in moved:
-            runs = [strehl_with_true_slopes(optics, air, configuration) for air in moved[name]]
+            runs = [strehl_with_true_slopes(optics, atmosphere, configuration) for atmosphere in moved[name]]
             values["Strehl, true slopes"] = float(np.mean(runs))
-            values["rms nm within 2 points"] = float(np.mean([_roughness(air) for air in moved[name]]))
+            values["rms nm within 2 points"] = float(
+                np.mean([_roughness(atmosphere) for atmosphere in moved[name]])
+            )
         rows.append(Row(name, values))
     return Table("air", f"Wavefront of {len(configuration.atmosphere.fraction)} layers", rows)
 
 
-def _roughness(air: MovingLayers) -> float:
+def _roughness(atmosphere: MovingLayers) -> float:
     """Return the rms difference of points next but one, over a second."""
-    fronts = [air.wavefront_nm(time) for time in np.arange(0, 1, 0.037)]
+    fronts = [atmosphere.wavefront_nm(time) for time in np.arange(0, 1, 0.037)]
     return float(np.sqrt(np.mean([np.mean((front[2:] - front[:-2]) ** 2) for front in fronts])))
 
 
 def parts_table(configuration: LoopConfiguration) -> Table:
     """Time the parts of a frame."""
     optics, detector = prepare(configuration), make_detector(configuration)
-    air = make_atmosphere(configuration, 1)
-    wavefront = air.wavefront_nm(0.1) * np.float32(0.3)
-    light = optics.sensor.frame(optics.sensor.spots(wavefront)) * configuration.photons
-    frame = detector.expose(light, np.random.default_rng(1))
+    atmosphere = make_atmosphere(configuration, 1)
+    wavefront = atmosphere.wavefront_nm(0.1) * np.float32(0.3)
+    flux = optics.sensor.frame(optics.sensor.spots(wavefront)) * configuration.photons
+    frame = detector.expose(flux, np.random.default_rng(1))
     pipelines = {
         name: make_pipeline(configuration, optics.sensor, Arm(name, settings))
         for name, settings in (("brightest", BRIGHTEST), ("TV", TV))
@@ -144,10 +148,10 @@ def parts_table(configuration: LoopConfiguration) -> Table:
     field = optics.pupil.field(wavefront, configuration.science.wavelength_m)
     commands, slopes = np.ones(optics.mirror.commands), np.ones(2 * len(optics.sensor.layout))
     parts: dict[str, Any] = {
-        "air": lambda: air.wavefront_nm(0.1),
+        "air": lambda: atmosphere.wavefront_nm(0.1),
         "mirror": lambda: optics.mirror.wavefront_nm(commands),
         "spots": lambda: optics.sensor.spots(wavefront),
-        "detector": lambda: detector.expose(light, np.random.default_rng(1)),
+        "detector": lambda: detector.expose(flux, np.random.default_rng(1)),
         "pipeline, brightest": lambda: pipelines["brightest"](frame),
         "pipeline, TV": lambda: pipelines["TV"](frame),
         "reconstructor": lambda: optics.reconstructor(slopes),
@@ -181,4 +185,4 @@ def run() -> list[Table]:
         rows.append(Row(name, {"frames/s": rate}, target, rate >= TARGET_FRAMES_PER_S, known))
     notes = ["measuring the centroid gain (120 frames) is part of each run"]
     loop = Table("loop", "Loop frames per second of a 4.2 m telescope, 7 x 7, one core", rows, notes)
-    return [loop, parts_table(configuration), air_table(configuration)]
+    return [loop, parts_table(configuration), atmosphere_table(configuration)]

@@ -30,7 +30,7 @@ from faintspot import Calibration, Layout, Settings, SlopePipeline
 from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
 from faintspot.ao_loop.control import slope_turbulence
 from faintspot.ao_loop.engine_files import write_engine_files
-from faintspot.ao_loop.observatory import prepare
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.control.compiled import integrate
 from faintspot.control.configuration import Control, ControlOptions, load_control
 from faintspot.control.learnt import CONTROLS, KALMAN, POLC, Model

@@ -22,7 +22,7 @@ from faintspot.pipeline.images import measure_images
 
 SIDE, READ_NOISE_E, FWHM_PX, BLOCKS = 16, 3.0, 1.772, 40
 SPOTS = {"near the diffraction limit": 1.14, "speckled": 2.92}
-LIGHT_E = (20.0, 60.0, 200.0)
+FLUX_E = (20.0, 60.0, 200.0)
 WIDTHS = (0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0)  # of the window, in units of the spot's
 
 Floats = NDArray[np.float64]
@@ -54,7 +54,7 @@ def main(motion_px: float, n: int) -> None:
     print("|---|---|---|---|---|---|")
     for name, d_over_r0 in SPOTS.items():
         learnt, tuned, scored = (residual_spots(n, d_over_r0, motion_px, seed) for seed in (1, 2, 3))
-        for flux_e in LIGHT_E:
+        for flux_e in FLUX_E:
             best = fs.FixedWeights.best_linear(*learnt, flux_e=flux_e, read_noise_e=READ_NOISE_E)
             arms: list[tuple[dict[str, Any], Any]] = [
                 ({"window_fwhm_px": width * FWHM_PX}, None) for width in WIDTHS

@@ -40,9 +40,9 @@ def image(detector: hcipy.Detector, path_m: np.ndarray, photons: float) -> hcipy
 
 
 flat = image(noiseless, 0 * pupil, 1.0)
-light = np.bincount(sensor.mla_index, flat, sensor.mla_grid.size)
-lit = light > 0.5 * light.max()
-photons = FLUX_E / light[lit].mean()
+flux = np.bincount(sensor.mla_index, flat, sensor.mla_grid.size)
+illuminated = flux > 0.5 * flux.max()
+photons = FLUX_E / flux[illuminated].mean()
 
 
 @cache
@@ -88,7 +88,7 @@ class Thresholded(hcipy.ShackHartmannWavefrontSensorEstimator):  # type: ignore[
     """HCIPy's estimator, after what many do first: take a level off the image."""
 
     def __init__(self, level_e: float) -> None:
-        super().__init__(sensor.mla_grid, sensor.mla_index, lit)
+        super().__init__(sensor.mla_grid, sensor.mla_index, illuminated)
         self.level_e = level_e
 
     def estimate(self, images: list[hcipy.Field]) -> hcipy.Field:
@@ -98,12 +98,12 @@ class Thresholded(hcipy.ShackHartmannWavefrontSensorEstimator):  # type: ignore[
 
 def ours(**settings: Any) -> SlopeEstimator:
     """Return faintspot's estimator: the same arguments as HCIPy's, and settings."""
-    return SlopeEstimator(sensor.mla_grid, sensor.mla_index, lit, settings=fs.Settings(**settings))
+    return SlopeEstimator(sensor.mla_grid, sensor.mla_index, illuminated, settings=fs.Settings(**settings))
 
 
 ARMS = {
     "HCIPy, centre of gravity": [
-        hcipy.ShackHartmannWavefrontSensorEstimator(sensor.mla_grid, sensor.mla_index, lit)
+        hcipy.ShackHartmannWavefrontSensorEstimator(sensor.mla_grid, sensor.mla_index, illuminated)
     ],
     "HCIPy, thresholded": [Thresholded(level) for level in (1.0, 2.0, 3.0)],
     "faintspot, brightest pixels": [ours(estimator="brightest", keep_brightest=k) for k in (20, 40)],

@@ -104,8 +104,8 @@ def compare(
     ratios: list[float] = []  # actual over stated standard error, of errors below 1 px
 
     def error(settings: fs.Settings, arm: Any = None) -> float:
-        at_full_light = ml if settings.estimator.takes_prior else settings
-        truth = bench.truth(1, place(positions(full, at_full_light, BRIGHT_READ_NOISE_E, arm, 1 / share)))
+        at_full_flux = ml if settings.estimator.takes_prior else settings
+        truth = bench.truth(1, place(positions(full, at_full_flux, BRIGHT_READ_NOISE_E, arm, 1 / share)))
         slopes = positions(thin[1], settings, read_noise, arm)
         found = place(slopes) - truth
         stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
@@ -127,21 +127,21 @@ def compare(
     errors += [error(ml, arm) for arm in (analytic, *learnt, (bright[0], bright[1] * share))]
     errors += [error(ml.replace(estimator="map", prior_std_px=PRIOR_PX, flux_e=flux), learnt[1])]
     background = float(one[1][0])
-    light = flux - background * share * np.prod(bench.window)
+    net_flux = flux - background * share * np.prod(bench.window)
     conditions: dict[str, Any] = {
         "shape": bench.window,
         "psf": one[0],
         "detector": Detector(read_noise_e=read_noise, background_e=background * share),
         "position_range_px": 1.5,
     }
-    bound = np.sqrt(2 / np.pi) * float(np.mean(fs.cramer_rao(light, **conditions)))
-    efficiency = fs.photon_efficiency(np.array(errors), light, **conditions)
+    bound = np.sqrt(2 / np.pi) * float(np.mean(fs.cramer_rao(net_flux, **conditions)))
+    efficiency = fs.photon_efficiency(np.array(errors), net_flux, **conditions)
     numbers = "".join(f"{value:10.4f}" for value in (*errors, bound))
     shown = " ".join(f"{e:.2f}" for e in efficiency), " ".join(f"{r:.2f}" for r in ratios[-3:])
     return f"{flux:5.0f} {read_noise:4.1f}{numbers}  | {shown[0]} | {shown[1]}"
 
 
-def _light_between(raw: NDArray[Any], arguments: argparse.Namespace) -> float:
+def _flux_between(raw: NDArray[Any], arguments: argparse.Namespace) -> float:
     """Return the level (ADU) on which the spots stand: dark level and background that the PSF's fit finds."""
     dark = float(np.percentile(raw.mean(axis=0), 1))
     electrons = np.maximum((raw - dark) * arguments.gain, 0)
@@ -161,7 +161,7 @@ def main() -> None:
     arguments = parser.parse_args()
     with open_frames(arguments.frames) as source:
         raw = source.block(0, source.n_frames).astype(np.float64)
-    dark = _light_between(raw, arguments) if arguments.dark is None else arguments.dark
+    dark = _flux_between(raw, arguments) if arguments.dark is None else arguments.dark
     electrons = np.maximum((raw - dark) * arguments.gain, 0)
     bench = Bench(electrons, arguments.bin, arguments.repeats, np.random.default_rng(2015))
     rng = np.random.default_rng(1503)
@@ -169,9 +169,11 @@ def main() -> None:
     lenslet = np.tile(np.arange(bench.n), len(train) // bench.n)
     bright = learnt_from(train, BRIGHT_READ_NOISE_E, lenslet)
     one = learnt_from(train, BRIGHT_READ_NOISE_E)
-    light = bench.flux - one[1][0] * np.prod(bench.window)
+    net_flux = bench.flux - one[1][0] * np.prod(bench.window)
     print(f"dark level {dark:.1f} ADU")
-    print(f"{bench.n} lenslets of {bench.window}, {bench.flux:.0f} e- each, {light:.0f} e- above background")
+    print(
+        f"{bench.n} lenslets of {bench.window}, {bench.flux:.0f} e- each, {net_flux:.0f} e- above background"
+    )
     names = (
         "brightest",
         "TV",

@@ -15,7 +15,7 @@ def compare(
     gains: Sequence[float],
     *,
     tuning: Sequence[int] = (1, 2),
-    scoring: Sequence[int] = (11, 12, 13, 14),
+    every_k: Sequence[int] = (11, 12, 13, 14),
     score: str = "Strehl ratio",
 ) -> None:
     """Print a table: the score of every arm, its standard error over pieces of air, and against the first.
@@ -42,7 +42,7 @@ def compare(
             for gain in gains
         ]
         _, number, gain = max(tried)
-        scores = np.array([strehl(setups[number], gain, seed) for seed in scoring])
+        scores = np.array([strehl(setups[number], gain, seed) for seed in every_k])
         first = scores if first is None else first
         rows = scores, scores - first
         errors = [row.std(ddof=1) / np.sqrt(len(row)) for row in rows]

@@ -43,7 +43,7 @@ pupil = telescope.pupil.astype(bool)
 
 
 @cache
-def air(seed: int) -> list[np.ndarray]:
+def atmosphere(seed: int) -> list[np.ndarray]:
     """Return the optical path difference, m, of every frame."""
     with quiet:
         layer = Atmosphere(
@@ -120,7 +120,7 @@ def strehl(setup: Setup, gain: float, seed: int) -> float:
     wfs.cam.random_state_photon_noise = np.random.RandomState(seed)
     wfs.cam.random_state_readout_noise = np.random.RandomState(seed + 1000)
     acting, latest, ratios = np.zeros(mirror.nValidAct), np.zeros(mirror.nValidAct), []
-    for path in air(seed):
+    for path in atmosphere(seed):
         setup.commands = acting, latest
         signal = measured(acting, path)
         residual = star.phase[pupil] * star.wavelength / IMAGING_M

@@ -95,13 +95,13 @@ def calibrate(manager: RTCManager) -> None:
         np.load(BENCH / f"{name}.npy") for name in ("interaction_matrix", "reference_slopes")
     )
     slopes.ref_slopes = np.zeros(slopes.valid_sub_aps.shape, np.float32)
-    slopes.ref_slopes[lit()] = reference.ravel()
+    slopes.ref_slopes[illuminated()] = reference.ravel()
     loop.im = np.zeros((slopes.valid_sub_aps.size, COMMANDS), np.float32)
-    loop.im[lit().ravel()] = matrix  # all 49 places, of which the telescope lights 36
+    loop.im[illuminated().ravel()] = matrix  # all 49 places, of which the telescope lights 36
     loop.compute_cm()
 
 
-def lit() -> np.ndarray:
+def illuminated() -> np.ndarray:
     """Which of pyRTC's places (x map above y map) the telescope lights."""
     import faintspot as fs
 

@@ -47,7 +47,7 @@ ORDERS = np.repeat(np.arange(1, 5), np.arange(2, 6))
 
 
 @cache
-def air(seed: int) -> np.ndarray:
+def atmosphere(seed: int) -> np.ndarray:
     """Return the modes' coefficients, px, in every frame: slower and larger where the order is low."""
     rng = np.random.default_rng(seed)
     keep = 1.0 - 0.01 * ORDERS
@@ -58,9 +58,9 @@ def air(seed: int) -> np.ndarray:
     return 0.8 / ORDERS * np.array(frames)
 
 
-def image(displacements: np.ndarray, light_e: float = FLUX_E, rng: Any = None) -> np.ndarray:
+def image(displacements: np.ndarray, flux_e: float = FLUX_E, rng: Any = None) -> np.ndarray:
     """Return a frame of spots that are displaced (2 n,) px; without noise where there is no `rng`."""
-    spots = np.maximum(PSF.images(displacements.reshape(2, -1).T, (SIDE, SIDE), light_e), 0.0)
+    spots = np.maximum(PSF.images(displacements.reshape(2, -1).T, (SIDE, SIDE), flux_e), 0.0)
     frame = spots.reshape(GRID, GRID, SIDE, SIDE).transpose(0, 2, 1, 3).reshape(GRID * SIDE, -1)
     if rng is not None:
         frame = rng.poisson(frame) + rng.normal(0.0, READ_NOISE_E, frame.shape)
@@ -134,7 +134,7 @@ def part_taken_off(setup: Setup, gain: float, seed: int) -> float:
         loop.im = setup.matrix.astype(np.float32)
         loop.compute_cm()
         rng, left = np.random.default_rng(seed + 1000), []
-        for coefficients in air(seed):
+        for coefficients in atmosphere(seed):
             residual = MODES @ (coefficients + np.ravel(commands.read()))
             left.append(residual)
             camera.write(image(residual, rng=rng))
@@ -145,7 +145,7 @@ def part_taken_off(setup: Setup, gain: float, seed: int) -> float:
             if component is not None:
                 component.close()
         clear_shms(streams.values())
-    return float(1.0 - np.var(left[SETTLE:]) / np.var(air(seed)[SETTLE:] @ MODES.T))
+    return float(1.0 - np.var(left[SETTLE:]) / np.var(atmosphere(seed)[SETTLE:] @ MODES.T))
 
 
 def table(name: str, **options: Any) -> dict[str, Any]:

@@ -256,4 +256,4 @@ ARMS = {
 if __name__ == "__main__":
     run(SYSTEM, SUBAPERTURES)
     print(f"about {FLUX_E:g} e- a lenslet, 1 e- read noise; Strehl ratio at 1.65 um")
-    compare(ARMS, strehl, GAINS, tuning=(1,), scoring=(11, 12, 13))
+    compare(ARMS, strehl, GAINS, tuning=(1,), every_k=(11, 12, 13))

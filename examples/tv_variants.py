@@ -61,8 +61,8 @@ def cases() -> list[Cell]:
 
 def far_cases() -> list[Cell]:
     """Return cells whose spots come near the window's edge."""
-    light = ((0.1, 30), (1.0, 30), (3.0, 80), (3.0, 200))
-    return [Cell(flux, noise, "diffraction", 1.0, 1.0, SIDE, 4.0, 0.0, 1.0) for noise, flux in light]
+    noise_and_flux = ((0.1, 30), (1.0, 30), (3.0, 80), (3.0, 200))
+    return [Cell(flux, noise, "diffraction", 1.0, 1.0, SIDE, 4.0, 0.0, 1.0) for noise, flux in noise_and_flux]
 
 
 def label(cell: Cell) -> str:
@@ -82,8 +82,8 @@ def automatic(cell: Cell) -> tuple[float, int]:
         "profile": cell.profile,
         "position_range_px": cell.position_range_px,
     }
-    light = (cell.flux_e, cell.read_noise_e)
-    return float(automatic_strength(*light, **known)), int(automatic_kept_pixels(*light, **known))
+    flux = (cell.flux_e, cell.read_noise_e)
+    return float(automatic_strength(*flux, **known)), int(automatic_kept_pixels(*flux, **known))
 
 
 def penalised_tv(images: Images, multiplier: float, iterations: int = 100, block: int = 128) -> Images:

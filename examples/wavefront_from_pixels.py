@@ -27,8 +27,8 @@ from scipy.sparse.linalg import eigsh
 
 from faintspot.ao_loop import LoopConfiguration, load_loop
 from faintspot.ao_loop.control import learnt_control
-from faintspot.ao_loop.observatory import LoopOptics, TelescopeModel, prepare
 from faintspot.ao_loop.simulation import DisabledErrors, _Loop
+from faintspot.ao_loop.telescope_model import LoopOptics, TelescopeModel, prepare
 from faintspot.control.kalman import SlopePredictor
 from faintspot.experiments.loop_arms import arm_kind
 from faintspot.turbulence.slope_covariance import phase_covariance_rad2
@@ -50,7 +50,7 @@ class Pixels:
         self.rows, self.columns = sensor.rows.astype(np.complex128), sensor.columns.astype(np.complex128)
         self.to_pixels = sensor.row_pixels.astype(np.float64), sensor.column_pixels.astype(np.float64)
         self.radians = 2e-9 * np.pi / sensor.wavelength_m
-        self.light, self.variance = configuration.photons, configuration.camera.read_noise_e**2
+        self.flux, self.variance = configuration.photons, configuration.camera.read_noise_e**2
         self.local = local
         """(points of a sub-aperture, local modes)"""
 
@@ -59,7 +59,7 @@ class Pixels:
         field = self.amplitude * np.exp(1j * self.radians * phase_nm)
         seen = self.rows @ field @ self.columns.T
         row, column = self.to_pixels
-        return self.light * (row @ (seen.real**2 + seen.imag**2) @ column.T), field, seen
+        return self.flux * (row @ (seen.real**2 + seen.imag**2) @ column.T), field, seen
 
     def likelihood(self, modes: Floats, around_nm: Any, taken: Floats) -> tuple[float, Floats, Floats]:
         """Return the log likelihood of images, its gradient (n, m) and its information (n, m, m)."""
@@ -69,7 +69,7 @@ class Pixels:
         change = self.rows @ ((1j * field)[:, None] * shapes @ self.columns.T)
         row, column = self.to_pixels
         slope = row @ (np.conj(seen)[:, None] * change).real @ column.T
-        slope = (2 * self.radians * self.light * slope).reshape(n, shapes.shape[1], -1)
+        slope = (2 * self.radians * self.flux * slope).reshape(n, shapes.shape[1], -1)
         expected = np.maximum(image, 0).reshape(n, -1) + self.variance
         measured = taken.reshape(n, -1) + self.variance
         weighted = slope / expected[:, None]
@@ -105,9 +105,9 @@ class Model:
         row, column = (part.ravel() for part in np.mgrid[:samples, :samples])
         points = cells[:, :1] * samples + row, cells[:, 1:] * samples + column
         step = configuration.width_m / sensor.points
-        air = configuration.atmosphere
+        atmosphere = configuration.atmosphere
         places = np.column_stack([points[1].ravel(), points[0].ravel()]) * step
-        covariance = phase_covariance_rad2(places, float(np.mean(air.r0_m)), air.outer_scale_m)
+        covariance = phase_covariance_rad2(places, float(np.mean(atmosphere.r0_m)), atmosphere.outer_scale_m)
         power, modes = eigsh(covariance * (500 / (2 * np.pi)) ** 2, MODES)
         blocks = modes.reshape(len(cells), -1, MODES)
         _, own = np.linalg.eigh(np.einsum("nak,k,nbk->ab", blocks, power, blocks))
@@ -189,16 +189,16 @@ def from_slopes(model: Model, noise_px: float) -> tuple[Floats, Floats]:
 
 def open_loop(configuration: LoopConfiguration) -> None:
     """Print the errors of one frame's estimates, without a prediction, and the bound."""
-    model, observatory = Model.of(configuration), TelescopeModel(configuration, 77)
+    model, telescope_model = Model.of(configuration), TelescopeModel(configuration, 77)
     rng, inverse = np.random.default_rng(3), np.diag(1 / model.power)
     start, rough = from_slopes(model, 0.43)
     perfect, no_noise = from_slopes(model, 0.0)
     information, errors = np.zeros((MODES, MODES)), []
     for frame in range(FRAMES):
-        wavefront, _ = observatory.wavefronts(7.3 * frame, np.zeros(model.optics.mirror.commands))
+        wavefront, _ = telescope_model.wavefronts(7.3 * frame, np.zeros(model.optics.mirror.commands))
         truth = model.modes.T @ wavefront[model.points].ravel().astype(np.float64)
         slopes = model.optics.sensor.mean_slopes_px(wavefront)
-        taken = model.taken(observatory.frame(frame, wavefront))
+        taken = model.taken(telescope_model.frame(frame, wavefront))
         begin = start @ (slopes + rng.normal(0, 0.43, len(slopes)))
         zero = np.zeros(MODES)
         found = [model.fit(taken, zero, inverse, each, steps=STEPS_OPEN)[0] for each in (begin, truth)]
@@ -208,8 +208,8 @@ def open_loop(configuration: LoopConfiguration) -> None:
         information += model.information(model.pixels.likelihood(local, 0.0, taken)[2]) / FRAMES
     rms = np.sqrt(np.square(errors).mean(axis=0))
     spread = np.square(errors).std(axis=0, ddof=1) / np.sqrt(FRAMES) / (2 * rms)
-    light = f"{configuration.photons:g} photo-electrons, {FRAMES} frames"
-    print(f"{configuration.name}, {light}; nm rms in the mirror's space")
+    flux = f"{configuration.photons:g} photo-electrons, {FRAMES} frames"
+    print(f"{configuration.name}, {flux}; nm rms in the mirror's space")
     bound = model.in_mirror(np.linalg.inv(information + inverse))
     print(f"  {'bound (Van Trees)':40s} {bound:6.1f}")
     titles = (
@@ -239,13 +239,13 @@ class PixelLoop(_Loop):
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         model, commands = self.model, self.line.acting
-        time = self.idealised.time_s(frame, self.configuration.control.frame_rate_hz)
-        after, seen = self.observatory.wavefronts(time, commands)
+        time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
+        after, seen = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         mean = self.from_slopes @ self.predictor.mean_px
         samples = self.configuration.sensor.samples
         mirror = self.optics.mirror.wavefront_nm(commands)[model.points].reshape(-1, samples, samples)
-        taken = model.taken(self.observatory.frame(frame, seen))
+        taken = model.taken(self.telescope_model.frame(frame, seen))
         found, _ = model.fit(taken, mean, self.inverse, mean, mirror, STEPS_CLOSED)
         self.predictor.state += self.to_state @ (model.slopes @ (found - mean))
         self.line.put(self.command @ self.predictor.state)

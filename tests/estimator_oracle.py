@@ -219,7 +219,7 @@ def by_score(case: Case, s: int, g: Floats, task: Task) -> Estimate:
         width = case.score.smoothing_px / oracle.START_STD_PER_FWHM
         first = oracle.start(g, replace(task, fwhm=(width, width), reach=min(4, max(g.shape) - 1)))
     kind, flux = int(case.score.index[s]), float(case.each("flux_e")[s])
-    return oracle.trained(g, case.score, kind, flux, first, task, oracle.believed_light(g, flux, task))
+    return oracle.trained(g, case.score, kind, flux, first, task, oracle.believed_flux(g, flux, task))
 
 
 def by_gravity(case: Case, s: int, g: Floats, task: Task) -> Estimate:

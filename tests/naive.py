@@ -270,8 +270,8 @@ def slopes(
             flags |= Flag.INFEASIBLE_STRENGTH
         if not denoised.converged:
             flags |= Flag.NOT_CONVERGED
-        results.append(_located(denoised, value, flags, bad, layout.centres[s], layout.corners[s]))
-        if reference is not None and results[-1].flags & (Flag.NO_LIGHT | Flag.TOO_MANY_BAD_PIXELS) == 0:
+        results.append(_spot_fits(denoised, value, flags, bad, layout.centres[s], layout.corners[s]))
+        if reference is not None and results[-1].flags & (Flag.NO_FLUX | Flag.TOO_MANY_BAD_PIXELS) == 0:
             results[-1].x -= float(np.asarray(reference)[s, 0])
             results[-1].y -= float(np.asarray(reference)[s, 1])
     return results
@@ -295,18 +295,18 @@ def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:
     return replace(denoised, converged=denoised.converged or tolerance == 0)
 
 
-def _located(denoised: Denoised, value: Any, flags: int, bad: int, centre: Floats, corner: Any) -> Slope:
+def _spot_fits(denoised: Denoised, value: Any, flags: int, bad: int, centre: Floats, corner: Any) -> Slope:
     """Background, centroid and validity of one denoised sub-aperture; position from its centre."""
     ny, nx = denoised.image.shape
     spot = brightest_pixels(denoised.image, int(value["keep_brightest"]), str(value["rule"]))
     flux = float(spot.sum())
     x, y = centre_of_gravity(spot)
-    lit = flux > value["flux_floor"] * np.max(np.abs(denoised.image))
-    if not lit or abs(x) > nx / 2 or abs(y) > ny / 2:
-        flags |= Flag.NO_LIGHT
+    illuminated = flux > value["flux_floor"] * np.max(np.abs(denoised.image))
+    if not illuminated or abs(x) > nx / 2 or abs(y) > ny / 2:
+        flags |= Flag.NO_FLUX
     if flags & Flag.TOO_MANY_BAD_PIXELS:  # no other reason is given
         flags &= Flag.TOO_MANY_BAD_PIXELS | Flag.SATURATED
-    if flags & (Flag.NO_LIGHT | Flag.TOO_MANY_BAD_PIXELS):
+    if flags & (Flag.NO_FLUX | Flag.TOO_MANY_BAD_PIXELS):
         x = y = 0.0
     else:
         x += corner[1] + (nx - 1) / 2 - centre[0]

@@ -158,13 +158,13 @@ def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
     """Inverse of the variance that the likelihood ascribes to every pixel."""
     if name == "matched":
         return np.ones_like(m)
-    light = np.maximum(m, 0.0)  # a spline may dip below zero
+    flux = np.maximum(m, 0.0)  # a spline may dip below zero
     floor = max(task.variance + task.weight_floor * first_flux, LEAST_VARIANCE)
     model_error_squared = min(task.model_error**2, MOST_MODEL_ERROR_E / first_flux)
-    return 1.0 / (floor + task.excess * light + model_error_squared * light**2)
+    return 1.0 / (floor + task.excess * flux + model_error_squared * flux**2)
 
 
-def believed_light(g: ArrayLike, expected: float, task: Task) -> float:
+def believed_flux(g: ArrayLike, expected: float, task: Task) -> float:
     """The expected light, or that above the window's edges where it is far more."""
     g = np.asarray(g, np.float64)
     inner = g[1:-1, 1:-1]
@@ -349,14 +349,14 @@ def fixed_window(
         seen = float(np.sum(weights[axis] * (ahead - behind))) / 0.5
         weights[axis] /= max(seen, 0.02) if gain is None else gain
     weights[2] /= max(float(np.sum(weights[2] * spot)), 0.02)
-    light = float(np.sum(weights[2] * g))
-    divisor = light if divisor is None else divisor
+    flux = float(np.sum(weights[2] * g))
+    divisor = flux if divisor is None else divisor
     found, errors = [], []
     for axis, home in enumerate((x0, y0)):
         found.append(home + float(np.sum(weights[axis] * g)) / divisor - float(np.sum(weights[axis] * spot)))
         noise = weights[axis] ** 2 * (task.variance + task.excess * divisor * np.maximum(spot, 0.0))
         errors.append(task.error_scale * math.sqrt(float(noise.sum())) / divisor)
-    return Estimate(found[0], found[1], light, errors[0], errors[1])
+    return Estimate(found[0], found[1], flux, errors[0], errors[1])
 
 
 def thresholded(g: ArrayLike, threshold_e: float) -> Estimate:

@@ -143,11 +143,11 @@ def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> None:
         )
     ):
         assert slopes.bad_pixels[s] == expected.bad_pixels
-        assert (slopes.flags[s] ^ expected.flags) & ~(Flag.NO_LIGHT | 16 | 32) == 0
+        assert (slopes.flags[s] ^ expected.flags) & ~(Flag.NO_FLUX | 16 | 32) == 0
         if expected.denoised.margin < MARGIN or 0 < strengths[s] < 1e-6 * scale:
             continue  # a strength below the image's rounding error counts as zero
         assert slopes.iterations[s] == expected.iterations
-        assert (slopes.flags[s] ^ expected.flags) & ~Flag.NO_LIGHT == 0
+        assert (slopes.flags[s] ^ expected.flags) & ~Flag.NO_FLUX == 0
         if rules[s] == "threshold" and expected.bad_pixels:
             continue  # filled pixels may tie with others but for rounding
         error_e = ROUNDING * scale * ny * nx

@@ -156,7 +156,7 @@ class TestIndependence:
         assert_same(slopes, case.measure())
 
     @pytest.mark.parametrize("estimator", ["map", "trained"])
-    def test_measured_light_does_not_depend_on_frames_before(self, estimator: str) -> None:
+    def test_measured_flux_does_not_depend_on_frames_before(self, estimator: str) -> None:
         case = random_case(10, estimator, n=6)
         measured = replace(case, settings=case.settings.replace(flux_e=None))
         frame = case.images.reshape(-1, case.images.shape[2])
@@ -188,9 +188,9 @@ class TestLocalBackground:
         for dark, fitted in ((None, True), (3.0, False)):
             case = random_case(12, "ml", n=5)
             pipeline = replace(case, calibration=replace(case.calibration, dark=dark)).pipeline()
-            assert pipeline.for_images().preparation.prepared.fits_background is fitted  # type: ignore[attr-defined]
+            assert pipeline.for_images().plan.prepared.fits_background is fitted  # type: ignore[attr-defined]
 
-    def test_light_that_is_measured_does_not_count_the_background(self) -> None:
+    def test_flux_that_is_measured_does_not_count_the_background(self) -> None:
         """40 spots give their mean light to 5 %; a few per cent of it fall onto the edge."""
         psf, rng = one_psf(), np.random.default_rng(3)
         images = psf.images(rng.uniform(-1, 1, (40, 2)), (12, 12), 500.0) + rng.normal(
@@ -200,12 +200,12 @@ class TestLocalBackground:
         settings = fs.Settings("map", search_range_px=3.0)
         case = Case(images.astype(np.float32), settings, fs.Calibration(read_noise_e=1.0), psf)
         pipeline = case.pipeline()
-        light = np.empty((1, 40), np.float32)
+        flux = np.empty((1, 40), np.float32)
         frame = case.images.reshape(1, -1, 12)
         source = pipeline.source(frame, frame.dtype)
         scratch = new_scratch(source.lanes, 12, 12)
-        pipeline.preparation.prepared.light_kernel(source, 0, -(-40 // pipeline.width), scratch, light)
-        assert light.mean() == pytest.approx(500.0, rel=0.1)
+        pipeline.plan.prepared.flux_kernel(source, 0, -(-40 // pipeline.width), scratch, flux)
+        assert flux.mean() == pytest.approx(500.0, rel=0.1)
         assert np.mean(np.abs(pipeline(frame[0]).flux - 500.0) < 100.0) > 0.95
 
 

@@ -40,7 +40,7 @@ def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[
     _, ny, nx = shape
     hot = np.zeros((ny, nx), np.float32)
     hot[rng.integers(ny), rng.integers(nx)] = 1e6
-    board = np.indices((ny, nx)).sum(axis=0) % 2
+    latest_messages = np.indices((ny, nx)).sum(axis=0) % 2
     noise = rng.normal(0.0, 1.0, (ny, nx))
     kinds = [
         np.zeros((ny, nx)),
@@ -53,8 +53,8 @@ def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[
         3e38 * np.clip(noise, -1, 1),
         hot,
         -hot,
-        1e4 * board,
-        np.where(board, np.nan, 5.0),
+        1e4 * latest_messages,
+        np.where(latest_messages, np.nan, 5.0),
         np.full((ny, nx), np.nan),
         np.full((ny, nx), np.inf),
         np.where(rng.random((ny, nx)) < 0.2, -np.inf, noise),
@@ -108,7 +108,7 @@ class TestImages:
 
     @EVERY
     @pytest.mark.parametrize("level", [0.0, -40.0])
-    def test_no_light_is_flagged(self, estimator: str, level: float) -> None:
+    def test_no_flux_is_flagged(self, estimator: str, level: float) -> None:
         """A frame without any light in which light was expected."""
         case = flat_case(estimator, np.full((5, 8, 9), level, np.float32), flux_e=400.0)
         slopes = case.measure()
@@ -117,9 +117,9 @@ class TestImages:
             return  # the zeros beyond the window are the light that it sees
         if estimator == "window":
             return  # it divides by the light that was expected, so that a faint frame is no worse than others
-        assert np.all(slopes.flags & Flag.NO_LIGHT)
+        assert np.all(slopes.flags & Flag.NO_FLUX)
 
-    def test_map_notices_that_there_is_no_light(self) -> None:
+    def test_map_notices_that_there_is_no_flux(self) -> None:
         images = np.random.default_rng(3).normal(0.0, 1.0, (300, 10, 10)).astype(np.float32)
         slopes = flat_case("map", images, flux_e=400.0, prior_std_px=1.0).measure()
         assert np.mean(slopes.flags == 0) < 0.1
@@ -155,7 +155,7 @@ class TestImages:
         assert_same(case.measure(), replace(case, images=images.astype(dtype)).measure())
 
     @EVERY
-    def test_outside_light_does_not_pull(self, estimator: str) -> None:
+    def test_outside_flux_does_not_pull(self, estimator: str) -> None:
         """A spot beyond the search range gives a slope within it."""
         images = one_psf().images([[3.0, -3.0]] * 4, (12, 12), 2000.0).astype(np.float32)
         slopes = flat_case(estimator, images, search_range_px=0.5, flux_e=2000.0).measure()
@@ -207,7 +207,7 @@ class TestSettings:
         case = random_case(1, estimator, n=5, window=(8, 8))
         for row in (groups.ZERO_X, groups.ZERO_Y, groups.RANGE):
             pipeline = case.pipeline()
-            for table in pipeline.preparation._levels:
+            for table in pipeline.plan._levels:
                 table[row] = number
             assert pipeline(case.images.reshape(-1, 8), case.prior).x.shape == (5,)
 

@@ -69,7 +69,7 @@ class TestSpot:
 
 
 class TestStart:
-    def test_finds_the_pixel_and_the_light(self) -> None:
+    def test_finds_the_pixel_and_the_flux(self) -> None:
         task = spot_task()
         assert task.spot is not None
         found = oracle.start(500 * task.spot.images(1.5, -2.0, SHAPE)[0], task)
@@ -123,7 +123,7 @@ class TestLikelihood:
         found = oracle.fisher(image, task, "matched")
         np.testing.assert_allclose([found.x, found.y, found.flux], best.x, rtol=1e-5, atol=1e-6)
 
-    def test_prior_rules_where_there_is_no_light(self) -> None:
+    def test_prior_rules_where_there_is_no_flux(self) -> None:
         task = spot_task(variance=25.0, prior=(0.3, -0.2), prior_std=0.1, steps=20)
         found = oracle.fisher(drawn(task, 5, 1)[0][0], task, "map")
         assert math.hypot(found.x - 0.3, found.y + 0.2) < 0.05
@@ -137,7 +137,7 @@ class TestLikelihood:
 
 
 class TestPosterior:
-    def test_equals_map_where_there_is_light(self) -> None:
+    def test_equals_map_where_there_is_flux(self) -> None:
         """The posterior is a Gaussian then; the two likelihoods differ in second order."""
         task = spot_task(variance=1.0, prior_std=0.5, steps=10, weight_floor=0.0)
         image = drawn(task, 3000, 1)[0][0]
@@ -147,7 +147,7 @@ class TestPosterior:
         assert posterior.x == pytest.approx(found.x, abs=0.2 * found.error_x)
         assert posterior.error_x == pytest.approx(found.error_x, rel=0.1)
 
-    def test_is_the_prior_without_light(self) -> None:
+    def test_is_the_prior_without_flux(self) -> None:
         task = spot_task(variance=100.0, prior=(0.2, 0.0), prior_std=0.4)
         grid = np.linspace(-3, 3, 31)
         found = oracle.grid_posterior(np.zeros(SHAPE), task, 0.01, grid, grid)

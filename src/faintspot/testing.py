@@ -71,8 +71,8 @@ class EstimatorTests:
         """Return a frame of n spots, and their positions (n, 2)."""
         rng = np.random.default_rng(seed)
         truth = rng.uniform(-reach_px, reach_px, (n, 2))
-        light = FLUX_E * spots(truth, shape=(SIDE, SIDE), profile="gaussian", size=SPOT_FWHM_PX / 2)
-        images = rng.poisson(light) + rng.normal(0.0, READ_NOISE_E, light.shape) if noise else light
+        flux = FLUX_E * spots(truth, shape=(SIDE, SIDE), profile="gaussian", size=SPOT_FWHM_PX / 2)
+        images = rng.poisson(flux) + rng.normal(0.0, READ_NOISE_E, flux.shape) if noise else flux
         return images.reshape(n * SIDE, SIDE).astype(np.float32), truth
 
     # The tests --------------------------------------------------------------------------------------

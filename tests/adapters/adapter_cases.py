@@ -26,14 +26,14 @@ def needs(package: str, extra: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(absent, reason=f"{package} is not installed (extra {extra})")
 
 
-def images(light_e: float = 1000.0, positions: Any = POSITIONS) -> np.ndarray:
+def images(flux_e: float = 1000.0, positions: Any = POSITIONS) -> np.ndarray:
     """Return spots without noise, (n, SIDE, SIDE) electrons."""
-    return np.asarray(PSF.images(np.asarray(positions), (SIDE, SIDE), light_e))
+    return np.asarray(PSF.images(np.asarray(positions), (SIDE, SIDE), flux_e))
 
 
-def noisy(rng: np.random.Generator, light_e: float = FAINT_E, positions: Any = POSITIONS) -> np.ndarray:
+def noisy(rng: np.random.Generator, flux_e: float = FAINT_E, positions: Any = POSITIONS) -> np.ndarray:
     """Return the same with photon noise and 1 electron of read noise."""
-    clean = images(light_e, positions)
+    clean = images(flux_e, positions)
     return np.asarray(rng.poisson(np.maximum(clean, 0.0)) + rng.normal(0.0, 1.0, clean.shape))
 
 

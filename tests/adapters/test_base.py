@@ -37,13 +37,13 @@ def tall(stack: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_calibration_does_not_depend_on_its_light(name: str) -> None:
+def test_calibration_does_not_depend_on_its_flux(name: str) -> None:
     # The frame is brought to the same light first; pixels are rounded to float32, and light that the pipeline
     # is told counts in steps of up to 10 % ("map").
     slopes = []
-    for light in (FAINT_E, 1e3, 5e6):
+    for flux in (FAINT_E, 1e3, 5e6):
         measured = tool(ESTIMATORS[name])
-        slopes.append(measured.measure(tall(images(light)), noise_free=True))
+        slopes.append(measured.measure(tall(images(flux)), noise_free=True))
         assert measured.last.valid.all()
     np.testing.assert_allclose(slopes[1:], [slopes[0], slopes[0]], rtol=0, atol=2e-4)
     # Spots within 1 px, where all of these see at least 0.7 of a displacement, and none more than 1.2 of it.
@@ -86,37 +86,37 @@ def test_a_calibration_without_slopes_is_refused() -> None:
         tool(EVERYTHING).measure(tall(stack), noise_free=True)
 
 
-def test_mean_light_is_followed_where_nobody_says_it() -> None:
+def test_mean_flux_is_followed_where_nobody_says_it() -> None:
     rng, middle = np.random.default_rng(2), np.zeros((N, 2))
     measured = tool(Settings("window"))
     known_yet = []
     for _ in range(100):
         measured.measure(tall(noisy(rng, positions=middle)))
-        known_yet.append(measured.light is not None)
+        known_yet.append(measured.flux is not None)
     assert known_yet == 19 * [False] + 81 * [True]
     # 100 frames of 40 e-; the sum under the window has a noise of 10 e- or less, its mean of 1.
-    assert measured.light is not None
-    np.testing.assert_allclose(measured.light.flux_e, FAINT_E, atol=6.0)
-    known = measured.pipeline.preparation.sensor.flux_e
-    np.testing.assert_allclose(known, measured.light.flux_e, rtol=0.1)
+    assert measured.flux is not None
+    np.testing.assert_allclose(measured.flux.flux_e, FAINT_E, atol=6.0)
+    known = measured.pipeline.plan.sensor.flux_e
+    np.testing.assert_allclose(known, measured.flux.flux_e, rtol=0.1)
     measured.measure(tall(images(1e6)), noise_free=True)
-    assert measured.light.flux_e.max() < 60.0  # calibrations do not count
+    assert measured.flux.flux_e.max() < 60.0  # calibrations do not count
 
 
 @pytest.mark.parametrize(
     ("settings", "options"),
     [
         (Settings("window", flux_e=FAINT_E), {}),
-        (Settings("window"), {"light_frames": None}),
+        (Settings("window"), {"flux_frames": None}),
         (Settings("brightest"), {}),
     ],
 )
-def test_mean_light_that_is_known_or_not_wanted(settings: Settings, options: dict[str, Any]) -> None:
+def test_mean_flux_that_is_known_or_not_wanted(settings: Settings, options: dict[str, Any]) -> None:
     rng, measured = np.random.default_rng(2), tool(settings, **options)
     before = measured.pipeline
     for _ in range(30):
         measured.measure(tall(noisy(rng)))
-    assert measured.light is None
+    assert measured.flux is None
     assert measured.pipeline is before
 
 
@@ -130,8 +130,8 @@ def test_a_prior_draws_slopes_towards_it() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"calibration_light_e": 0.0}, "calibration_light_e = 0"),
-        ({"light_frames": 0.5}, "light_frames = 0.5"),
+        ({"calibration_flux_e": 0.0}, "calibration_flux_e = 0"),
+        ({"flux_frames": 0.5}, "flux_frames = 0.5"),
         ({"psf": None}, "psf"),
     ],
 )

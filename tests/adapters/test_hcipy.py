@@ -145,7 +145,7 @@ def test_last_estimate_says_how_good_it_is(optics: Any) -> None:
     image = image_through(optics) / 100
     image[optics.mla_index == 3] = 0.0
     slopes = np.asarray(estimator.estimate([image]))
-    assert estimator.flags[3] & fs.SubapertureFlag.NO_LIGHT
+    assert estimator.flags[3] & fs.SubapertureFlag.NO_FLUX
     assert not estimator.flags[4] & INVALID
     np.testing.assert_array_equal(slopes[:, 3], 0.0)
     np.testing.assert_allclose(estimator.slopes.x, slopes[0] / PIXEL_M, rtol=1e-6, atol=1e-7)

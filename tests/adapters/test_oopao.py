@@ -100,7 +100,7 @@ def test_noise_switches_calibration_off_and_prediction_on() -> None:
     assert len(asked) == 1
 
 
-def test_a_spot_without_light_has_slope_zero() -> None:
+def test_a_spot_without_flux_has_slope_zero() -> None:
     wfs = StandIn()
     oopao.attach(wfs, EVERYTHING)
     wfs.sh_data["src_0"].reference_signal_2D += 0.3

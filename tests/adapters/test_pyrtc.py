@@ -72,7 +72,7 @@ def test_only_valid_subapertures_are_measured() -> None:
     assert len(own.tool.pipeline.layout) == N
 
 
-def test_frames_without_light() -> None:
+def test_frames_without_flux() -> None:
     own = measuring()
     np.testing.assert_array_equal(own.maps(process(), np.zeros((30, 30)), no_stream), 0.0)
     stack = images()

@@ -85,7 +85,7 @@ def test_predicted_slopes(wfs: StandIn) -> None:
     assert attached.measured.last.valid.all()
 
 
-def test_a_spot_without_light_has_slope_zero(wfs: StandIn) -> None:
+def test_a_spot_without_flux_has_slope_zero(wfs: StandIn) -> None:
     attached = soapy.attach(wfs, EVERYTHING)
     wfs.config.photonNoise = True
     frame = images()

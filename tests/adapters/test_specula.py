@@ -116,7 +116,7 @@ class TestRealTool:
             errors.append(np.std(slopes - (true - 0.05)))
         assert errors[1] < 0.3 * errors[0]  # 5 electrons say little, and a prior of 0.1 px a lot
 
-    def test_a_spot_without_light_has_the_slope_of_the_null(self, subapertures: Any, specula: Any) -> None:
+    def test_a_spot_without_flux_has_the_slope_of_the_null(self, subapertures: Any, specula: Any) -> None:
         from specula.data_objects.slopes import Slopes
 
         stack = images()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import faintspot as fs
-from faintspot.advice.seen import Seen
+from faintspot.advice.loop_telemetry import LoopTelemetry
 
 LAYOUT = fs.Layout.grid((6, 6), pixels=8)
 RATE_HZ = 200.0
@@ -21,7 +21,7 @@ def seen_with_truth(
     turn: int = 60,
     vibration: tuple[float, float] = (0.0, 0.0),
     seed: int = 1,
-) -> tuple[Seen, np.ndarray]:
+) -> tuple[LoopTelemetry, np.ndarray]:
     """Return two arms in turn and the true residual slopes, px.
 
     The air is a sum of slow waves, the mirror follows it by two frames; arm a has the noise `noise_px[a]`, a
@@ -32,21 +32,25 @@ def seen_with_truth(
     m, time = 2 * len(LAYOUT), np.arange(frames) / RATE_HZ
     frequency = rng.uniform(0.2, 6.0, (12, m))
     phase = rng.uniform(0, 2 * np.pi, (12, m))
-    air = np.sin(2 * np.pi * time[:, None, None] * frequency + phase).sum(axis=1) * 0.2
+    atmosphere = np.sin(2 * np.pi * time[:, None, None] * frequency + phase).sum(axis=1) * 0.2
     amplitude, at = vibration
-    air[:, : m // 2] += (amplitude * np.sin(2 * np.pi * at * time))[:, None]
+    atmosphere[:, : m // 2] += (amplitude * np.sin(2 * np.pi * at * time))[:, None]
     arm = np.arange(frames) // turn % 2
-    held = -np.vstack([np.zeros((2, m)), air[:-2]])
+    held = -np.vstack([np.zeros((2, m)), atmosphere[:-2]])
     held += np.array(extra_px)[arm][:, None] * rng.standard_normal((frames, m))
-    residual = air + held
+    residual = atmosphere + held
     noise = np.array(noise_px)[arm][:, None]
     measured = np.array(gains)[arm][:, None] * residual + noise * rng.standard_normal((frames, m))
     variance = np.broadcast_to(noise**2, measured.shape)
-    seen = Seen(arm, np.arange(frames) // turn, measured, variance, np.ones_like(measured), held, RATE_HZ)
+    seen = LoopTelemetry(
+        arm, np.arange(frames) // turn, measured, variance, np.ones_like(measured), held, RATE_HZ
+    )
     return seen, residual
 
 
-def recording(seen: Seen, commands: np.ndarray, delay: int, **changes: Any) -> fs.io.telemetry.Telemetry:
+def recording(
+    seen: LoopTelemetry, commands: np.ndarray, delay: int, **changes: Any
+) -> fs.io.telemetry.Telemetry:
     """Return a recording of slopes and of the commands that were computed from each frame."""
     from faintspot.io.telemetry import Telemetry
 

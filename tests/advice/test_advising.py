@@ -18,7 +18,7 @@ pytest.importorskip("zarr")
 from tests.realtime.closed_loop import CONFIGURATION, PATIENCE_S, Sky, configured, make_engine
 
 from faintspot.advice.advising import Advice, Loop, write_journal
-from faintspot.advice.known import Known
+from faintspot.advice.measured import Measured
 from faintspot.base.errors import InputError
 from faintspot.realtime.commands import LENGTHY, commands_of
 from faintspot.realtime.control import ControlServer
@@ -60,7 +60,7 @@ def test_advice_from_the_command_line(running: tuple[Loop, Sky, Path], run: Comm
     assert told.code == 0, told.err
     lines = told.out.splitlines()
     assert lines[0].endswith("frames with brightest")
-    for name in ("light", "read noise", "width of the spots", "centroid gain", "r0", "wind", "vibrations"):
+    for name in ("flux", "read noise", "width of the spots", "centroid gain", "r0", "wind", "vibrations"):
         assert any(line.startswith(f"  {name}") for line in lines), told.out
     assert loop.ask("status")["advice"] == lines[:-1]
     with pytest.raises(InputError, match="lines = 3: expected a list of texts"):
@@ -69,7 +69,7 @@ def test_advice_from_the_command_line(running: tuple[Loop, Sky, Path], run: Comm
     assert journal[-1]["name"] == loop.name
     known = {each["name"]: each for each in journal[-1]["known"]}
     # 200 photons for sub-apertures that are half lit or more, and what 16 pixels hold of speckled spots.
-    assert 120 < known["light"]["value"] < 200
+    assert 120 < known["flux"]["value"] < 200
     assert known["read noise"]["value"] == pytest.approx(1.0, abs=0.2)
     recorded = path.parent / "night.zarr"
     run.ok("realtime", "record", recorded, "--name", loop.name, "--frames", 400)
@@ -87,7 +87,7 @@ def test_an_open_loop_tells_nothing(running: tuple[Loop, Sky, Path]) -> None:
 
 def test_the_journal(tmp_path: Path) -> None:
     config = tmp_path / "faintspot.toml"
-    advice = Advice(500, [Known("light", "e-", 3.0, 0.1)])
+    advice = Advice(500, [Measured("flux", "e-", 3.0, 0.1)])
     for _ in range(2):
         place = write_journal(config, advice.entry("one"))
     written = json.loads(place.read_text())

@@ -9,14 +9,14 @@ import pytest
 from tests.advice.advice_cases import LAYOUT, seen_with_truth
 
 import faintspot as fs
+from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.advice.residual import compared_residual, residual_wavefront, wavefront_modes
-from faintspot.advice.seen import Seen
 from faintspot.pipeline.slopes import RESULT_TYPES
 
 MODES, UNIT = wavefront_modes(LAYOUT)
 
 
-def by_arm(seen: Seen, values: np.ndarray) -> np.ndarray:
+def by_arm(seen: LoopTelemetry, values: np.ndarray) -> np.ndarray:
     return np.array([np.nanmean(values[seen.arm == arm]) for arm in (0, 1)])
 
 

@@ -86,17 +86,17 @@ def test_near_the_best_of_a_search(cell: Cell) -> None:
         assert found < 1.10 * plain.min(), method
 
 
-def test_strength_grows_with_read_noise_and_with_light_in_the_wings() -> None:
+def test_strength_grows_with_read_noise_and_with_flux_in_the_wings() -> None:
     common: dict[str, Any] = {"pixels": 256, "spot_fwhm_px": 1.772}
     noise = automatic_strength(1000.0, [0.1, 0.3, 1.0, 3.0, 10.0], **common)
     assert (np.diff(noise) > 0).all()
-    light = automatic_strength([30.0, 100.0, 1000.0, 1e4], 0.1, **common)
-    assert (np.diff(light) > 0).all()
+    flux = automatic_strength([30.0, 100.0, 1000.0, 1e4], 0.1, **common)
+    assert (np.diff(flux) > 0).all()
     without_wings = automatic_strength([30.0, 100.0, 1000.0, 1e4], 0.1, profile="gaussian", **common)
-    assert (without_wings < light).all()
+    assert (without_wings < flux).all()
 
 
-def test_strength_is_below_the_noise_of_a_mean_pixel_where_light_is_plenty() -> None:
+def test_strength_is_below_the_noise_of_a_mean_pixel_where_flux_is_plenty() -> None:
     for profile in PROFILES:
         strength = automatic_strength(2000.0, 3.0, pixels=256, spot_fwhm_px=2.0, profile=profile)
         assert 1.0 < strength < np.sqrt(9.0 + 2000.0 / 256)
@@ -120,7 +120,7 @@ def test_more_pixels_after_denoising_than_without_where_noise_is_large() -> None
     assert kept["none"] < kept["smoothed"]
 
 
-def test_without_light_nothing_is_denoised_and_nearly_all_pixels_are_kept() -> None:
+def test_without_flux_nothing_is_denoised_and_nearly_all_pixels_are_kept() -> None:
     arguments: dict[str, Any] = {"pixels": 256, "spot_fwhm_px": 2.0}
     assert automatic_strength(0.0, 3.0, **arguments) == 0
     assert automatic_smoothing(0.0, 3.0, **arguments) == 0

@@ -36,7 +36,7 @@ def test_single_pixels() -> None:
 
 @every_dtype
 @pytest.mark.parametrize("value", [0.0, -1.0, -1e-44])
-def test_without_light(dtype: Any, value: float) -> None:
+def test_without_flux(dtype: Any, value: float) -> None:
     assert np.array_equal(fs.centre_of_gravity(np.full((3, 4, 4), value, dtype)), np.zeros((3, 2)))
 
 

@@ -23,5 +23,5 @@ from faintspot.estimators.total_variation import TotalVariation
     ],
     ids=lambda estimator: estimator.name,
 )
-def test_references_leave_out_what_is_for_faint_light(faint: Estimator, bright: Estimator) -> None:
-    assert faint.for_bright_light() == bright
+def test_references_leave_out_what_is_for_faint_flux(faint: Estimator, bright: Estimator) -> None:
+    assert faint.for_bright_flux() == bright

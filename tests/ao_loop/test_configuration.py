@@ -43,7 +43,7 @@ def test_a_file_goes_before_a_shipped_name(tmp_path: Path, monkeypatch: pytest.M
     assert load_loop("canary.toml").name == "mine"
 
 
-def test_light_by_magnitude() -> None:
+def test_flux_by_magnitude() -> None:
     loop = LoopConfiguration().replace("camera", photons_per_subaperture=None, magnitude=11.0)
     assert loop.photons == pytest.approx(float(loop.photometry.electrons(11.0)))
     assert 100 < loop.photons < 500

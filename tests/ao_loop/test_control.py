@@ -10,8 +10,8 @@ import faintspot as fs
 from faintspot.ao_loop import Arm, LoopConfiguration, simulate_loop
 from faintspot.ao_loop.arms import PRIOR
 from faintspot.ao_loop.control import learnt_control, telemetry_of
-from faintspot.ao_loop.observatory import prepare
 from faintspot.ao_loop.simulation import DisabledErrors
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.errors import InputError
 from faintspot.control.learning import CONTROLS, INTEGRATOR
 from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, arm_kind
@@ -48,7 +48,9 @@ def test_never_below_the_integrator(told: float, kinds: list[str]) -> None:
 
     Three runs of 250 scored frames: differences are paired, and 0.015 is three of their standard errors.
     """
-    configuration = FAINT.replace("control", told_wind_factor=told, told_wind_turn_deg=90.0 * (told != 1))
+    configuration = FAINT.replace(
+        "control", assumed_wind_factor=told, assumed_wind_turn_deg=90.0 * (told != 1)
+    )
 
     def strehl(arm: Arm) -> float:
         return float(
@@ -92,7 +94,7 @@ def test_control_needs_a_closed_loop_and_the_whole_run() -> None:
 
 def test_true_slopes_have_no_prior() -> None:
     short = FAINT.replace("run", frames=60, settle_frames=20)
-    record = simulate_loop(short, [_arm("kalman")], idealised=DisabledErrors(true_slopes=True))
+    record = simulate_loop(short, [_arm("kalman")], disabled_errors=DisabledErrors(true_slopes=True))
     assert np.isfinite(record.commands).all()
     assert record.mean_strehl() > 0.5
 
@@ -114,5 +116,5 @@ def test_names_of_arms_say_their_control() -> None:
 
 
 def test_the_winds_that_are_told_are_of_the_configuration() -> None:
-    told = LoopConfiguration.from_text(FAINT.replace("control", told_wind_factor=1.5).to_text())
-    assert told.control.told_wind_factor == 1.5
+    told = LoopConfiguration.from_text(FAINT.replace("control", assumed_wind_factor=1.5).to_text())
+    assert told.control.assumed_wind_factor == 1.5

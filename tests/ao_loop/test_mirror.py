@@ -49,8 +49,8 @@ def test_fitting_error_is_that_of_theory() -> None:
     """
     pupil = make_pupil(quiet())
     fit = BestFit.of(make_mirror(quiet(), pupil), pupil)
-    air = make_atmosphere(quiet(), 2)
-    residuals = [fit.residual(air.wavefront_nm(time)) for time in np.arange(0, 10, 0.5)]
+    atmosphere = make_atmosphere(quiet(), 2)
+    residuals = [fit.residual(atmosphere.wavefront_nm(time)) for time in np.arange(0, 10, 0.5)]
     variance = float(np.mean([pupil.rms(left) ** 2 for left in residuals]))
     coefficient = variance * (2 * np.pi / 500) ** 2 / (0.6 / 0.15) ** (5 / 3)
     assert 0.19 < coefficient < 0.30

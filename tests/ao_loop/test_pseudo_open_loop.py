@@ -12,11 +12,11 @@ from faintspot.base.errors import InputError
 @given(st.integers(0, 3), st.integers(0, 2**32 - 1), st.floats(0.2, 1.5))
 def test_the_mirror_is_taken_out_of_the_slopes(delay: int, seed: int, gain: float) -> None:
     rng = np.random.default_rng(seed)
-    air, computed, matrix = rng.normal(size=(20, 8)), rng.normal(size=(20, 3)), rng.normal(size=(8, 3))
+    atmosphere, computed, matrix = rng.normal(size=(20, 8)), rng.normal(size=(20, 3)), rng.normal(size=(8, 3))
     held = np.concatenate([rng.normal(size=(delay, 3)), computed[: 20 - delay]])
-    measured = gain * (air + held @ matrix.T)
+    measured = gain * (atmosphere + held @ matrix.T)
     found = pseudo_open_loop_slopes(measured, computed, matrix, centroid_gain=gain, delay_frames=delay)
-    np.testing.assert_allclose(found, air[delay:], atol=1e-12)
+    np.testing.assert_allclose(found, atmosphere[delay:], atol=1e-12)
 
 
 def test_each_frame_may_have_its_own_gain() -> None:

@@ -9,8 +9,8 @@ from faintspot.ao_loop import Arm, LoopRecord, load_loop, simulate_loop
 from faintspot.ao_loop.atmosphere import make_atmosphere
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.mirror import BestFit
-from faintspot.ao_loop.observatory import prepare
 from faintspot.ao_loop.simulation import measure_gains
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.errors import InputError
 
 pytest.importorskip("hcipy")
@@ -54,7 +54,7 @@ def test_runs_repeat_bit_for_bit(record: LoopRecord) -> None:
     np.testing.assert_array_equal(again.psf, record.psf)
 
 
-def test_arms_see_the_same_air_and_photons(record: LoopRecord) -> None:
+def test_arms_see_the_same_atmosphere_and_photons(record: LoopRecord) -> None:
     both = [plain(), Arm("tv", fs.Settings(noise_std=1.0, keep_brightest=80))]
     schedule = np.repeat([0, 1], 100)
     mixed = simulate_loop(faint(), both, schedule)
@@ -78,9 +78,9 @@ def test_slopes_follow_the_interaction_matrix() -> None:
     """
     loop = quiet().replace("run", frames=60)
     record = simulate_loop(loop, [Arm("true", PLAIN, true_slopes=True)], seed=4)
-    air, sensor = make_atmosphere(loop, 4), prepare(loop).sensor
+    atmosphere, sensor = make_atmosphere(loop, 4), prepare(loop).sensor
     frames = np.arange(20, 60)
-    expected = np.array([sensor.mean_slopes_px(air.wavefront_nm((k + 0.5) / 250)) for k in frames])
+    expected = np.array([sensor.mean_slopes_px(atmosphere.wavefront_nm((k + 0.5) / 250)) for k in frames])
     open_loop = record.slopes_px[frames] - record.commands[frames] @ record.interaction_matrix.T
     assert np.std(open_loop - expected) < 0.02 * np.std(expected)
 
@@ -94,11 +94,11 @@ def test_noise_free_loop_lies_between_fitting_error_and_its_budget() -> None:
     """
     loop = quiet()
     record = simulate_loop(loop, [Arm("true", PLAIN, true_slopes=True, gain=0.5)])
-    optics, air = prepare(loop), make_atmosphere(loop, loop.run.seed)
+    optics, atmosphere = prepare(loop), make_atmosphere(loop, loop.run.seed)
     fit = BestFit.of(optics.mirror, optics.pupil)
     fitting, lag = [], []
     for frame in range(40, 200, 5):
-        now, before, long_before = (air.wavefront_nm((frame + 0.5 - late) / 250) for late in (0, 1, 6))
+        now, before, long_before = (atmosphere.wavefront_nm((frame + 0.5 - late) / 250) for late in (0, 1, 6))
         left = fit.residual(now)
         fitting.append(optics.pupil.rms(left) ** 2)
         lag.append(

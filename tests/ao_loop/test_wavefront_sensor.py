@@ -25,7 +25,7 @@ def _tilt(sensor: ShackHartmann, x_px: float, y_px: float) -> np.ndarray:
     return ((x_px * line + y_px * line[:, None]) / sensor.px_per_nm).astype(np.float32)
 
 
-def test_36_sub_apertures_are_lit(sensor: ShackHartmann) -> None:
+def test_36_sub_apertures_are_illuminated(sensor: ShackHartmann) -> None:
     assert len(sensor.layout) == 36
     assert sensor.illumination.min() > 0.5
     assert sensor.layout.frame_shape == (112, 112)
@@ -34,13 +34,13 @@ def test_36_sub_apertures_are_lit(sensor: ShackHartmann) -> None:
 def test_flat_spots_are_the_lenslets_diffraction(sensor: ShackHartmann) -> None:
     """Two Gauss-Legendre samples a pixel: within 0.3 % of the brightest pixel."""
     expected = fs.simulate.spots(np.zeros((1, 2)), shape=(16, 16), profile="diffraction", size=1.0)[0]
-    lit = np.flatnonzero(sensor.illumination > 0.9999)
-    spot = sensor.spots(FLAT)[lit[0]]
-    assert len(lit) > 4
+    illuminated = np.flatnonzero(sensor.illumination > 0.9999)
+    spot = sensor.spots(FLAT)[illuminated[0]]
+    assert len(illuminated) > 4
     np.testing.assert_allclose(spot, expected, atol=3e-3 * expected.max())
 
 
-def test_light_is_that_of_the_lit_part(sensor: ShackHartmann) -> None:
+def test_flux_is_that_of_the_illuminated_part(sensor: ShackHartmann) -> None:
     """About 95 % of the light falls into the window; the rest is the wings, wider where partly lit."""
     np.testing.assert_allclose(sensor.spots(FLAT).sum(axis=(1, 2)), 0.95 * sensor.illumination, rtol=0.05)
 
@@ -55,9 +55,9 @@ def test_a_tilt_moves_the_spots(sensor: ShackHartmann) -> None:
         sensor.layout, settings, fs.Calibration(dark=0.0, read_noise_e=1.0), psf=fs.PSF.analytic(), threads=1
     )
     slopes = pipeline(sensor.frame(sensor.spots(tilt)) * 1e5)
-    lit = sensor.illumination > 0.9999
-    np.testing.assert_allclose(slopes.x[lit], 0.5, atol=0.01)  # the PSF's own tables are good to that
-    np.testing.assert_allclose(slopes.y[lit], -0.25, atol=0.01)
+    illuminated = sensor.illumination > 0.9999
+    np.testing.assert_allclose(slopes.x[illuminated], 0.5, atol=0.01)  # the PSF's own tables are good to that
+    np.testing.assert_allclose(slopes.y[illuminated], -0.25, atol=0.01)
 
 
 def test_noise_free_slopes_are_mean_gradients(sensor: ShackHartmann) -> None:
@@ -65,12 +65,12 @@ def test_noise_free_slopes_are_mean_gradients(sensor: ShackHartmann) -> None:
 
     The window cuts the wings: a gain of 0.96; scatter about the line below 2 % of the slopes' rms.
     """
-    air = make_atmosphere(quiet(), 1)
+    atmosphere = make_atmosphere(quiet(), 1)
     settings = fs.Settings("brightest", keep_brightest=255)
     pipeline = fs.SlopePipeline(sensor.layout, settings, threads=1)
     truth, measured = [], []
     for time in np.arange(0, 5, 0.5):
-        wavefront = 0.25 * air.wavefront_nm(time)
+        wavefront = 0.25 * atmosphere.wavefront_nm(time)
         truth.append(sensor.mean_slopes_px(wavefront))
         measured.append(pipeline(sensor.frame(sensor.spots(wavefront)) * 1e6).vector)
     true, seen = np.ravel(truth), np.ravel(measured)
@@ -101,7 +101,7 @@ def test_spots_are_as_long_as_asked() -> None:
     np.testing.assert_allclose(spot, spot[::-1, ::-1], atol=1e-6)
 
 
-def test_nothing_lit_is_refused() -> None:
+def test_nothing_illuminated_is_refused() -> None:
     dark = quiet().replace("sensor", subapertures=1, samples=12, least_illumination=0.9)
     with pytest.raises(InputError, match=r"no sub-aperture has 0\.9 of its area in the pupil"):
         make_sensor(dark, make_pupil(dark))

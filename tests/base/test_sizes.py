@@ -120,7 +120,7 @@ def test_large_grids_are_quick_enough_to_make() -> None:
     assert len(fs.Layout.grid((300, 300), pixels=8)) == 90_000
 
 
-def test_light_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flux_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     """Faint and bright frames in turn: with room for few levels, all are measured, the first ones alike."""
     from faintspot.estimators import maximum_a_posteriori
 
@@ -129,7 +129,7 @@ def test_light_beyond_the_memory_uses_the_nearest_tables(monkeypatch: pytest.Mon
     place = fs.simulate.spots(np.zeros((16, 2)), shape=(8, 8), size=0.8, profile="gaussian")
     bright = place.reshape(4, 4, 8, 8).swapaxes(1, 2).reshape(32, 32)
     frames = rng.poisson(np.multiply.outer([30, 300, 330, 3000], bright)) + rng.normal(0, 1, (4, 32, 32))
-    room: Any = narrow.preparation.prepared
+    room: Any = narrow.plan.prepared
     expected = [roomy(frame) for frame in frames]
     monkeypatch.setattr(maximum_a_posteriori, "MOST_NUMBERS", 2 * np.prod(room.table_shape))
     full = [narrow(frame) for frame in frames]

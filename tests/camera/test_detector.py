@@ -257,7 +257,7 @@ def test_bad_detectors_are_named_in_one_line(options: dict[str, Any], named: str
         ({"hot_pixels": [(4, 0, 1.0)]}, np.zeros((4, 3))),
     ],
 )
-def test_bad_light_is_refused_in_one_line(options: dict[str, Any], mean_e: Any) -> None:
+def test_bad_flux_is_refused_in_one_line(options: dict[str, Any], mean_e: Any) -> None:
     for method in (Detector(**options).expose, Detector(**options).variance):
         with pytest.raises(InputError, match="mean_e") as caught:
             method(mean_e)

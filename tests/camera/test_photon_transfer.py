@@ -98,9 +98,9 @@ def test_hot_pixels_and_a_drifting_level_do_not_matter() -> None:
 def test_flickering_brightness_is_taken_out() -> None:
     rng = np.random.default_rng(4)
     y, x = np.indices((64, 64))
-    light = 100 + 800 * np.exp(-((x % 16 - 7.3) ** 2 + (y % 16 - 8.1) ** 2) / 18)
+    flux = 100 + 800 * np.exp(-((x % 16 - 7.3) ** 2 + (y % 16 - 8.1) ** 2) / 18)
     flicker = 1 + 0.1 * rng.standard_normal((50, 1, 1))
-    frames = CAMERA.expose(light * flicker, rng)
+    frames = CAMERA.expose(flux * flicker, rng)
     found = measure_detector(frames, dark_level_adu=100.0)
     # 10 % of 900 e- is 90 e-, three times the photon noise, were it left in.
     assert found.reliable, found.notes
@@ -116,7 +116,7 @@ def test_too_much_movement_is_said(movement_px: float) -> None:
     assert found.read_noise_adu == pytest.approx(2.5, rel=0.02)
 
 
-def test_light_too_faint_for_a_gain_is_said() -> None:
+def test_flux_too_faint_for_a_gain_is_said() -> None:
     frames, darks = recorded(CAMERA, 2.0, n_frames=10)
     found = measure_detector(frames, darks)
     assert not found.reliable
@@ -125,9 +125,9 @@ def test_light_too_faint_for_a_gain_is_said() -> None:
 
 def test_saturation_is_said_and_a_range_avoids_it() -> None:
     rng = np.random.default_rng(5)
-    light = np.tile(np.linspace(50.0, 1500.0, 96), (96, 1))
+    flux = np.tile(np.linspace(50.0, 1500.0, 96), (96, 1))
     camera = Detector(5.0, gain_e_per_adu=2.0, offset_adu=100.0, full_well_e=1000.0)
-    frames = camera.expose(np.broadcast_to(light, (40, 96, 96)), rng)
+    frames = camera.expose(np.broadcast_to(flux, (40, 96, 96)), rng)
     assert not measure_detector(frames, dark_level_adu=100.0).reliable
     found = measure_detector(frames, dark_level_adu=100.0, range_adu=(0.0, 400.0))
     assert found.reliable, found.notes

@@ -209,7 +209,7 @@ def test_which_lenslets(folder: Path, run: Commands) -> None:
     assert len(radius) == np.count_nonzero(np.abs(np.hypot(*(lattice("square") - (78, 75)).T) - 27.5) <= 17.5)
     run.ok(*arguments, "--roi", "0,0,110,90")
     assert len(Layout.load("new.toml")) == 4 * 5  # rows and columns of nodes in it
-    run.ok(*arguments, "--lit-fraction", "0.9")
+    run.ok(*arguments, "--illuminated-fraction", "0.9")
     assert len(Layout.load("new.toml")) > 40
     for option, value, words in (
         ("--exclude", "3,x", "such as 3,17,40-45"),
@@ -221,7 +221,7 @@ def test_which_lenslets(folder: Path, run: Commands) -> None:
         ("--roi", "0,0,1000,10", "within the frame's 160 columns"),
         ("--window", "12", "height and width"),
         ("--window", "1,12", "pixels = 1"),
-        ("--lit-fraction", "2", "lit-fraction = 2"),
+        ("--illuminated-fraction", "2", "lit-fraction = 2"),
         ("--pitch", "2", "spots of quad cells overlap"),
     ):
         assert words in run.refused("layout", "a.npy", "-o", "o.toml", option, value).error

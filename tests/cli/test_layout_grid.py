@@ -73,7 +73,7 @@ def test_windows_that_are_smaller_than_the_pitch_are_said(folder: Path, run: Com
         (("--grid", "8"), "--grid 8"),
         (("--grid", "8x8", "--pitch", "2"), "--pitch"),
         (("--grid", "80x8"), "cells of at least"),
-        (("--grid", "8x8", "--lit-fraction", "2"), "--lit-fraction"),
+        (("--grid", "8x8", "--illuminated-fraction", "2"), "--illuminated-fraction"),
     ],
 )
 def test_refused(folder: Path, run: Commands, options: tuple[str, ...], naming: str) -> None:

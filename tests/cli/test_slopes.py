@@ -165,7 +165,7 @@ def test_bad_frames_are_flagged_counted_and_leave_their_neighbours_alone(folder:
     np.testing.assert_array_equal(stored["x"][9, 1:], good.x[9, 1:])
     assert stored["flags"][9, 0] & SubapertureFlag.BAD_PIXELS
     assert np.all(stored["flags"][3] & SubapertureFlag.TOO_MANY_BAD_PIXELS)
-    assert np.all(stored["flags"][[14, 20]] & SubapertureFlag.NO_LIGHT)
+    assert np.all(stored["flags"][[14, 20]] & SubapertureFlag.NO_FLUX)
     assert np.all(stored["flags"][20] & SubapertureFlag.SATURATED)
     for index in (3, 14, 20):
         assert not stored["valid"][index].any()

@@ -47,7 +47,7 @@ def test_what_is_not_valid_is_not_measured() -> None:
     x, y = rng.standard_normal((2, N)).astype(np.float32)
     error = np.full(N, 0.5, np.float32)
     flags = np.zeros(N, np.uint8)
-    flags[[2, 5]] = SubapertureFlag.NO_LIGHT, SubapertureFlag.TOO_MANY_BAD_PIXELS
+    flags[[2, 5]] = SubapertureFlag.NO_FLUX, SubapertureFlag.TOO_MANY_BAD_PIXELS
     flags[7] = SubapertureFlag.SATURATED  # only informs
     x[2], y[3] = 100.0, np.nan
     slopes, errors, said = np.full(2 * N, 9.0), np.full(2 * N, 9.0), np.zeros(2)

@@ -45,7 +45,7 @@ class Mirror:
         slopes = mean + self.noise_px * self.rng.standard_normal((2, 18))
         flags = np.zeros((2, 9), np.uint8)
         lost = self.rng.random((2, 9)) < self.invalid
-        flags[lost] = SubapertureFlag.NO_LIGHT
+        flags[lost] = SubapertureFlag.NO_FLUX
         slopes[np.tile(lost, 2)] = 0.0
         if self.at_limit and np.abs(command).max() > 0.5:
             flags[:, 2] |= np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)

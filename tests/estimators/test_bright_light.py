@@ -22,11 +22,11 @@ WRONG = {
 }
 
 
-def gain(settings: Settings, light_e: float, psf: Any, reach: float = 1.0, score: Any = None) -> float:
+def gain(settings: Settings, flux_e: float, psf: Any, reach: float = 1.0, score: Any = None) -> float:
     """Return the slope that is measured for a displacement, without noise; all must be valid."""
     layout = fs.Layout.stacked(N, (SIDE, SIDE))
     pipeline = fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=1.0), psf=psf, score=score)
-    images = np.maximum(TRUE.images(reach * POSITIONS, (SIDE, SIDE), light_e), 0.0)
+    images = np.maximum(TRUE.images(reach * POSITIONS, (SIDE, SIDE), flux_e), 0.0)
     slopes = pipeline(images.reshape(-1, SIDE))
     assert slopes.valid.all()
     return float(np.polyfit(reach * POSITIONS.T.ravel(), slopes.vector, 1)[0])
@@ -34,34 +34,34 @@ def gain(settings: Settings, light_e: float, psf: Any, reach: float = 1.0, score
 
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize("model_error", [0.1, 0.3, 1.0])
-def test_a_wrong_psf_costs_no_gain_in_bright_light(wrong: str, model_error: float) -> None:
+def test_a_wrong_psf_costs_no_gain_in_bright_flux(wrong: str, model_error: float) -> None:
     # A PSF that is wrong by 20 %, or without wings, has gains of 0.91 to 1.09 at any light. Loops are stable
     # to a factor of two; 0.85 to 1.15 leaves them room, and 1.3 to 1.6, as it was once, would fail.
-    found = [gain(Settings("ml", model_error=model_error), light, WRONG[wrong]) for light in LIGHTS_E]
+    found = [gain(Settings("ml", model_error=model_error), flux, WRONG[wrong]) for flux in LIGHTS_E]
     assert min(found) > 0.85
     assert max(found) < 1.15
 
 
 @pytest.mark.parametrize("prior_std_px", [None, 0.3])
-def test_map_in_far_more_light_than_expected(prior_std_px: float | None) -> None:
+def test_map_in_far_more_flux_than_expected(prior_std_px: float | None) -> None:
     # Steps of a fit that begins with too little light are too long by that factor: once up to 5.
     settings = Settings("map", flux_e=40.0, prior_std_px=prior_std_px)
-    for light in LIGHTS_E:
+    for flux in LIGHTS_E:
         for reach in (0.3, 1.0):
             # A prior of 0.3 px draws by its variance over that of the spot: by 4 % at 300 electrons. What is
             # left of steps that were too long in three of them is 5 %.
-            assert gain(settings, light, TRUE, reach) == pytest.approx(1.0, abs=0.1)
+            assert gain(settings, flux, TRUE, reach) == pytest.approx(1.0, abs=0.1)
 
 
-def test_trained_score_in_far_more_light_than_expected() -> None:
+def test_trained_score_in_far_more_flux_than_expected() -> None:
     score = fs.train_estimator(
         flux_e=(30, 100), detector=fs.simulate.Detector(1.0), shape=(SIDE, SIDE), realisations=3000
     )
     settings = Settings("trained", flux_e=40.0)
     # Scores for faint light draw towards the reference: a gain of 0.7 to 1; without the light it would be
     # 100,000, and all slopes at the edge of the window.
-    for light in LIGHTS_E:
-        assert 0.6 < gain(settings, light, None, score=score) < 1.1
+    for flux in LIGHTS_E:
+        assert 0.6 < gain(settings, flux, None, score=score) < 1.1
 
 
 @pytest.mark.parametrize("local_background", ["on", "off"])

@@ -79,8 +79,8 @@ def test_a_frame_that_fails_is_flagged_and_counted(error: BaseException) -> None
     assert np.all(slopes.vector == 0)
     assert np.all(slopes.flux[1] == 0)
     assert np.all(np.isinf(slopes.standard_error_x))
-    assert found.preparation.prepared.faults == 1
-    assert type(error).__name__ in found.preparation.prepared.fault
+    assert found.plan.prepared.faults == 1
+    assert type(error).__name__ in found.plan.prepared.fault
 
 
 def test_what_is_not_usable_is_flagged_alone() -> None:

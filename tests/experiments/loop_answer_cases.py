@@ -38,11 +38,13 @@ def made_up(
     question = LoopQuestion(configuration(), arms=tuple(shifts), **asked)
     rng = np.random.default_rng(5)
     magnitudes = question.configuration.photometry.magnitude(PHOTONS)
-    air = rng.normal(0.0, 0.02, (len(PHOTONS), realisations))
+    atmosphere = rng.normal(0.0, 0.02, (len(PHOTONS), realisations))
     results = []
     for name, shift in shifts.items():
         kind = arm_kind(name)
-        strehl = strehl_of(magnitudes, shift)[:, None] + air + rng.normal(0.0, scatter, air.shape)
+        strehl = (
+            strehl_of(magnitudes, shift)[:, None] + atmosphere + rng.normal(0.0, scatter, atmosphere.shape)
+        )
         tuned = kind.tuned(question.configuration)
         choice = {option: _VALUES.get(option, each.first[0]) for option, each in tuned.items()}
         ends = tuple(("window_fwhm_px",) if name == "window" else () for _ in PHOTONS)

@@ -60,13 +60,13 @@ def made_up_magnitude(gain_mag: float = 0.3, realisations: int = 6) -> Magnitude
     """Curves of one shape; TV is `gain_mag` fainter than brightest pixels, the likelihoods 1 mag."""
     rng = np.random.default_rng(3)
     magnitudes = np.linspace(13.0, 9.0, 5)
-    air = rng.normal(0, 0.02, (5, realisations))
+    atmosphere = rng.normal(0, 0.02, (5, realisations))
     shifts = (0.0, gain_mag, 1.0, 1.0)
     strehl = np.array(
         [
             0.6 / (1 + np.exp(1.5 * (magnitudes - 11 - shift)))[:, None]
-            + air
-            + rng.normal(0, 1e-3, air.shape)
+            + atmosphere
+            + rng.normal(0, 1e-3, atmosphere.shape)
             for shift in shifts
         ]
     )

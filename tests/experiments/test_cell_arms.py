@@ -70,7 +70,7 @@ def test_arms_are_what_they_say(
         np.testing.assert_allclose(table[found, k - 1], expected[found], rtol=0, atol=1e-5)  # of float32
 
 
-def test_without_light_the_position_is_the_centre() -> None:
+def test_without_flux_the_position_is_the_centre() -> None:
     truth = np.array([[0.5, -0.25]])
     flat = np.full((1, 10, 10), 0.1, np.float32)
     table, valid = error_table(TotalVariation(noise_std=1.4), flat, truth)
@@ -173,10 +173,10 @@ def plugin(monkeypatch: pytest.MonkeyPatch) -> type[Estimator]:
 
         def locate(self, images: Any, sensor: Sensor, prior: Any) -> Any:
             assert np.isfinite(sensor.spot_fwhm_px).all()
-            light = np.maximum(images, 0.0) ** self.power
+            flux = np.maximum(images, 0.0) ** self.power
             y, x = (np.arange(size) - (size - 1) / 2 for size in images.shape[1:])
-            total = light.sum(axis=(1, 2))
-            return np.stack([light.sum(axis=1) @ x / total, light.sum(axis=2) @ y / total], axis=1)
+            total = flux.sum(axis=(1, 2))
+            return np.stack([flux.sum(axis=1) @ x / total, flux.sum(axis=2) @ y / total], axis=1)
 
     monkeypatch.setattr(registry, "_kinds", {**registry.estimators(), "own": OwnEstimator})
     return OwnEstimator

@@ -38,14 +38,14 @@ def gain(curve: Curve, at: float, seed: int = 1) -> Gain:
     return found
 
 
-def with_scatter(method_light: float, n: int = 2000) -> Curve:
+def with_scatter(method_flux: float, n: int = 2000) -> Curve:
     """R = sqrt(10 / flux), and of a method that needs less light, with 10 % of scatter that both share."""
     flux = np.geomspace(10, 1000, 7)
     scatter = 1 + 0.1 * np.random.default_rng(1).standard_normal((len(flux), n))
     scatter /= scatter.mean(axis=1, keepdims=True)
     of = {
-        name: np.sqrt(light / flux)[:, None] * scatter
-        for name, light in (("reference", 10.0), ("method", method_light))
+        name: np.sqrt(needed / flux)[:, None] * scatter
+        for name, needed in (("reference", 10.0), ("method", method_flux))
     }
     return Curve.of_errors(flux, of)
 
@@ -113,7 +113,7 @@ def test_gain_is_reproducible() -> None:
     assert gain(curve, 100.0).low == gain(curve, 100.0).low
 
 
-def test_half_the_light_is_three_quarters_of_a_magnitude() -> None:
+def test_half_the_flux_is_three_quarters_of_a_magnitude() -> None:
     curve = with_scatter(5.0)
     found = magnitude_gain(curve, 100.0, np.random.default_rng(3), method="method", reference="reference")
     assert found.value == pytest.approx(2.5 * math.log10(2), abs=0.01)
@@ -127,11 +127,11 @@ def test_half_the_light_is_three_quarters_of_a_magnitude() -> None:
 
 
 @pytest.mark.parametrize(("light", "expected"), [(0.01, math.inf), (1e4, -math.inf)])
-def test_gain_beyond_the_curve_has_a_sign(light: float, expected: float) -> None:
+def test_gain_beyond_the_curve_has_a_sign(flux: float, expected: float) -> None:
     options: Any = {"method": "method", "reference": "reference"}
-    found = magnitude_gain(with_scatter(light), 100.0, np.random.default_rng(3), **options)
+    found = magnitude_gain(with_scatter(flux), 100.0, np.random.default_rng(3), **options)
     assert found.value == expected
-    assert math.isnan(magnitude_gain(with_scatter(light), 5.0, np.random.default_rng(3), **options).value)
+    assert math.isnan(magnitude_gain(with_scatter(flux), 5.0, np.random.default_rng(3), **options).value)
 
 
 def test_limiting_flux() -> None:

@@ -44,7 +44,7 @@ def test_sets(whole: Path) -> None:
     assert result.records[0].labels == ("no TV", "TV 0 e-", "TV 2 e-")
 
 
-def test_gain_of_the_camera_and_air_differ(whole: Path) -> None:
+def test_gain_of_the_camera_and_atmosphere_differ(whole: Path) -> None:
     first, second = InterleavedResult.load(whole).records
     assert "em_gain = 100.0" in first.configuration
     assert "em_gain = 75.0" in second.configuration

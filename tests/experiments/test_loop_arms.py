@@ -74,10 +74,10 @@ def peak() -> Iterator[type[Estimator]]:
             return {"power": [2.0, 1.5, 3.0, 4.0, 5.0]}
 
         def locate(self, images: Any, sensor: Any, prior: Any) -> Any:
-            light = np.maximum(images, 0.0).astype(float) ** self.power + 1e-9
+            flux = np.maximum(images, 0.0).astype(float) ** self.power + 1e-9
             line = np.arange(images.shape[-1]) - 0.5 * (images.shape[-1] - 1)
-            total = light.sum(axis=(1, 2))
-            return np.stack([(light.sum(axis=axis) @ line) / total for axis in (1, 2)], axis=1)
+            total = flux.sum(axis=(1, 2))
+            return np.stack([(flux.sum(axis=axis) @ line) / total for axis in (1, 2)], axis=1)
 
     yield Peak
     del registry._kinds["peak"]

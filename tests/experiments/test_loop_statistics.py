@@ -23,8 +23,8 @@ numbers = arrays(np.float64, st.integers(1, 12), elements=st.floats(-1, 1))
 
 
 def curves(shift: float, realisations: int = 6, scatter: float = 0.02) -> np.ndarray:
-    air = np.random.default_rng(2).normal(0, scatter, realisations)  # the same for every arm
-    return 0.7 - 0.1 * (MAGNITUDES[:, None] - shift - 8) + air
+    atmosphere = np.random.default_rng(2).normal(0, scatter, realisations)  # the same for every arm
+    return 0.7 - 0.1 * (MAGNITUDES[:, None] - shift - 8) + atmosphere
 
 
 @given(numbers)

@@ -13,8 +13,8 @@ from faintspot.experiments.loop_verdict import budget_summary, magnitude_summary
 @pytest.fixture
 def result() -> MagnitudeResult:
     """TV denoising is 0.01 worse than brightest pixels everywhere, give or take 0.002."""
-    air = np.array([-0.1, 0.0, 0.1, 0.05, -0.05])
-    brightest = np.array([0.2, 0.4, 0.6])[:, None] + air
+    atmosphere = np.array([-0.1, 0.0, 0.1, 0.05, -0.05])
+    brightest = np.array([0.2, 0.4, 0.6])[:, None] + atmosphere
     tv = brightest - 0.01 + 0.002 * np.array([1, -1, 0, 1, -1])
     return MagnitudeResult(
         ("brightest", "tv"),

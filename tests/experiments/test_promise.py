@@ -41,7 +41,7 @@ def answered(movement_px: float, gain: float, **given: float) -> Answer:
     return tune(question_from_frames(frames, layout=LAYOUT, **given), **QUICK)
 
 
-def test_without_darks_the_light_is_right_and_the_promise_kept(tmp_path: Path) -> None:
+def test_without_darks_the_flux_is_right_and_the_promise_kept(tmp_path: Path) -> None:
     answer = answered(0.7, 0.5)
     question, promise = answer.question, answer.promise
     assert question.star_flux_e == pytest.approx(300.0, rel=0.06)  # as the gain

@@ -36,7 +36,7 @@ def recorded(n_frames: int = 30) -> tuple[np.ndarray, np.ndarray]:
     return frames, CAMERA.expose(np.zeros((20, *LAYOUT.frame_shape)), rng)
 
 
-def test_camera_light_and_spot_are_measured() -> None:
+def test_camera_flux_and_spot_are_measured() -> None:
     frames, darks = recorded()
     question = question_from_frames(frames, darks, layout=LAYOUT)
     assert question.gain_e_per_adu == pytest.approx(0.5, rel=0.05)  # 30 frames of 36 spots
@@ -109,23 +109,23 @@ def test_a_single_frame_does_not_tell_the_gain() -> None:
         question_from_frames(frames[0], darks[:, :10], layout=LAYOUT)
 
 
-def test_light_that_differs_between_subapertures_is_simulated_so() -> None:
+def test_flux_that_differs_between_subapertures_is_simulated_so() -> None:
     rng = np.random.default_rng(6)
-    light = np.where(np.arange(36) % 2, 500.0, 1500.0)
+    flux = np.where(np.arange(36) % 2, 500.0, 1500.0)
     frames, _ = sensor_frames(
         LAYOUT.corners,
         LAYOUT.window,
         LAYOUT.frame_shape,
         12,
-        flux_e=light,
+        flux_e=flux,
         positions=rng.uniform(-0.6, 0.6, (12, 36, 2)),
         detector=CAMERA,
         rng=rng,
     )
     question = question_from_frames(frames, layout=LAYOUT, gain_e_per_adu=0.5)
     assert question.star_flux_e == pytest.approx(1000.0, rel=0.03)
-    assert question.relative_light is not None
-    np.testing.assert_allclose(question.relative_light, light / 1000.0, rtol=0.06)  # 6 frames, 2 % each
+    assert question.relative_flux is not None
+    np.testing.assert_allclose(question.relative_flux, flux / 1000.0, rtol=0.06)  # 6 frames, 2 % each
 
 
 def test_unreliable_gain_is_not_used() -> None:

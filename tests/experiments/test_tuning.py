@@ -34,7 +34,7 @@ def test_errors_are_near_the_bound_where_the_spot_is_known() -> None:
     assert answer.best.over_brightest.value > 0.1
 
 
-def test_more_light_means_smaller_errors() -> None:
+def test_more_flux_means_smaller_errors() -> None:
     for result in answered().results:
         assert np.all(np.diff(result.error_px) < 0)
 
@@ -111,10 +111,10 @@ def test_an_estimator_of_somebody_else_takes_part(monkeypatch: pytest.MonkeyPatc
             return {"power": [1.0, 2.0]}
 
         def locate(self, images: Any, sensor: Any, prior: Any) -> Any:
-            light = np.maximum(images, 0.0) ** self.power
+            flux = np.maximum(images, 0.0) ** self.power
             y, x = (np.arange(size) - (size - 1) / 2 for size in images.shape[1:])
-            total = light.sum(axis=(1, 2))
-            return np.stack([light.sum(axis=1) @ x / total, light.sum(axis=2) @ y / total], axis=1)
+            total = flux.sum(axis=(1, 2))
+            return np.stack([flux.sum(axis=1) @ x / total, flux.sum(axis=2) @ y / total], axis=1)
 
     monkeypatch.setattr(registry, "_kinds", {**estimators(), "own": OwnEstimator})
     answer = tune(Question(**{**CAMERA, "flux_e": 2000.0}), realisations=256, steps=1)

@@ -33,8 +33,8 @@ def centre_of_gravity(images: NDArray[Any], weights: NDArray[Any]) -> NDArray[An
     """Weighted centre of gravity from the window's middle, (n, 2), as a controller computes it."""
     weighted = images * weights
     rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in images.shape[1:])
-    light = weighted.sum(axis=(1, 2))
-    x, y = ((weighted * along).sum(axis=(1, 2)) / light for along in (columns, rows[:, None]))
+    flux = weighted.sum(axis=(1, 2))
+    x, y = ((weighted * along).sum(axis=(1, 2)) / flux for along in (columns, rows[:, None]))
     return np.stack([x, y], axis=1)
 
 

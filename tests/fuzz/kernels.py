@@ -57,7 +57,7 @@ def run(seed: int, chosen: list[tuple[str, int, str]]) -> None:
         return
     assert_sane(expected)
     assert_same(_measured(pipeline, frames, prior, at_end, rng), expected)
-    if not pipeline.needs_light and prior is None:
+    if not pipeline.needs_flux and prior is None:
         found, wanted = _streamed(pipeline, frames, at_end), pipeline(frames)
         for name in vars(wanted):
             assert np.array_equal(getattr(found, name), getattr(wanted, name)[0]), name
@@ -154,22 +154,22 @@ def _measured(
     """Call the kernel as the pipeline does, with everything guarded."""
     n, n_frames = len(pipeline.layout), len(frames)
     guard = partial(guarded_tree, at_end=at_end)
-    preparation, lanes, window = pipeline.preparation, pipeline._lanes, pipeline.layout.window
+    plan, lanes, window = pipeline.plan, pipeline._lanes, pipeline.layout.window
     source = guard(pipeline.source(kernel_frames(frames), frames.dtype))
     groups = n_frames * -(-n // lanes.width)
-    own = preparation.own_scratch
+    own = plan.own_scratch
     scratch = guard(new_scratch(lanes, *window, own(lanes, *window)))
-    if preparation.needs_light:
-        light = guard(np.empty((n_frames, n), np.float32))
-        preparation.light_kernel(frames)(source, 0, groups, scratch, light)
-        variants = preparation.variants(light.mean(axis=1, dtype=np.float64))
+    if plan.needs_flux:
+        flux = guard(np.empty((n_frames, n), np.float32))
+        plan.flux_kernel(frames)(source, 0, groups, scratch, flux)
+        variants = plan.variants(flux.mean(axis=1, dtype=np.float64))
     else:
         variants = np.zeros(n_frames, np.int64)
-    task = guard(preparation.task(variants, None if prior is None else prior.reshape(1, 2, n)))
+    task = guard(plan.task(variants, None if prior is None else prior.reshape(1, 2, n)))
     results = guard(SlopeArrays(*(np.empty((n_frames, n), kind) for kind in RESULT_TYPES)))
     rows = STAGE_ROWS * int(rng.integers(2))
     stages = guard(np.empty((rows, n_frames, n, pipeline.layout.pixels), np.float32))
-    preparation.kernel(frames)(source, task, 0, groups, scratch, results, stages)
+    plan.kernel(frames)(source, task, 0, groups, scratch, results, stages)
     return Slopes(*results)
 
 

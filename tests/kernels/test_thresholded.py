@@ -29,13 +29,13 @@ def sensor(window: tuple[int, int], threshold: Any, calibration: fs.Calibration)
 
 def in_lanes(pipeline: fs.SlopePipeline, frame: np.ndarray) -> fs.Slopes:
     """The same by the kernel that puts the pixels of several windows side by side."""
-    prepared: Any = pipeline.preparation.prepared
+    prepared: Any = pipeline.plan.prepared
     other = copy.copy(pipeline)
-    other.preparation = copy.copy(pipeline.preparation)
+    other.plan = copy.copy(pipeline.plan)
     changed: Any = copy.copy(prepared)
     changed.kernel, changed.tables = gravity_of_groups, prepared.tables.gravity
-    other.preparation.prepared = changed
-    other.preparation._made, other.preparation._kernels = None, {}
+    other.plan.prepared = changed
+    other.plan._made, other.plan._kernels = None, {}
     return other(frame)
 
 
@@ -57,7 +57,7 @@ def test_as_in_lanes(window: tuple[int, int], dtype: Any, seed: int) -> None:
     rng = np.random.default_rng(seed)
     calibration = fs.Calibration(100.0, gain_e_per_adu=2.0, read_noise_e=1.0)
     pipeline = sensor(window, rng.uniform(0, 20, 15), calibration)
-    assert pipeline.preparation.prepared.kernel is thresholded_in_rows
+    assert pipeline.plan.prepared.kernel is thresholded_in_rows
     frame = rng.poisson(rng.choice([1, 30]), pipeline.layout.frame_shape) + 95
     frame = frame.astype(dtype)
     hostile = [0, 65535] if dtype == np.uint16 else [np.nan, np.inf, -np.inf, 3e38, -1e30, 0]
@@ -88,4 +88,4 @@ def test_images_do_not_change_slopes() -> None:
 
 
 def test_windows_of_odd_widths_are_measured_in_lanes() -> None:
-    assert sensor((10, 10), 3.0, fs.Calibration()).preparation.prepared.kernel is gravity_of_groups
+    assert sensor((10, 10), 3.0, fs.Calibration()).plan.prepared.kernel is gravity_of_groups

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from faintspot.live_page.access import Access
 from faintspot.live_page.batch import Batch, Picture, Source
+from faintspot.live_page.client_requests import ClientRequest
 from faintspot.live_page.server import LiveServer
-from faintspot.live_page.wishes import Wish
 from faintspot.realtime.telemetry_segment import record_type
 from faintspot.sensor.layout import Layout
 
@@ -68,7 +68,7 @@ class Noted:
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
 
-    def known(self) -> Mapping[str, Wish]:
+    def known(self) -> Mapping[str, ClientRequest]:
         def note(asked: dict[str, Any]) -> Mapping[str, Any]:
             self.asked.append(asked)
             return {"text": "noted"}

@@ -14,8 +14,8 @@ from faintspot.base.errors import InputError
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page import recording_source
+from faintspot.live_page.client_requests import answered
 from faintspot.live_page.recording_source import RecordingSource, places_of
-from faintspot.live_page.wishes import answered
 from faintspot.realtime.telemetry_segment import image_type, layout_values
 
 FRAMES = 10_000

@@ -31,8 +31,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def noted(server: LiveServer) -> list[dict[str, Any]]:
-    assert isinstance(server.wishes, Noted)
-    return server.wishes.asked
+    assert isinstance(server.client_requests, Noted)
+    return server.client_requests.asked
 
 
 async def status_of(server: LiveServer, path: str = "/", **headers: str) -> int:

@@ -40,7 +40,7 @@ class TestBadFrames:
     @pytest.mark.parametrize("value", [0.0, 5.0, -3.0, 1e29, 1e-42])
     def test_constant(self, value: float) -> None:
         slopes = self.measure(np.full((30, 30), value, np.float32))
-        assert np.all(slopes.flags == Flag.NO_LIGHT | Flag.INFEASIBLE_STRENGTH)
+        assert np.all(slopes.flags == Flag.NO_FLUX | Flag.INFEASIBLE_STRENGTH)
         assert np.all(slopes.flux == 0.0)
 
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -66,7 +66,7 @@ class TestBadFrames:
         frame[3, 3], frame[4, 4] = 1e300, -1e300
         slopes = self.measure(frame)
         assert slopes.bad_pixels[0] == 2
-        assert slopes.flags[0] & ~Flag.NO_LIGHT == Flag.BAD_PIXELS
+        assert slopes.flags[0] & ~Flag.NO_FLUX == Flag.BAD_PIXELS
 
     @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.int32])
     def test_saturated(self, dtype: Any) -> None:
@@ -77,7 +77,7 @@ class TestBadFrames:
         assert not np.any(slopes.flags[1:] & Flag.SATURATED)
         assert slopes.valid[0]
         full = self.measure(np.full((30, 30), np.iinfo(dtype).max, dtype))
-        assert np.all(full.flags == Flag.SATURATED | Flag.NO_LIGHT | Flag.INFEASIBLE_STRENGTH)
+        assert np.all(full.flags == Flag.SATURATED | Flag.NO_FLUX | Flag.INFEASIBLE_STRENGTH)
 
     def test_saturation_level(self) -> None:
         frame = np.random.default_rng(3).uniform(0, 100, (30, 30))
@@ -137,10 +137,10 @@ class TestBadFrames:
         chosen = rng.choice(values, rng.integers(1, 5))
         self.measure(rng.choice(chosen, (30, 30)).astype(np.float32))
 
-    def test_nearly_flat_image_is_no_light(self) -> None:
+    def test_nearly_flat_image_is_no_flux(self) -> None:
         frame = 1e6 + np.random.default_rng(6).normal(0, 0.01, (30, 30))
         slopes = self.measure(frame)
-        assert np.all(slopes.flags & Flag.NO_LIGHT)
+        assert np.all(slopes.flags & Flag.NO_FLUX)
 
 
 class TestTooStrong:

@@ -69,7 +69,7 @@ class TestWhatIsMissing:
             pipeline(np.zeros(LAYOUT.frame_shape), prior=np.zeros((11, 2)))
 
 
-class TestMeasuredLight:
+class TestMeasuredFlux:
     def test_is_each_frames_own(self) -> None:
         """Frames measured together and one by one are the same, though their light differs."""
         faint, bright = frames(2, 60.0)[0], frames(2, 900.0)[0]
@@ -83,7 +83,7 @@ class TestMeasuredLight:
             assert np.array_equal(together.flags[i], alone.flags)
 
     @pytest.mark.parametrize("estimator", ["trained", "map"])
-    def test_is_close_to_the_light_given(self, estimator: str) -> None:
+    def test_is_close_to_the_flux_given(self, estimator: str) -> None:
         """Of 12 spots of 400 e- the mean light is known to 3 %, which moves no slope by more than 0.03 px."""
         frame, _ = frames(1, 400.0)
         parts: dict[str, Any] = {"psf": fs.PSF.analytic(), "score": score()}
@@ -166,16 +166,14 @@ class TestTables:
         known = spot_tables.model_of_weights(both, np.full((2, 2), spot), psf, (16, 16), 16)
         assert np.allclose(known.gain[:, 0], 1.0 + (spot / weight) ** 2, rtol=0.01)
 
-    def test_least_light_grows_with_noise_and_range(self) -> None:
+    def test_least_flux_grows_with_noise_and_range(self) -> None:
         psf = fs.PSF.analytic()
-        by_noise = [
-            spot_tables.least_light(psf, 0, noise**2, 1.0, 1.0, 16) for noise in (0.1, 1.0, 3.0, 16.0)
-        ]
+        by_noise = [spot_tables.least_flux(psf, 0, noise**2, 1.0, 1.0, 16) for noise in (0.1, 1.0, 3.0, 16.0)]
         assert all(a < b for a, b in itertools.pairwise(by_noise))
-        by_range = [spot_tables.least_light(psf, 0, 9.0, 1.0, reach, 16) for reach in (1.0, 2.0, 8.0)]
+        by_range = [spot_tables.least_flux(psf, 0, 9.0, 1.0, reach, 16) for reach in (1.0, 2.0, 8.0)]
         assert all(a < b for a, b in itertools.pairwise(by_range))
 
-    def test_posterior_of_known_light_integrates_the_likelihood(self) -> None:
+    def test_posterior_of_known_flux_integrates_the_likelihood(self) -> None:
         """The table gives the log-likelihood ratio of Poisson pixels of variance v + m."""
         psf, v, flux = fs.PSF.analytic(), 0.5, 40.0
         grid, spacing = spot_tables.posterior_grid(1.0, 1.9, (8, 8))

@@ -15,7 +15,7 @@ import pytest
 
 import faintspot
 from faintspot.ao_loop import Arm, simulate_loop
-from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.errors import InputError
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import Control

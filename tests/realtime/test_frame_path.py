@@ -141,7 +141,7 @@ def test_wrong_slots(slots: NDArray[Any], message: str) -> None:
         FramePath(pipeline("plain"), slots, Progress(np.zeros(2, np.int64), 0, 1))
 
 
-def test_light_must_be_known_beforehand() -> None:
+def test_flux_must_be_known_beforehand() -> None:
     source = Source()
     automatic = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
     with pytest.raises(fs.InputError, match=r"settings\.flux_e"):

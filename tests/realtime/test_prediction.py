@@ -143,10 +143,10 @@ def test_a_prediction_for_another_frame_is_not_taken() -> None:
     reader.close()
 
 
-def test_the_mean_light_is_told(sky: Sky, files: tuple[Path, Control]) -> None:
+def test_the_mean_flux_is_told(sky: Sky, files: tuple[Path, Control]) -> None:
     """The star fades by three quarters: the settings follow."""
     path, control = files
-    engine = make_engine(sky.name, path, control, mean_light=20.0)
+    engine = make_engine(sky.name, path, control, mean_flux=20.0)
     sky.start(engine)
     sky.frames(25)
     sky.until(lambda: engine.live.change_number > 0 or sky.frame() is None)
@@ -157,13 +157,13 @@ def test_the_mean_light_is_told(sky: Sky, files: tuple[Path, Control]) -> None:
     sky.until(lambda: np.mean(engine.live.settings.flux_e) < 0.4 * told or sky.frame() is None)
 
 
-def test_estimators_that_do_not_use_the_light_are_left_alone(
+def test_estimators_that_do_not_use_the_flux_are_left_alone(
     sky: Sky, files: tuple[Path, Control], tmp_path: Path
 ) -> None:
     path = tmp_path / "faintspot.toml"
     path.write_text(files[0].read_text())
     (tmp_path / "faintspot.psf.npz").write_bytes((files[0].parent / "faintspot.psf.npz").read_bytes())
-    engine = make_engine(sky.name, path, None, settings=fs.Settings("brightest"), mean_light=5.0)
+    engine = make_engine(sky.name, path, None, settings=fs.Settings("brightest"), mean_flux=5.0)
     sky.start(engine)
     sky.frames(10)
     time.sleep(0.3)

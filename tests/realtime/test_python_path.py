@@ -111,7 +111,7 @@ def test_a_frame_that_fails_is_flagged() -> None:
             assert np.all(np.isfinite(slopes.vector))
             assert_same(slopes, source.pipeline(frame))
     assert source.path.fault is None
-    assert source.pipeline.preparation.prepared.faults == 4
+    assert source.pipeline.plan.prepared.faults == 4
 
 
 def test_single_subapertures_that_are_not_usable() -> None:

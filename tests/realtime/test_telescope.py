@@ -28,7 +28,7 @@ import faintspot as fs
 from faintspot.ao_loop import LoopRecord, simulate_loop
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.engine_files import write_engine_files
-from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime_telescope import telescope_set, telescope_status
 from faintspot.control.reconstructor import make_reconstructor
@@ -111,7 +111,7 @@ def record() -> LoopRecord:
 def test_frames_and_truth_are_the_simulated_loops(record: LoopRecord, name: str, commands: Any) -> None:
     """With the same commands: Strehl ratio and rms, and slopes through the same pipeline, bit for bit."""
     watched = Watched(name)
-    pipeline = make_pipeline(CONFIGURATION, watched.telescope.observatory.optics.sensor, plain())
+    pipeline = make_pipeline(CONFIGURATION, watched.telescope.telescope_model.optics.sensor, plain())
     for number, (slopes, strehl, residual) in enumerate(
         zip(record.slopes_px, record.strehl, record.residual_nm, strict=True)
     ):
@@ -127,9 +127,9 @@ def test_frames_and_truth_are_the_simulated_loops(record: LoopRecord, name: str,
 
 def test_realisations_differ(name: str) -> None:
     watched = Watched(name, realisation=1, seed=5)
-    observatory = TelescopeModel(CONFIGURATION, 5, 1)
-    seen = observatory.wavefronts(0.5e-3, np.zeros(COMMANDS))[1]
-    np.testing.assert_array_equal(watched.frame(), observatory.frame(0, seen))
+    telescope_model = TelescopeModel(CONFIGURATION, 5, 1)
+    seen = telescope_model.wavefronts(0.5e-3, np.zeros(COMMANDS))[1]
+    np.testing.assert_array_equal(watched.frame(), telescope_model.frame(0, seen))
     watched.close()
 
 
@@ -257,8 +257,8 @@ def test_orders_take_effect_with_an_exposure(watched: Watched) -> None:
         "r0_m": (0.05, 0.05),
         "wind_factor": 2.0,
     }
-    expected = 2 * TelescopeModel(CONFIGURATION, CONFIGURATION.run.seed).air.velocity
-    np.testing.assert_array_equal(watched.telescope.observatory.air.velocity, expected)
+    expected = 2 * TelescopeModel(CONFIGURATION, CONFIGURATION.run.seed).atmosphere.velocity
+    np.testing.assert_array_equal(watched.telescope.telescope_model.atmosphere.velocity, expected)
 
 
 def test_magnitude_and_seeing_are_converted() -> None:

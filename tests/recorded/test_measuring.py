@@ -145,7 +145,7 @@ def test_summary_counts_flags() -> None:
     frames[4] = 0
     summary = Summary(30, 16)
     summary.add(expected(frames))
-    assert summary.flag_counts[SubapertureFlag.NO_LIGHT] == 16
+    assert summary.flag_counts[SubapertureFlag.NO_FLUX] == 16
     assert summary.bad_frames == 1
     assert summary.measured == 480
     assert set(expected(frames).variables) == {
@@ -154,23 +154,23 @@ def test_summary_counts_flags() -> None:
     }
 
 
-def test_mean_light_of_the_recording(files: tuple[Path, Path, Path]) -> None:
+def test_mean_flux_of_the_recording(files: tuple[Path, Path, Path]) -> None:
     """Told to the pipeline, and the same again after a stop."""
     frames, configuration, output = files
     changes: dict[str, Any] = {"estimator": "window", "spot_fwhm_px": 2.0}
-    told: dict[str, Any] = {"changes": changes, "mean_light": True}
+    told: dict[str, Any] = {"changes": changes, "mean_flux": True}
     with pytest.raises(Stopped):
         measure_recorded([frames], configuration, output, **told, block_frames=8, progress=stop_after(8))
     assert measure_recorded([frames], configuration, output, **told).resumed_at == 8
     layout, settings, calibration, _, _ = faintspot.pipeline.configuration.load_all(configuration)
     pipeline = faintspot.SlopePipeline(layout, settings.replace(**changes), calibration)
-    light = faintspot.MeanFlux(pipeline(simulated()).flux)
-    expected_slopes = pipeline.with_flux(light)(simulated())
+    flux = faintspot.MeanFlux(pipeline(simulated()).flux)
+    expected_slopes = pipeline.with_flux(flux)(simulated())
     np.testing.assert_array_equal(read_slopes(output).variables["x"], expected_slopes.x)
-    assert np.ptp(expected_slopes.flux / light.flux_e) > 0.01  # the light of frames differs
+    assert np.ptp(expected_slopes.flux / flux.flux_e) > 0.01  # the light of frames differs
 
 
-def test_mean_light_of_an_estimator_that_does_not_use_it(files: tuple[Path, Path, Path]) -> None:
+def test_mean_flux_of_an_estimator_that_does_not_use_it(files: tuple[Path, Path, Path]) -> None:
     frames, configuration, output = files
     with pytest.raises(InputError, match="'brightest' does not use the light"):
-        measure_recorded([frames], configuration, output, changes={"estimator": "brightest"}, mean_light=True)
+        measure_recorded([frames], configuration, output, changes={"estimator": "brightest"}, mean_flux=True)

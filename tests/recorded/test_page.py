@@ -129,7 +129,7 @@ def test_without_layout_the_page_says_so() -> None:
 def test_warnings_say_what_to_do_next() -> None:
     x = np.zeros((4, 5))
     flags = np.zeros((4, 5), np.uint8)
-    flags[:, 0] = 1  # NO_LIGHT
+    flags[:, 0] = 1  # NO_FLUX
     flags[:, 1] = 8  # SATURATED
     flags[:, 2] = 32  # NOT_CONVERGED
     arm = MeasuredSlopes("TV", x, x, x + 5, flags, x.astype(int) + 7)

@@ -21,7 +21,7 @@ def make_arm(
     rng = np.random.default_rng(seed)
     x, y = rng.normal(size=(2, n_frames, n)).astype(np.float32)
     dark = rng.random((n_frames, n)) < dark_fraction
-    flags = np.where(dark, int(SubapertureFlag.NO_LIGHT), 0).astype(np.uint8)
+    flags = np.where(dark, int(SubapertureFlag.NO_FLUX), 0).astype(np.uint8)
     flux = rng.exponential(100.0, (n_frames, n)).astype(np.float32)
     return MeasuredSlopes(name, x, y, flux, flags, rng.integers(1, 30, (n_frames, n)))
 
@@ -71,12 +71,12 @@ def test_summary_is_of_valid_measurements_only() -> None:
 
 
 def test_limit_fraction_counts_valid_measurements() -> None:
-    flags = np.array([[32, 0, 33, 1]], np.uint8)  # NOT_CONVERGED; fine; both NO_LIGHT and NOT_CONVERGED; dark
+    flags = np.array([[32, 0, 33, 1]], np.uint8)  # NOT_CONVERGED; fine; both NO_FLUX and NOT_CONVERGED; dark
     zero = np.zeros((1, 4))
     arm = MeasuredSlopes("TV", zero, zero, zero, flags, np.ones((1, 4), int))
     assert statistics.summarise(arm).limit_fraction == 0.5
-    assert arm.flag_count(SubapertureFlag.NO_LIGHT) == 2
-    assert arm.flag_count(SubapertureFlag.NO_LIGHT | SubapertureFlag.NOT_CONVERGED) == 1
+    assert arm.flag_count(SubapertureFlag.NO_FLUX) == 2
+    assert arm.flag_count(SubapertureFlag.NO_FLUX | SubapertureFlag.NOT_CONVERGED) == 1
 
 
 def test_nothing_valid_gives_nan_without_warnings() -> None:

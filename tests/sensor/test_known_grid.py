@@ -50,7 +50,7 @@ def test_all_cells_are_illuminated_where_none_is_clearly_dark() -> None:
 
 
 @pytest.mark.parametrize("n", [2, 4, 7, 20])
-def test_lit_cells_are_not_taken_for_dark_ones(n: int) -> None:
+def test_illuminated_cells_are_not_taken_for_dark_ones(n: int) -> None:
     """Flux that scatters by 0.4, as scintillation makes it."""
     for seed in range(20):
         flux = np.exp(0.4 * np.random.default_rng(seed).normal(size=(n, n)))
@@ -96,7 +96,9 @@ def test_a_pupil_decides_whatever_the_flux() -> None:
 def test_the_fraction_decides() -> None:
     image = np.kron(np.array([[0.0, 1.0, 1.0], [0.0, 0.5, 1.0], [0.0, 0.1, 1.0]]), np.ones((2, 2)))
     for fraction, count in ((0.05, 6), (0.3, 5), (0.6, 4)):
-        assert len(find_illuminated(image, (3, 3), has_dark=True, lit_fraction=fraction).layout) == count
+        assert (
+            len(find_illuminated(image, (3, 3), has_dark=True, illuminated_fraction=fraction).layout) == count
+        )
 
 
 @pytest.mark.parametrize(
@@ -105,7 +107,12 @@ def test_the_fraction_decides() -> None:
         (np.ones((20, 20)), (12, 10), {}, "cells of at least"),
         (np.ones((20, 20)), (10, 10), {"pixels": 3}, "within a cell"),
         (np.zeros((20, 20)), (10, 10), {"has_dark": True}, "no cell is illuminated"),
-        (np.ones((20, 20)), (10, 10), {"lit_fraction": 2.0, "has_dark": True}, "lit_fraction"),
+        (
+            np.ones((20, 20)),
+            (10, 10),
+            {"illuminated_fraction": 2.0, "has_dark": True},
+            "illuminated_fraction",
+        ),
         (np.ones((20, 20)), (10, 10), {"roi": (0, 0, 30, 20)}, "roi"),
     ],
 )

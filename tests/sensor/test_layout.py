@@ -24,11 +24,11 @@ class TestGrid:
             ((40, 40), 20.0, 0.0, 1264),
         ],
     )
-    def test_number_of_lit_subapertures(self, shape: Any, outer: Any, inner: Any, count: int) -> None:
+    def test_number_of_illuminated_subapertures(self, shape: Any, outer: Any, inner: Any, count: int) -> None:
         layout = fs.Layout.grid(shape, pixels=4, outer_radius=outer, inner_radius=inner)
         distance = [np.hypot(i - (shape[0] - 1) / 2, j - (shape[1] - 1) / 2) for i, j in np.ndindex(shape)]
-        lit = [d for d in distance if (inner or 0) <= d <= (np.inf if outer is None else outer)]
-        assert len(layout) == len(lit)
+        illuminated = [d for d in distance if (inner or 0) <= d <= (np.inf if outer is None else outer)]
+        assert len(layout) == len(illuminated)
         assert len(layout) == count
 
     def test_places(self) -> None:

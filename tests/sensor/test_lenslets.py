@@ -148,11 +148,11 @@ def test_flux_is_that_of_the_spots() -> None:
     assert np.median(grid.flux) == pytest.approx(3000.0, rel=0.15)
 
 
-def test_dim_lenslets_are_not_lit() -> None:
+def test_dim_lenslets_are_not_illuminated() -> None:
     truth = simulated(shift=0.05, hot_pixels=0, seed=4)
     bright = find_lenslets(truth.image)
     assert len(bright.cells) == len(truth.nodes)
-    assert find_lenslets(truth.image, lit_fraction=1.0).flux.min() >= np.median(bright.flux) * 0.99
+    assert find_lenslets(truth.image, illuminated_fraction=1.0).flux.min() >= np.median(bright.flux) * 0.99
 
 
 def test_hint_and_geometry_are_obeyed() -> None:
@@ -216,7 +216,7 @@ def test_no_lattice_is_an_error_in_one_line(image: NDArray[Any]) -> None:
         (np.eye(40), {"geometry": "round"}, "geometry"),
         (np.eye(40), {"pitch_px": -3}, "pitch_px"),
         (np.eye(40), {"pitch_px": 39}, "pitch_px"),
-        (np.eye(40), {"lit_fraction": 2}, "lit_fraction"),
+        (np.eye(40), {"illuminated_fraction": 2}, "illuminated_fraction"),
         (np.eye(40), {"bad_pixels": np.zeros((3, 3), dtype=bool)}, "bad_pixels"),
         (np.eye(40), {"bad_pixels": np.ones((40, 40), dtype=bool)}, "bad_pixels"),
     ],
@@ -273,7 +273,9 @@ def test_bench_edge_frames() -> None:
         ("f9wfs_20200225-205600", "hexagonal", 35.02, 28.6, 143),
     ],
 )
-def test_telescope_frames(name: str, geometry: str, pitch_px: float, angle_deg: float, lit: int) -> None:
+def test_telescope_frames(
+    name: str, geometry: str, pitch_px: float, angle_deg: float, illuminated: int
+) -> None:
     grid = find_lenslets(fits_frame(f"data/{name}.fits.gz"))
     check_regular(grid)
     assert grid.geometry == geometry
@@ -281,7 +283,7 @@ def test_telescope_frames(name: str, geometry: str, pitch_px: float, angle_deg: 
     assert grid.angle_deg == pytest.approx(angle_deg, abs=0.2)
     # Counts that this finder gave and pictures of the windows bear out; a few dim ones at the pupil's edge
     # may fall either way.
-    assert abs(len(grid.cells) - lit) <= 4
+    assert abs(len(grid.cells) - illuminated) <= 4
     if geometry == "square":
         assert grid.cells[:, 1].max() == 13
     # Nothing is lit behind the central obstruction.
@@ -289,7 +291,7 @@ def test_telescope_frames(name: str, geometry: str, pitch_px: float, angle_deg: 
     assert np.hypot(*(grid.centres - middle).T).min() > 1.2 * grid.pitch_px
 
 
-def test_reference_frame_is_lit_all_over() -> None:
+def test_reference_frame_is_illuminated_all_over() -> None:
     """17 x 17, of which three corners of the lowest row and two beside are dark or cut."""
     grid = find_lenslets(fits_frame("data/f5_hecto_ref.fits.gz"))
     assert grid.geometry == "square"

@@ -10,21 +10,21 @@ from hypothesis import strategies as st
 from faintspot.base.errors import InputError
 from faintspot.simulate.photometry import ZERO_POINTS, Photometry
 
-LIGHT = Photometry(area_m2=0.36, frame_time_s=0.004)
+FLUX = Photometry(area_m2=0.36, frame_time_s=0.004)
 
 
 @given(st.floats(-5, 25))
 def test_magnitude_is_the_inverse_of_electrons(magnitude: float) -> None:
-    assert float(LIGHT.magnitude(LIGHT.electrons(magnitude))) == pytest.approx(magnitude, abs=1e-9)
+    assert float(FLUX.magnitude(FLUX.electrons(magnitude))) == pytest.approx(magnitude, abs=1e-9)
 
 
 def test_electrons_are_those_of_the_formula() -> None:
     expected = ZERO_POINTS["R"] * 10**-4.0 * 0.36 * 0.004 * 0.4 * 0.9
-    assert float(LIGHT.electrons(10.0)) == pytest.approx(expected)
+    assert float(FLUX.electrons(10.0)) == pytest.approx(expected)
 
 
 def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
-    bright, faint = LIGHT.electrons([7.0, 12.0])
+    bright, faint = FLUX.electrons([7.0, 12.0])
     assert bright / faint == pytest.approx(100)
 
 

@@ -121,7 +121,7 @@ def test_information_lies_between_gaussian_and_counting(mean: float, read_noise:
     assert found <= (1 + 5e-4) / max(mean, 1e-6)
 
 
-def test_exact_and_gaussian_noise_agree_with_much_light_only() -> None:
+def test_exact_and_gaussian_noise_agree_with_much_flux_only() -> None:
     detector = Detector(1.0)
     ratio = [
         float((cramer_rao(f, detector=detector, noise="gaussian") / cramer_rao(f, detector=detector)).mean())
@@ -169,7 +169,7 @@ def test_a_maximum_likelihood_fit_reaches_the_bound(flux: float, read_noise: flo
     assert 0.9 < efficiency < 1.1
 
 
-def test_a_multiplication_register_costs_half_the_light() -> None:
+def test_a_multiplication_register_costs_half_the_flux() -> None:
     counting = cramer_rao(50.0, detector=Detector(0.0), noise="gaussian")
     multiplied = cramer_rao(100.0, detector=Detector(0.0, em_gain=300.0))
     np.testing.assert_allclose(multiplied, counting, rtol=1e-6)
@@ -253,7 +253,7 @@ def test_negative_wings_tell_nothing() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(flux=st.floats(1, 1e4), read_noise=st.sampled_from([0.0, 0.1, 1.0, 3.0]), share=st.floats(0.1, 1))
-def test_efficiency_is_the_share_of_light_needed(flux: float, read_noise: float, share: float) -> None:
+def test_efficiency_is_the_share_of_flux_needed(flux: float, read_noise: float, share: float) -> None:
     detector = Detector(read_noise)
     error = MEAN_ABSOLUTE * cramer_rao(share * flux, detector=detector).mean()
     assert photon_efficiency(error, flux, detector=detector) == pytest.approx(share, rel=2e-3)

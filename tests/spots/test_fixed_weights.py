@@ -73,7 +73,7 @@ def test_stated_errors_are_those_of_the_slopes(learnt: fs.FixedWeights) -> None:
     assert found.x.std() == pytest.approx(float(found.standard_error_x[0]), rel=0.03)
 
 
-def test_without_known_light_the_frame_says_it() -> None:
+def test_without_known_flux_the_frame_says_it() -> None:
     clean, _ = spots_of_a_loop(9, 3)
     images = (1e4 * clean).astype(np.float32)
     layout, settings = fs.Layout.grid((9, 1), pixels=SIDE), window(2.5).replace(flux_e=None)
@@ -82,13 +82,13 @@ def test_without_known_light_the_frame_says_it() -> None:
     np.testing.assert_allclose(pipeline(frame).vector, pipeline(3 * frame).vector, atol=1e-5)
 
 
-def test_mean_light_needs_the_light() -> None:
+def test_mean_flux_needs_the_flux() -> None:
     settings = fs.Settings(Window(normalisation="mean"), spot_fwhm_px=2.0)
     with pytest.raises(fs.InputError, match=r"settings.flux_e: expected the light"):
         fs.SlopePipeline(fs.Layout.grid((2, 2), pixels=8), settings)
 
 
-def test_spots_without_light_are_flagged() -> None:
+def test_spots_without_flux_are_flagged() -> None:
     settings = window(2.0).replace(flux_e=np.array([60.0, 1e-6]))
     clean, _ = spots_of_a_loop(2, 3)
     found = measure_images(FLUX_E * clean, settings, calibration=fs.Calibration(read_noise_e=1.0))
@@ -139,7 +139,7 @@ def test_files(tmp_path: Path, learnt: fs.FixedWeights) -> None:
     learnt.save(path)
     again = load_score(path)
     assert isinstance(again, fs.FixedWeights)
-    for name in ("x", "y", "mean_spot", "light"):
+    for name in ("x", "y", "mean_spot", "flux"):
         np.testing.assert_array_equal(getattr(again, name), getattr(learnt, name))
 
 
@@ -151,7 +151,7 @@ def test_files(tmp_path: Path, learnt: fs.FixedWeights) -> None:
         ({"x": np.full((4, 4), np.nan)}, "weights.x: expected finite"),
         ({"x": np.full((4, 4), 1e30)}, "weights.x"),
         ({"mean_spot": np.zeros((4, 4))}, "weights.mean_spot: expected light"),
-        ({"light": np.ones((5, 4))}, "weights.light: expected shape"),
+        ({"flux": np.ones((5, 4))}, "weights.light: expected shape"),
         ({"index": [[0]]}, "weights.index: expected shape"),
         ({"index": [1]}, "weights.index = 1"),
     ],

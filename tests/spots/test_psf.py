@@ -44,7 +44,7 @@ def test_images_are_those_of_the_simulation(options: dict[str, Any]) -> None:
 
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.5, 1e4))
 @settings(max_examples=25, deadline=None)
-def test_light_and_position(x: float, y: float, flux: float) -> None:
+def test_flux_and_position(x: float, y: float, flux: float) -> None:
     psf = PSF.analytic("gaussian", radius_px=8)
     image = psf.images(np.array([[x, y]]), (24, 24), flux)[0]
     u = np.arange(24) - 11.5

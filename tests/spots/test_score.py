@@ -82,7 +82,7 @@ def test_stays_within_the_search_range(x: float, y: float, half: float, home: fl
     assert np.all(np.abs(found - home) <= half * (1 + 1e-12))
 
 
-def test_no_expected_light_leaves_the_start() -> None:
+def test_no_expected_flux_leaves_the_start() -> None:
     images = np.ones((5, 8, 8))
     np.testing.assert_array_equal(random_score().apply(images, 0.0, [0.3, -1.1])[2], [0.3, -1.1])
     np.testing.assert_array_equal(random_score().apply(images, -5.0, reference=[0.1, 0.2])[2], [0.1, 0.2])

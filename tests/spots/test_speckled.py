@@ -140,7 +140,7 @@ def test_strehl_ratio_in_weak_turbulence() -> None:
     assert abs((1 - strehl) / (variance * d_over_r0 ** (5 / 3)) - 1) < 0.09
 
 
-def test_truth_is_the_centre_of_gravity_of_all_the_light() -> None:
+def test_truth_is_the_centre_of_gravity_of_all_the_flux() -> None:
     images, truth = speckled_spots(
         60,
         d_over_r0=2.0,
@@ -214,7 +214,7 @@ def test_the_same_seed_gives_the_same_images_however_many() -> None:
     size=st.floats(0.3, 4),
     shape=st.tuples(st.integers(1, 30), st.integers(1, 30)),
 )
-def test_light_is_never_negative_nor_made(d_over_r0: float, size: float, shape: tuple[int, int]) -> None:
+def test_flux_is_never_negative_nor_made(d_over_r0: float, size: float, shape: tuple[int, int]) -> None:
     images, truth = speckled_spots(4, d_over_r0=d_over_r0, size=size, shape=shape, flux_e=7.0)
     assert images.shape == (4, *shape)
     assert np.all(images >= 0)
@@ -233,8 +233,8 @@ def test_subapertures_see_turbulence_and_keep_their_positions() -> None:
     assert speckled.dtype == np.float32
     assert speckled.max(axis=(1, 2)).mean() < 0.8 * still.max(axis=(1, 2)).mean()
     # Turbulence of 2 r0 spreads 3 to 5 % of the light beyond 16 pixels.
-    light = speckled.sum(axis=(1, 2)) / still.sum(axis=(1, 2))
-    assert 0.9 < light.mean() < 1.0
+    flux = speckled.sum(axis=(1, 2)) / still.sum(axis=(1, 2))
+    assert 0.9 < flux.mean() < 1.0
 
 
 def test_no_turbulence_leaves_the_draws_of_subapertures_as_they_were() -> None:

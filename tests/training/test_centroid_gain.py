@@ -49,7 +49,7 @@ def test_quad_cells() -> None:
 
 def prepared_gain(pipeline: fs.SlopePipeline) -> Any:
     """The gain that the window takes for the spot's given width: what it divides differences by."""
-    prepared: Any = pipeline.preparation.prepared
+    prepared: Any = pipeline.plan.prepared
     return 0.5 / np.abs(prepared.weights.x).max()
 
 

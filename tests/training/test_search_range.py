@@ -11,10 +11,10 @@ SHAPE, SPOTS = (12, 12), 600
 ANYWHERE = 4.0  # px: as far as spots of this window can be told
 
 
-def measured(flux_e: float, positions: np.ndarray, light: np.ndarray | float = 1.0) -> SpotRange:
+def measured(flux_e: float, positions: np.ndarray, relative: np.ndarray | float = 1.0) -> SpotRange:
     """Return the range of spots at 3 e- of read noise; it knows the flux only up to a factor of 2."""
     rng = np.random.default_rng(3)
-    camera, flux = Detector(read_noise_e=3.0), flux_e * light * np.ones(len(positions))
+    camera, flux = Detector(read_noise_e=3.0), flux_e * relative * np.ones(len(positions))
     images, _ = subapertures(
         len(positions), shape=SHAPE, flux_e=flux, positions=positions, detector=camera, rng=rng
     )
@@ -40,8 +40,8 @@ def test_an_offset_common_to_all_spots_counts_once() -> None:
 
 
 def test_dim_subapertures_are_as_near_as_bright_ones() -> None:
-    light = np.where(np.arange(SPOTS) % 4, 1.3, 0.1)
-    assert measured(60.0, np.zeros((SPOTS, 2)), light).quantile_px < 0.5
+    flux = np.where(np.arange(SPOTS) % 4, 1.3, 0.1)
+    assert measured(60.0, np.zeros((SPOTS, 2)), flux).quantile_px < 0.5
 
 
 @pytest.mark.parametrize("true_px", [0.0, ANYWHERE])

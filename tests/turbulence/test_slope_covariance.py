@@ -40,11 +40,11 @@ def _simulated(configuration: LoopConfiguration, lag_s: float) -> tuple[np.ndarr
     across, samples = configuration.sensor.subapertures, configuration.sensor.samples
     rng, products = np.random.default_rng(2), []
     for realisation in range(24):
-        air = make_atmosphere(configuration, 7, realisation)
+        atmosphere = make_atmosphere(configuration, 7, realisation)
         for time in rng.uniform(0, 100, 40):
             pair = []
             for at in (time + lag_s, time):
-                squares = air.wavefront_nm(at).reshape(across, samples, across, samples).swapaxes(1, 2)
+                squares = atmosphere.wavefront_nm(at).reshape(across, samples, across, samples).swapaxes(1, 2)
                 rise = [np.diff(squares, axis=axis).mean(axis=(2, 3)).ravel() * samples for axis in (3, 2)]
                 pair.append(np.concatenate(rise))
             products.append(np.outer(*pair))

@@ -37,7 +37,7 @@ def slopes_of_modes(layout: Layout, coefficients: NDArray[Any]) -> NDArray[np.fl
 
 def flagged(slopes: Slopes, where: Any) -> Slopes:
     flags = slopes.flags.copy()
-    flags[where] = int(SubapertureFlag.NO_LIGHT)
+    flags[where] = int(SubapertureFlag.NO_FLUX)
     return replace(
         slopes, flags=flags, x=np.where(flags > 0, 0, slopes.x), y=np.where(flags > 0, 0, slopes.y)
     )

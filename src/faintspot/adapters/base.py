@@ -25,13 +25,13 @@ from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
 
-CALIBRATION_LIGHT_E = 1000.0
-"""Light (electrons) of a sub-aperture at which frames without noise are measured."""
-LIGHT_FRAMES = 1000.0
-"""Time constant of the mean light, frames."""
-_FIRST_FRAMES = 20  # that the mean light begins with: one faint frame says too little
+CALIBRATION_FLUX_E = 1000.0
+"""Flux (electrons) of a sub-aperture at which frames without noise are measured."""
+FLUX_FRAMES = 1000.0
+"""Time constant of the mean flux, frames."""
+_FIRST_FRAMES = 20  # that the mean flux begins with: one faint frame says too little
 _FOLLOW_EVERY = 10  # frames
-_LEAST_LIGHT_E = 1e-3
+_LEAST_FLUX_E = 1e-3
 _PARTS = "estimator", "settings", "calibration", "psf", "score"
 _EXACT_PX = 1e-6  # what a centre in pixels may be off by rounding
 
@@ -142,8 +142,8 @@ class Options(TypedDict, total=False):
 
     psf: PSF | None
     score: Score | None
-    calibration_light_e: float
-    light_frames: float | None
+    calibration_flux_e: float
+    flux_frames: float | None
     threads: int | None
 
 
@@ -160,11 +160,11 @@ class ToolSlopes:
         The tool's unit per pixel along x and y; negative where its axis runs against the frame's.
     psf, score : PSF, Score, optional
         For the estimators that need them, see `faintspot.SlopePipeline`.
-    calibration_light_e : float
-        Mean light of a sub-aperture, electrons, at which frames without noise are measured.
-    light_frames : float, optional
-        Time constant (frames) of the running mean of the light that estimators which use it are given, where
-        the settings have no `flux_e`; begins after 20 frames. None: the light is that of each frame.
+    calibration_flux_e : float
+        Mean flux of a sub-aperture, electrons, at which frames without noise are measured.
+    flux_frames : float, optional
+        Time constant (frames) of the running mean of the flux that estimators which use it are given, where
+        the settings have no `flux_e`; begins after 20 frames. None: the flux is that of each frame.
     threads : int, optional
         See `faintspot.SlopePipeline`.
 
@@ -183,20 +183,20 @@ class ToolSlopes:
         unit_per_px: ArrayLike = (1.0, 1.0),
         psf: PSF | None = None,
         score: Score | None = None,
-        calibration_light_e: float = CALIBRATION_LIGHT_E,
-        light_frames: float | None = LIGHT_FRAMES,
+        calibration_flux_e: float = CALIBRATION_FLUX_E,
+        flux_frames: float | None = FLUX_FRAMES,
         threads: int | None = None,
     ) -> None:
         self.pipeline = SlopePipeline(layout, settings, calibration, psf=psf, score=score, threads=threads)
         self.unit_per_px = finite_array("unit_per_px", unit_per_px).astype(np.float64).reshape(2, 1)
-        self._light_e = _checked_light(calibration_light_e)
-        if light_frames is not None:
-            number_between("light_frames", light_frames, 1.0)
-        known = not np.isnan(self.pipeline.preparation.sensor.flux_e).any()
-        follows = light_frames is not None and settings.estimator.uses_light and not known
-        self._light_frames = light_frames if follows else None
-        self._first_light: list[NDArray[np.float32]] = []
-        self._light: MeanFlux | None = None
+        self._flux_e = _checked_flux(calibration_flux_e)
+        if flux_frames is not None:
+            number_between("flux_frames", flux_frames, 1.0)
+        known = not np.isnan(self.pipeline.plan.sensor.flux_e).any()
+        follows = flux_frames is not None and settings.estimator.uses_flux and not known
+        self._flux_frames = flux_frames if follows else None
+        self._first_flux: list[NDArray[np.float32]] = []
+        self._flux: MeanFlux | None = None
         self._frames = 0
         self.noise_free = False
         """Whether frames are a calibration's, without noise, as in `calibrating`."""
@@ -219,35 +219,35 @@ class ToolSlopes:
         Raises
         ------
         InputError
-            As for the pipeline; for a calibration frame without light, or without slopes.
+            As for the pipeline; for a calibration frame without flux, or without slopes.
         """
         if noise_free or self.noise_free:
             self._last = self._calibrated(frame)
         else:
             self._last = self.pipeline(frame, prior_px)
-            if self._light_frames is not None:
+            if self._flux_frames is not None:
                 self._follow(self._last.flux)
         return np.stack([self._last.x, self._last.y], dtype=np.float64) * self.unit_per_px
 
     @contextmanager
-    def calibrating(self, light_e: float | None = None) -> Iterator[None]:
+    def calibrating(self, flux_e: float | None = None) -> Iterator[None]:
         """Measure frames without noise, as of interaction matrices and references, in the `with` block.
 
-        Whatever their light is, they are measured at `light_e` electrons a sub-aperture (default: as given
+        Whatever their flux is, they are measured at `flux_e` electrons a sub-aperture (default: as given
         when this was made), with no prior, and without what is meant for noise: at a faint star's own light
-        denoising would flatten the spots, and in very bright light models of noise no longer hold.
+        denoising would flatten the spots, and in very high flux models of noise no longer hold.
 
         Raises
         ------
         InputError
-            For light that is not positive.
+            For flux that is not positive.
         """
-        before = self.noise_free, self._light_e
-        self.noise_free, self._light_e = True, self._light_e if light_e is None else _checked_light(light_e)
+        before = self.noise_free, self._flux_e
+        self.noise_free, self._flux_e = True, self._flux_e if flux_e is None else _checked_flux(flux_e)
         try:
             yield
         finally:
-            self.noise_free, self._light_e = before
+            self.noise_free, self._flux_e = before
 
     @property
     def last(self) -> Slopes:
@@ -269,26 +269,26 @@ class ToolSlopes:
         return in_px * np.abs(self.unit_per_px)
 
     @property
-    def light(self) -> MeanFlux | None:
-        """The running mean of the light, once there is one."""
-        return self._light
+    def flux(self) -> MeanFlux | None:
+        """The running mean of the flux, once there is one."""
+        return self._flux
 
     def _follow(self, flux_e: NDArray[np.float32]) -> None:
-        """Take a frame's light into the mean; the pipeline follows in steps, as making it anew takes time."""
-        assert self._light_frames is not None
+        """Take a frame's flux into the mean; the pipeline follows in steps, as making it anew takes time."""
+        assert self._flux_frames is not None
         self._frames += 1
-        if self._light is not None:
-            self._light = self._light.updated(flux_e)
+        if self._flux is not None:
+            self._flux = self._flux.updated(flux_e)
         elif self._frames < _FIRST_FRAMES:
-            self._first_light.append(flux_e)
+            self._first_flux.append(flux_e)
         else:
-            self._light = MeanFlux(np.array([*self._first_light, flux_e]), self._light_frames)
-            self._first_light.clear()
-        if self._light is not None and self._frames % _FOLLOW_EVERY == 0:
-            self.pipeline = self.pipeline.with_flux(self._light)
+            self._flux = MeanFlux(np.array([*self._first_flux, flux_e]), self._flux_frames)
+            self._first_flux.clear()
+        if self._flux is not None and self._frames % _FOLLOW_EVERY == 0:
+            self.pipeline = self.pipeline.with_flux(self._flux)
 
     def _calibrated(self, frame: Any) -> Slopes:
-        """Measure a frame without noise at the light of calibrations."""
+        """Measure a frame without noise at the flux of calibrations."""
         pipeline, calibration = self.pipeline, self.pipeline.calibration
         layout = pipeline.layout
         array = finite_array("calibration frame", frame)
@@ -296,28 +296,28 @@ class ToolSlopes:
             raise InputError(f"calibration frame: expected shape {layout.frame_shape}, got {array.shape}")
         dark, e_per_adu = calibration.maps(layout.frame_shape)
         images = layout.images((array - dark) * e_per_adu)
-        light = np.nansum(images, axis=(1, 2))
-        if not light.mean() > 0.0:
+        flux = np.nansum(images, axis=(1, 2))
+        if not flux.mean() > 0.0:
             raise InputError(
-                f"calibration frame: expected light in the sub-apertures, got {light.mean():.3g} e- in the "
+                f"calibration frame: expected flux in the sub-apertures, got {flux.mean():.3g} e- in the "
                 "mean; is the source on, and the calibration's dark right?"
             )
-        factor = self._light_e / light.mean()
+        factor = self._flux_e / flux.mean()
         if self._bright is None:
             settings = pipeline.settings
-            bright = settings.replace(estimator=settings.estimator.for_bright_light(), flux_e=None)
+            bright = settings.replace(estimator=settings.estimator.for_bright_flux(), flux_e=None)
             self._bright = pipeline.with_settings(bright).for_images()
-        if self._bright.settings.estimator.uses_light:
-            self._bright = self._bright.with_flux(np.maximum(light * factor, _LEAST_LIGHT_E))
+        if self._bright.settings.estimator.uses_flux:
+            self._bright = self._bright.with_flux(np.maximum(flux * factor, _LEAST_FLUX_E))
         slopes = self._bright((images * factor).reshape(-1, layout.window[1]))
         found = int(np.count_nonzero(slopes.valid))
         if 2 * found < len(layout):
             raise InputError(
                 f"calibration frame: expected slopes of {len(layout)} sub-apertures, got {found}; check that "
-                "spots are within their windows and search_range_px, or give another calibration_light_e"
+                "spots are within their windows and search_range_px, or give another calibration_flux_e"
             )
         return slopes
 
 
-def _checked_light(light_e: float) -> float:
-    return number_between("calibration_light_e", light_e, 0.0, 1e9, low_open=True)
+def _checked_flux(flux_e: float) -> float:
+    return number_between("calibration_flux_e", flux_e, 0.0, 1e9, low_open=True)

@@ -53,7 +53,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         Takes the last slopes, (2, n) m, and returns those that are expected next, for estimators that take a
         prior; called before each frame but the first.
     **options
-        psf, score, calibration_light_e, light_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
+        psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
     estimation_grid : hcipy.Grid
         Their centres: the grid of the slopes.
     measured : ToolSlopes
-        What measures: its `pipeline`, the `last` slopes (px), `light`.
+        What measures: its `pipeline`, the `last` slopes (px), `flux`.
 
     Raises
     ------
@@ -128,9 +128,9 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         self._slopes = hcipy.Field(self.measured.measure(frame, prior_px=prior_px), self.estimation_grid)
         return self._slopes
 
-    def calibrating(self, light_e: float | None = None) -> Any:
+    def calibrating(self, flux_e: float | None = None) -> Any:
         """Measure images without noise in a `with` block, see `ToolSlopes.calibrating`."""
-        return self.measured.calibrating(light_e)
+        return self.measured.calibrating(flux_e)
 
     @property
     def pipeline(self) -> SlopePipeline:

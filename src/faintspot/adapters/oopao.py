@@ -44,7 +44,7 @@ def attach(
         Takes the last `wfs.signal`, (2 n,), and returns the one that is expected next, for estimators that
         take a prior; called before each frame but the first. For an asterism a list, one for each source.
     **options
-        psf, score, calibration_light_e, light_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
+        psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Returns
     -------
@@ -98,7 +98,7 @@ class Attached:
             if not abs(unit) > _LEAST_UNIT:  # NaN is not, either
                 raise InputError(
                     f"wfs.slopes_units: expected about 1 from OOPAO's tilt, got {unit:g}; check "
-                    "search_range_px, or give another calibration_light_e"
+                    "search_range_px, or give another calibration_flux_e"
                 )
         except InputError:
             del wfs.wfs_integrate, wfs.centroid
@@ -110,19 +110,19 @@ class Attached:
         self.wfs.initialize_wfs()
 
     @contextmanager
-    def calibrating(self, light_e: float | None = None) -> Iterator[None]:
+    def calibrating(self, flux_e: float | None = None) -> Iterator[None]:
         """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`.
 
         OOPAO's frames without photon and read-out noise are measured so anyway.
         """
         with ExitStack() as stack:
             for each in self.measured:
-                stack.enter_context(each.calibrating(light_e))
+                stack.enter_context(each.calibrating(flux_e))
             yield
 
     @property
     def measured(self) -> tuple[ToolSlopes, ...]:
-        """Of every source: what measures it, with `last` slopes (px), `standard_errors` and `light`."""
+        """Of every source: what measures it, with `last` slopes (px), `standard_errors` and `flux`."""
         return tuple(source.slopes for source in self._sources)
 
     def _integrate(self, src: Any, sh_data: Any) -> Any:

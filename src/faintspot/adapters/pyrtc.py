@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, ToolSlopes, layout_around, parts_of
+from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, ToolSlopes, layout_around, parts_of
 from faintspot.adapters.checks import check_version
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.realtime.stream import Follower
@@ -58,8 +58,8 @@ def slopes_process() -> Any:
         A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
     noise_free : bool
         Whether frames are a calibration's without noise, as of a simulated sensor. Default false.
-    calibration_light_e, light_frames : float
-        See `faintspot.adapters.base.ToolSlopes`; `light_frames` 0: no running mean.
+    calibration_flux_e, flux_frames : float
+        See `faintspot.adapters.base.ToolSlopes`; `flux_frames` 0: no running mean.
     input_streams: predicted : str
         Stream of the slopes that are expected next, as long as `signal`; optional.
 
@@ -82,9 +82,9 @@ def slopes_process() -> Any:
             """Slopes as pyRTC's centroiders give them: (2 N, N) px, the x map above the y map."""
             return self.measuring.maps(self, image, tool.open_stream)
 
-        def calibrating(self, light_e: float | None = None) -> Any:
+        def calibrating(self, flux_e: float | None = None) -> Any:
             """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`."""
-            return self.measuring.tool.calibrating(light_e)
+            return self.measuring.tool.calibrating(flux_e)
 
     FaintspotSlopes.__module__, FaintspotSlopes.__qualname__ = __name__, "FaintspotSlopes"
     return FaintspotSlopes
@@ -138,7 +138,7 @@ class _Frames:
         if not isinstance(name, str):
             raise InputError(f"wfs.frames: expected the name of a stream, got {name!r}")
         self._shape = int(conf["height"]), int(conf["width"])
-        self._follower = Follower(name, _logger.warning, self._unfit, lambda: "waiting")
+        self._follower = Follower(name, _logger.warning, self._incompatible, lambda: "waiting")
         self._seen = 0
 
     def next_into(self, frame: NDArray[Any]) -> bool:
@@ -166,7 +166,7 @@ class _Frames:
         """Let go of the stream."""
         self._follower.close()
 
-    def _unfit(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
         fits = shape == self._shape and dtype.kind in "iuf"
         return "" if fits else f"frames of {self._shape[0]} x {self._shape[1]} (wfs.height, wfs.width)"
 
@@ -179,9 +179,9 @@ class _Measuring:
             raise InputError("slopes.faintspot: expected a faintspot.toml or its tables, got none")
         self.parts = parts_of(conf["faintspot"])
         self.noise_free = bool(conf.get("noise_free", False))
-        self.light_e = conf.get("calibration_light_e", CALIBRATION_LIGHT_E)
-        frames = conf.get("light_frames", LIGHT_FRAMES)
-        self.light_frames = frames if frames else None
+        self.flux_e = conf.get("calibration_flux_e", CALIBRATION_FLUX_E)
+        frames = conf.get("flux_frames", FLUX_FRAMES)
+        self.flux_frames = frames if frames else None
         self.stream_name = (conf.get("input_streams") or {}).get(PREDICTED)
         self._stream: Any = None
         self._tool: ToolSlopes | None = None
@@ -212,7 +212,7 @@ class _Measuring:
         reference = references.ravel()[at].reshape(2, -1)
         prior = self._predicted(valid, open_stream)
         prior = None if prior is None else (prior.ravel()[at].reshape(2, -1) + reference).ravel()
-        if not image.any():  # pyRTC's first frame, with which kernels are compiled, is no light of a star's
+        if not image.any():  # pyRTC's first frame, with which kernels are compiled, is no flux of a star's
             self._tool.pipeline(image)
             return np.zeros((2 * n, n), np.float32)
         found = self._tool.measure(image, prior_px=prior, noise_free=self.noise_free)
@@ -246,8 +246,8 @@ class _Measuring:
             calibration,
             psf=psf,
             score=score,
-            calibration_light_e=self.light_e,
-            light_frames=self.light_frames,
+            calibration_flux_e=self.flux_e,
+            flux_frames=self.flux_frames,
         )
 
     def _predicted(self, valid: NDArray[np.bool_], open_stream: Any) -> NDArray[np.float64] | None:

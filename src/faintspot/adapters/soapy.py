@@ -41,7 +41,7 @@ def attach(
         Takes the last slopes that the centroider gave, (2 n,) px after the static ones, and returns those
         that are expected next, for estimators that take a prior; called before each frame but the first.
     **options
-        psf, score, calibration_light_e, light_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
+        psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Returns
     -------
@@ -97,15 +97,15 @@ class Attached:
 
     @property
     def measured(self) -> ToolSlopes:
-        """What measures, with `last` slopes (px), `standard_errors` and `light`."""
+        """What measures, with `last` slopes (px), `standard_errors` and `flux`."""
         return self._spots.measured
 
-    def calibrating(self, light_e: float | None = None) -> Any:
+    def calibrating(self, flux_e: float | None = None) -> Any:
         """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`.
 
         soapy's frames of interaction matrices, and those of a sensor without noise, are measured so anyway.
         """
-        return self.measured.calibrating(light_e)
+        return self.measured.calibrating(flux_e)
 
     def _centroid(self, images: Any, threshold: Any = None, ref: Any = None, **_: Any) -> NDArray[np.float64]:
         """Positions as soapy's centroiders give them: (2, n) px from the first pixel."""

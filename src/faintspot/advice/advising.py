@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
-from faintspot.advice.known import Known, of_air, of_images
+from faintspot.advice.loop_telemetry import seen_in_telemetry
+from faintspot.advice.measured import Measured, of_atmosphere, of_images
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
-from faintspot.advice.seen import seen_in_telemetry
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived, parse_json, write_atomically
 from faintspot.base.toml_files import parse_text
@@ -113,7 +113,7 @@ class Advice:
     """Measurements of a closed loop."""
 
     frames: int
-    known: list[Known]
+    known: list[Measured]
 
     def entry(self, name: str) -> dict[str, Any]:
         """Return it as plain values, for the journal."""
@@ -155,14 +155,14 @@ def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
     frames = electrons_of(telemetry.raw, loop.calibration)
     shifted = loop.centroid_gain(settings, frames)
     known = of_images(frames, layout, loop.calibration)
-    gain_known = Known("centroid gain", "", remark="too few images")
+    gain_known = Measured("centroid gain", "", remark="too few images")
     if shifted is not None:
         remark = "over the one that the control divides by"
-        gain_known = Known("centroid gain", "", shifted.value, shifted.standard_error, remark)
+        gain_known = Measured("centroid gain", "", shifted.value, shifted.standard_error, remark)
     gains = [shifted.value if shifted is not None and shifted.value > 0 else 1.0] * number
     modes, unit = wavefront_modes(layout)
     left = residual_wavefront(seen, modes, gains)
-    return Advice(len(seen), [*known, gain_known, *of_air(seen, layout, gains), _residual(left, unit)])
+    return Advice(len(seen), [*known, gain_known, *of_atmosphere(seen, layout, gains), _residual(left, unit)])
 
 
 def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Settings]:
@@ -235,17 +235,17 @@ def _watched(name: str, seconds: float, stop: threading.Event) -> Telemetry:
         reader.close()
 
 
-def _residual(left: Floats, unit: str) -> Known:
+def _residual(left: Floats, unit: str) -> Measured:
     """Return the rms of the residual wavefront."""
     values = left[np.isfinite(left)]
     name = "residual wavefront, what the modes see of it"
     if not len(values):
-        return Known(name, unit, remark="too few frames")
+        return Measured(name, unit, remark="too few frames")
     mean: Estimate = mean_by_blocks(values, _BLOCK_FRAMES)
     if not mean.value > 0:
-        return Known(name, unit, remark="less than its error")
+        return Measured(name, unit, remark="less than its error")
     rms = math.sqrt(mean.value)
-    return Known(name, f"{unit} rms", rms, mean.standard_error / (2 * rms), "the noise taken off")
+    return Measured(name, f"{unit} rms", rms, mean.standard_error / (2 * rms), "the noise taken off")
 
 
 def _plain(value: float) -> float | None:

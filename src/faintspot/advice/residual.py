@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.advice.seen import Seen
+from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.experiments.loop_results import neighbour_differences
 from faintspot.experiments.statistics import Estimate, paired_mean
 from faintspot.pipeline.slopes import RESULT_TYPES, Slopes
@@ -45,7 +45,7 @@ def wavefront_modes(layout: Layout) -> tuple[Floats, str]:
     return np.ascontiguousarray(found.coefficients.T), found.unit
 
 
-def residual_wavefront(seen: Seen, modes: Floats, gains: Sequence[float] | None = None) -> Floats:
+def residual_wavefront(seen: LoopTelemetry, modes: Floats, gains: Sequence[float] | None = None) -> Floats:
     """Return the mean square of each frame's residual wavefront without the noise, (frames,).
 
     In the square of the modes' unit; of single frames it may be negative. NaN near the ends of turns, and
@@ -59,11 +59,11 @@ def residual_wavefront(seen: Seen, modes: Floats, gains: Sequence[float] | None 
     gains : sequence of float, optional
         Centroid gain of every arm; see `faintspot.advice.centroid_gain`.
     """
-    residual, air = (each @ modes.T for each in seen.weighted(gains))
-    around = np.full_like(air, np.nan)
-    near, far = air[3:-1] + air[1:-3], air[4:] + air[:-4]
+    residual, atmosphere = (each @ modes.T for each in seen.weighted(gains))
+    around = np.full_like(atmosphere, np.nan)
+    near, far = atmosphere[3:-1] + atmosphere[1:-3], atmosphere[4:] + atmosphere[:-4]
     around[2:-2] = (4 * near - far) / 6
-    noise = (air * (air - around)).sum(axis=1)
+    noise = (atmosphere * (atmosphere - around)).sum(axis=1)
     left: Floats = np.square(residual).sum(axis=1) - noise
     apart = np.full(len(seen), True)
     apart[2:-2] = seen.turn[4:] != seen.turn[:-4]
@@ -71,7 +71,9 @@ def residual_wavefront(seen: Seen, modes: Floats, gains: Sequence[float] | None 
     return left
 
 
-def compared_residual(seen: Seen, left: Floats, gain_errors: Sequence[float] = (0.0, 0.0)) -> Estimate:
+def compared_residual(
+    seen: LoopTelemetry, left: Floats, gain_errors: Sequence[float] = (0.0, 0.0)
+) -> Estimate:
     """Return by how much arm 1 leaves more than arm 0, in turn with it.
 
     Each turn of arm 1 is compared with the straight line between the turns of arm 0 before and after it.

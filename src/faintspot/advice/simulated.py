@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import electrons_of
-from faintspot.advice.seen import Seen, without_priors
+from faintspot.advice.loop_telemetry import LoopTelemetry, without_priors
 from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.control import prior_std_px
-from faintspot.ao_loop.observatory import TelescopeModel
 from faintspot.ao_loop.record import LoopRecord
+from faintspot.ao_loop.telescope_model import TelescopeModel
 
 
-def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> Seen:
+def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> LoopTelemetry:
     """Return what a simulated loop has seen after settling; its slopes divided as the loop does it."""
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
     later, arm = record.delay_frames - 1, record.arm.astype(np.int64)
@@ -30,17 +30,17 @@ def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> Seen:
     slopes, error = (each / divisor for each in (record.slopes_px, record.standard_error_px))
     alone = without_priors(slopes.astype(np.float64), error.astype(np.float64), expected, arm, priors)
     turn = np.concatenate([[0], np.cumsum(np.diff(arm) != 0)])
-    seen = Seen(arm, turn, *alone, held, record.frame_rate_hz)
+    seen = LoopTelemetry(arm, turn, *alone, held, record.frame_rate_hz)
     return seen.chosen(record.scored & (np.arange(record.frames) < record.frames - later))
 
 
 def frames_of_record(record: LoopRecord, numbers: Sequence[int]) -> NDArray[np.float32]:
     """Return some frames of a run, (images, h, w) electrons, made anew from what the mirror held."""
     configuration = LoopConfiguration.from_text(record.configuration)
-    observatory = TelescopeModel(configuration, record.seed, record.realisation)
+    telescope_model = TelescopeModel(configuration, record.seed, record.realisation)
     frames = []
     for number in numbers:
         time_s = (number + 0.5) / record.frame_rate_hz
-        _, seen = observatory.wavefronts(time_s, record.commands[number].astype(np.float64))
-        frames.append(observatory.frame(number, seen))
+        _, seen = telescope_model.wavefronts(time_s, record.commands[number].astype(np.float64))
+        frames.append(telescope_model.frame(number, seen))
     return electrons_of(np.stack(frames), camera_calibration(configuration))

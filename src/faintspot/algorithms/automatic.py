@@ -1,9 +1,9 @@
-"""Strength, number of kept pixels and smoothing width from what is known of the light and the camera.
+"""Strength, number of kept pixels and smoothing width from what is known of the flux and the camera.
 
 Where the formulae come from, how their constants were found and how well they do: docs/automatic.md. With
 
     N = pixels of the window, r = range of positions, side = sqrt(N),
-    A = noise-equivalent area of the spot, px^2 (1 / sum of f^2, f = fraction of the light in a pixel),
+    A = noise-equivalent area of the spot, px^2 (1 / sum of f^2, f = fraction of the flux in a pixel),
     v = read_noise^2 + excess * background, variance of a dark pixel, e-^2,
     C = flux / (A * (sqrt(v) + tail)), contrast of the core to a dark pixel's noise (`tail`: background
         electrons are few and large, so that their noise has higher peaks than sqrt(v) says),
@@ -116,9 +116,9 @@ def automatic_strength(
     contrast = np.maximum(sensor.flux / (sensor.area * noise), 1e-3)
     dark = gain * (noise + STRENGTH.tail * sensor.excess * sensor.counted) * contrast**-STRENGTH.decline
     dark = dark**2 * np.maximum(1 - freedom / sensor.pixels, 0.1)
-    light = sensor.excess * sensor.flux / sensor.pixels
+    flux = sensor.excess * sensor.flux / sensor.pixels
     outside_core = wings * np.exp(-STRENGTH.wings_window * sensor.area / sensor.pixels)
-    found = np.minimum(np.sqrt(dark + outside_core * light), np.sqrt(sensor.variance + light))
+    found = np.minimum(np.sqrt(dark + outside_core * flux), np.sqrt(sensor.variance + flux))
     strength = np.where(lost, STRENGTH.lost * noise, found)
     result: NDArray[np.float64] = np.where(off, 0.0, strength)[()]
     return result
@@ -258,7 +258,7 @@ def is_lost(**sensor: Any) -> bool:
 
 
 class _Sensor(NamedTuple):
-    """Light, camera and window in electrons and pixels; each a number or an array."""
+    """Flux, camera and window in electrons and pixels; each a number or an array."""
 
     flux: Any
     excess: Any

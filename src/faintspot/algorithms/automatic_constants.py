@@ -49,7 +49,7 @@ class Strength(NamedTuple):
     noise_freedom: float  # and, where the spot is faint, by noise taken for light: up to D = noise_freedom_at
     noise_freedom_at: float
     noise_freedom_exponent: float
-    wings: float  # of a sinc^2: part of the light's noise that is removed; none of a Gaussian's
+    wings: float  # of a sinc^2: part of the flux's noise that is removed; none of a Gaussian's
     wings_window: float  # falls with A / N: in a small window most light is in the core
     lost: float  # of sqrt(v), where the spot is lost
 

@@ -89,30 +89,30 @@ def make_atmosphere(configuration: LoopConfiguration, seed: int, realisation: in
     InputError
         When the outer scale is too large for the screens.
     """
-    air = configuration.atmosphere
+    atmosphere = configuration.atmosphere
     points = configuration.sensor.subapertures * configuration.sensor.samples
     spacing = configuration.width_m / points
-    size = _screen_points(air.outer_scale_m, configuration.width_m, spacing)
-    layers = len(air.fraction)
+    size = _screen_points(atmosphere.outer_scale_m, configuration.width_m, spacing)
+    layers = len(atmosphere.fraction)
     rng = np.random.default_rng([seed, realisation, 1])
     children = rng.spawn(layers)
-    strength = np.array(air.fraction) / sum(air.fraction)
-    amplitude = _amplitudes(size, spacing, air.outer_scale_m)
+    strength = np.array(atmosphere.fraction) / sum(atmosphere.fraction)
+    amplitude = _amplitudes(size, spacing, atmosphere.outer_scale_m)
     screens = tuple(
         _draw_screen(amplitude, child) * np.float32(math.sqrt(part))
         for child, part in zip(children, strength, strict=True)
     )
-    angle = np.deg2rad(air.wind_direction_deg)
-    speed = np.array(air.wind_speed_m_per_s) / spacing
+    angle = np.deg2rad(atmosphere.wind_direction_deg)
+    speed = np.array(atmosphere.wind_speed_m_per_s) / spacing
     velocity = np.stack([np.sin(angle) * speed, np.cos(angle) * speed], axis=1)
-    ends = air.r0_m if isinstance(air.r0_m, tuple) else (air.r0_m, air.r0_m)
+    ends = atmosphere.r0_m if isinstance(atmosphere.r0_m, tuple) else (atmosphere.r0_m, atmosphere.r0_m)
     return MovingLayers(
         screens,
         velocity,
         rng.uniform(0, size, (layers, 2)),
         points,
         (ends[0], ends[1]),
-        air.drift_time_s,
+        atmosphere.drift_time_s,
         float(rng.uniform(0, 2 * math.pi)),
     )
 

@@ -67,12 +67,12 @@ def reference_slopes(
 ) -> NDArray[np.float32]:
     """Return what an arm's estimator measures of a flat wavefront, all x, then all y, (2 n,) px.
 
-    References are measured with bright frames without noise, and without what is for faint light:
+    References are measured with bright frames without noise, and without what is for faint flux:
     at its strength of denoising they would be denoised to nothing.
     """
     bright = SlopePipeline(
         arm_layout(sensor.layout, arm),
-        arm.settings.replace(estimator=arm.settings.estimator.for_bright_light(), flux_e=None),
+        arm.settings.replace(estimator=arm.settings.estimator.for_bright_flux(), flux_e=None),
         Calibration(dark=0.0, read_noise_e=1.0),
         psf=_psf(configuration, arm),
         score=arm.score,
@@ -98,7 +98,7 @@ def interaction_matrix(sensor: ShackHartmann, mirror: DeformableMirror) -> Float
     """Return the displacements of the spots for a command of 1 nm of each actuator, (2 n, commands) px.
 
     Measured by poking each actuator up and down, with bright frames without noise, centres of gravity of
-    all the light in the windows, and divided by the slopes that a known displacement gives. All arms use it,
+    all the flux in the windows, and divided by the slopes that a known displacement gives. All arms use it,
     each with its own reference slopes and its own centroid gain at the run's flux. A matrix through an arm's
     own estimator with such frames was no better: it changed the Strehl ratio by -0.035 to 0.000 for the 20
     brightest pixels, -0.007 to 0.016 for weighted centres of gravity, and -0.037 to -0.014 for likelihood,
@@ -127,7 +127,7 @@ def typical_spots(
     configuration: LoopConfiguration,
     sensor: ShackHartmann,
     mirror: DeformableMirror,
-    air: MovingLayers,
+    atmosphere: MovingLayers,
     reconstructor: Floats,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return spots as in the loop, all displaced by +0.25 px in x and y, and by -0.25 px.
@@ -143,16 +143,16 @@ def typical_spots(
     control = configuration.control
     for number in range(1, _DITHER_WAVEFRONTS + 1):
         time = -_DITHER_STEP_S * number
-        wavefront = air.wavefront_nm(time)
+        wavefront = atmosphere.wavefront_nm(time)
         if control.mode == CLOSED:
-            earlier = air.wavefront_nm(time - control.delay_frames / control.frame_rate_hz)
+            earlier = atmosphere.wavefront_nm(time - control.delay_frames / control.frame_rate_hz)
             wavefront = wavefront - mirror.wavefront_nm(reconstructor @ sensor.mean_slopes_px(earlier))
         pairs.append([sensor.spots(wavefront, sign * _DITHER_PX) for sign in (1.0, -1.0)])
     up, down = (np.stack(spots) for spots in zip(*pairs, strict=True))
     return up, down
 
 
-def mean_light(
+def mean_flux(
     pipeline: SlopePipeline,
     sensor: ShackHartmann,
     detector: Exposing,
@@ -160,7 +160,7 @@ def mean_light(
     spots: tuple[NDArray[np.float32], NDArray[np.float32]],
     seed: int,
 ) -> MeanFlux:
-    """Return the mean light of every sub-aperture, from frames of `typical_spots` at the run's own flux."""
+    """Return the mean flux of every sub-aperture, from frames of `typical_spots` at the run's own flux."""
     frames = []
     for number, each in enumerate(spots[0]):
         rng = np.random.default_rng([seed, number, 5])

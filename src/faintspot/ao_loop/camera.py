@@ -1,4 +1,4 @@
-"""The sensor's camera: what it makes of the light, with its noise or without, and how that is undone."""
+"""The sensor's camera: what it makes of the flux, with its noise or without, and how that is undone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Exposing(Protocol):
     """A camera."""
 
     def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.generic]:
-        """Return a frame of so much light in each pixel."""
+        """Return a frame of so high flux in each pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +29,8 @@ class NoiselessDetector:
     def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float32]:
         """Return the mean frame, ADU."""
         camera = self.detector
-        light = mean_e + camera.background_e + camera.dark_e
-        adu = camera.offset_adu + light * camera.em_gain / camera.gain_e_per_adu
+        flux = mean_e + camera.background_e + camera.dark_e
+        adu = camera.offset_adu + flux * camera.em_gain / camera.gain_e_per_adu
         return adu.astype(np.float32)
 
 

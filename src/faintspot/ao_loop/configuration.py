@@ -90,7 +90,7 @@ class Atmosphere:
 
 @dataclass(frozen=True)
 class Camera:
-    """The sensor's camera and the star's light on it; as `faintspot.simulate.Detector`."""
+    """The sensor's camera and the star's flux on it; as `faintspot.simulate.Detector`."""
 
     photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
     """Photo-electrons of a fully lit sub-aperture in a frame; or give the magnitude."""
@@ -126,9 +126,9 @@ class Control:
     """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
     telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
     """Closed loop with an integrator that other kinds of control learn from, on air that is not scored."""
-    told_wind_factor: float = number(1.0, 0.0, 100.0)
+    assumed_wind_factor: float = number(1.0, 0.0, 100.0)
     """Winds that control is told, as a multiple of the true ones."""
-    told_wind_turn_deg: float = number(0.0, -360.0, 360.0)
+    assumed_wind_turn_deg: float = number(0.0, -360.0, 360.0)
     """Angle by which the winds that control is told are turned."""
 
 
@@ -161,7 +161,7 @@ class LoopConfiguration:
     InputError
         For a value out of its range, and for parts that do not fit together: an aperture smaller than a
         sub-aperture or than all of them cover, a window that the phase's points cannot fill, layers with
-        lists of different lengths, no light or two amounts of it.
+        lists of different lengths, no flux or two amounts of it.
 
     Examples
     --------
@@ -187,7 +187,7 @@ class LoopConfiguration:
         for name in SECTIONS:
             object.__setattr__(self, name, checked_section(name, getattr(self, name), SECTIONS[name]))
         _check_layers(self.atmosphere)
-        _check_light(self.camera)
+        _check_flux(self.camera)
         _check_sampling(self)
 
     def replace(self, section: str, **values: Any) -> LoopConfiguration:
@@ -396,19 +396,23 @@ def _keys(section: str) -> list[str]:
     return [item.name for item in fields(SECTIONS[section])]
 
 
-def _check_layers(air: Atmosphere) -> None:
+def _check_layers(atmosphere: Atmosphere) -> None:
     names = ("altitude_m", "fraction", "wind_speed_m_per_s", "wind_direction_deg")
-    lengths = {name: len(getattr(air, name)) for name in names}
-    if len(set(lengths.values())) > 1 or not air.fraction:
+    lengths = {name: len(getattr(atmosphere, name)) for name in names}
+    if len(set(lengths.values())) > 1 or not atmosphere.fraction:
         found = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise InputError(f"atmosphere: expected lists with one value for each layer, got {found}")
-    if sum(air.fraction) <= 0:
+    if sum(atmosphere.fraction) <= 0:
         raise InputError("atmosphere.fraction: expected at least one layer with a strength above 0")
-    if isinstance(air.r0_m, tuple) and (len(air.r0_m) != 2 or air.r0_m[0] > air.r0_m[1]):
-        raise InputError(f"atmosphere.r0_m = {list(air.r0_m)}: expected one number or [lowest, highest]")
+    if isinstance(atmosphere.r0_m, tuple) and (
+        len(atmosphere.r0_m) != 2 or atmosphere.r0_m[0] > atmosphere.r0_m[1]
+    ):
+        raise InputError(
+            f"atmosphere.r0_m = {list(atmosphere.r0_m)}: expected one number or [lowest, highest]"
+        )
 
 
-def _check_light(camera: Camera) -> None:
+def _check_flux(camera: Camera) -> None:
     if (camera.photons_per_subaperture is None) == (camera.magnitude is None):
         raise InputError("camera: expected either photons_per_subaperture or magnitude")
     one_of("camera.band", camera.band, list(ZERO_POINTS))

@@ -22,7 +22,7 @@ from faintspot.control.telemetry import Telemetry, make_telemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:
-    from faintspot.ao_loop.observatory import LoopOptics
+    from faintspot.ao_loop.telescope_model import LoopOptics
 
 Floats = NDArray[np.float64]
 Simulate = Callable[..., LoopRecord]
@@ -106,18 +106,18 @@ def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
 
 def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
     """Return what theory knows of the slopes of sub-apertures, with the winds that control is told."""
-    air, control = configuration.atmosphere, configuration.control
-    angle = np.deg2rad(air.wind_direction_deg)
+    atmosphere, control = configuration.atmosphere, configuration.control
+    angle = np.deg2rad(atmosphere.wind_direction_deg)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     return SlopeTurbulence(
         cells[:, ::-1].astype(np.float64) * configuration.subaperture_m,
         configuration.subaperture_m,
         configuration.pixel_scale_rad,
-        float(np.mean(air.r0_m)),
-        air.outer_scale_m,
-        np.array(air.fraction),
-        np.array(air.wind_speed_m_per_s, np.float64)[:, None] * around,
-    ).turned(control.told_wind_factor, control.told_wind_turn_deg)
+        float(np.mean(atmosphere.r0_m)),
+        atmosphere.outer_scale_m,
+        np.array(atmosphere.fraction),
+        np.array(atmosphere.wind_speed_m_per_s, np.float64)[:, None] * around,
+    ).turned(control.assumed_wind_factor, control.assumed_wind_turn_deg)
 
 
 @dataclass(frozen=True)
@@ -152,13 +152,13 @@ def _learnt(
     seed: int,
     simulate: Simulate,
 ) -> Learnt:
-    from faintspot.ao_loop.observatory import prepare
+    from faintspot.ao_loop.telescope_model import prepare
 
     if kind == KALMAN and noise_scale != 1.0:  # learning takes long
         usual = _learnt(configuration, known, kind, 1.0, seed, simulate)
         return replace(usual, model=usual.model.with_noise(noise_scale))
     optics, control = prepare(configuration), configuration.control
-    telemetry = _telemetry(_without_told(configuration), known, seed, simulate)
+    telemetry = _telemetry(_without_assumed(configuration), known, seed, simulate)
     told = slope_turbulence(configuration, optics.sensor.layout.cells)
     frame_s = 1 / control.frame_rate_hz
     theories = {
@@ -207,6 +207,6 @@ def _with_prior(arm: Arm, std_px: float | Floats) -> Arm:
     return replace(arm, settings=arm.settings.replace(**changes))
 
 
-def _without_told(configuration: LoopConfiguration) -> LoopConfiguration:
+def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration as far as its telemetry depends on it."""
-    return configuration.replace("control", told_wind_factor=1.0, told_wind_turn_deg=0.0)
+    return configuration.replace("control", assumed_wind_factor=1.0, assumed_wind_turn_deg=0.0)

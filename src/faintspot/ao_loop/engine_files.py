@@ -13,8 +13,8 @@ from faintspot.ao_loop.calibration import flat_psf, make_pipeline, reference_slo
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import ARCSEC, LoopConfiguration
 from faintspot.ao_loop.control import learnt_control
-from faintspot.ao_loop.observatory import prepare
 from faintspot.ao_loop.simulation import measure_gains, simulate_loop
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.config.tables import read_tables
 from faintspot.control import configuration as control_file

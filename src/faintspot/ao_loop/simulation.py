@@ -14,15 +14,15 @@ from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.calibration import (
     centroid_gain,
     make_pipeline,
-    mean_light,
+    mean_flux,
     typical_spots,
 )
 from faintspot.ao_loop.camera import Exposing, make_detector
 from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
 from faintspot.ao_loop.control import learnt_control, make_controller
-from faintspot.ao_loop.observatory import TelescopeModel, air_of, prepare, without_light
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.ao_loop.telescope import PSF_SAMPLING
+from faintspot.ao_loop.telescope_model import TelescopeModel, atmosphere_of, prepare, without_flux
 from faintspot.base.checks import number_between, numbers_between
 from faintspot.base.errors import InputError
 from faintspot.control.commands import CommandDelayLine
@@ -40,13 +40,13 @@ class DisabledErrors:
     """What a run leaves out of what spoils the Strehl ratio, for error budgets; by default nothing."""
 
     noiseless: bool = False
-    """Every pixel holds its mean light."""
+    """Every pixel holds its mean flux."""
     true_slopes: bool = False
     """Slopes are the wavefront's mean gradients, of every arm."""
     correctable: bool = False
     """The air is only what the mirror can make."""
     faster: float = 1.0
-    """How many times as often frames are taken, as much light in each, in stretches over the same time."""
+    """How many times as often frames are taken, as high flux in each, in stretches over the same time."""
     exact_gain: bool = False
     """Slopes are divided by the centroid gain that they had in a first run, of one arm."""
 
@@ -55,7 +55,7 @@ class DisabledErrors:
     stretch_settle_frames: ClassVar[int] = 40
 
     def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
-        """Return the configuration with its frame rate, and the light in a frame as it was."""
+        """Return the configuration with its frame rate, and the flux in a frame as it was."""
         if self.faster == 1.0:
             return configuration
         rate = configuration.control.frame_rate_hz * self.faster
@@ -85,7 +85,7 @@ def simulate_loop(
     seed: int | None = None,
     realisation: int = 0,
     progress: Callable[[int, int], None] | None = None,
-    idealised: DisabledErrors | None = None,
+    disabled_errors: DisabledErrors | None = None,
     learns_on: LoopConfiguration | None = None,
 ) -> LoopRecord:
     """Run the loop once.
@@ -106,7 +106,7 @@ def simulate_loop(
         Other realisations have other air and other noise.
     progress : callable, optional
         Called with the number of frames done and that of all, after every frame.
-    idealised : DisabledErrors, optional
+    disabled_errors : DisabledErrors, optional
         What is left out of what spoils the Strehl ratio.
     learns_on : LoopConfiguration, optional
         Of the loop that control learns from where it does. Default: the same, with other air.
@@ -134,7 +134,7 @@ def simulate_loop(
     which = _checked_schedule(configuration, arms, schedule)
     start = configuration.run.seed if seed is None else int(number_between("seed", seed, 0, integer=True))
     number = int(number_between("realisation", realisation, 0, integer=True))
-    switches = DisabledErrors() if idealised is None else idealised
+    switches = DisabledErrors() if disabled_errors is None else disabled_errors
     ready = [
         learnt_control(switches.configuration(configuration), arm, start, simulate_loop, learns_on)
         for arm in map(switches.arm, arms)
@@ -156,7 +156,7 @@ def measure_gains(
 ) -> NDArray[np.float64]:
     """Return the centroid gain of each pipeline at the configuration's flux, by `centroid_gain`."""
     optics, detector = prepare(configuration), detector or make_detector(configuration)
-    spots = _typical_spots(without_light(configuration), seed, realisation)
+    spots = _typical_spots(without_flux(configuration), seed, realisation)
     return np.array(
         [
             centroid_gain(pipeline, optics.sensor, detector, configuration.photons, spots, seed)
@@ -175,25 +175,25 @@ class _Loop:
         which: NDArray[np.int64],
         seed: int,
         realisation: int,
-        idealised: DisabledErrors,
+        disabled_errors: DisabledErrors,
         gains: NDArray[np.float64] | None = None,
     ) -> None:
-        self.configuration = configuration = idealised.configuration(configuration)
+        self.configuration = configuration = disabled_errors.configuration(configuration)
         self.arms = arms = tuple(arm for arm, _ in ready)
-        self.which, self.idealised = which, idealised
+        self.which, self.disabled_errors = which, disabled_errors
         self.seed, self.realisation = seed, realisation
-        self.observatory = TelescopeModel(
+        self.telescope_model = TelescopeModel(
             configuration,
             seed,
             realisation,
-            correctable=idealised.correctable,
-            noiseless=idealised.noiseless,
+            correctable=disabled_errors.correctable,
+            noiseless=disabled_errors.noiseless,
         )
-        self.optics = optics = self.observatory.optics
+        self.optics = optics = self.telescope_model.optics
         self.pipelines = [make_pipeline(configuration, optics.sensor, arm) for arm in arms]
-        self.lights = [self._first_light(pipeline) for pipeline in self.pipelines]
+        self.fluxes = [self._first_flux(pipeline) for pipeline in self.pipelines]
         for number in range(len(arms)):
-            self._follow_light(number)
+            self._follow_flux(number)
         self.gains, self.divisors = self._gains_and_divisors(gains)
         self.line = CommandDelayLine(optics.mirror.commands, configuration.control.delay_frames)
         self.controllers = [make_controller(configuration, optics, *each, self.line) for each in ready]
@@ -207,19 +207,19 @@ class _Loop:
         pixels = len(optics.science.transform)
         self.images = np.zeros((len(arms), pixels, pixels))
 
-    def _first_light(self, pipeline: SlopePipeline) -> MeanFlux | None:
-        """Return the mean light of every sub-aperture for an estimator that uses it, as before a run."""
-        if not pipeline.settings.estimator.uses_light or pipeline.settings.flux_e is not None:
+    def _first_flux(self, pipeline: SlopePipeline) -> MeanFlux | None:
+        """Return the mean flux of every sub-aperture for an estimator that uses it, as before a run."""
+        if not pipeline.settings.estimator.uses_flux or pipeline.settings.flux_e is not None:
             return None
-        spots = _typical_spots(without_light(self.configuration), self.seed, self.realisation)
+        spots = _typical_spots(without_flux(self.configuration), self.seed, self.realisation)
         photons, sensor = self.configuration.photons, self.optics.sensor
-        return mean_light(pipeline, sensor, self.observatory.detector, photons, spots, self.seed)
+        return mean_flux(pipeline, sensor, self.telescope_model.detector, photons, spots, self.seed)
 
-    def _follow_light(self, number: int) -> None:
-        """Tell an arm's pipeline the mean light."""
-        light = self.lights[number]
-        if light is not None:
-            self.pipelines[number] = self.pipelines[number].with_flux(light)
+    def _follow_flux(self, number: int) -> None:
+        """Tell an arm's pipeline the mean flux."""
+        flux = self.fluxes[number]
+        if flux is not None:
+            self.pipelines[number] = self.pipelines[number].with_flux(flux)
 
     def _gains_and_divisors(
         self, known: NDArray[np.float64] | None
@@ -232,7 +232,7 @@ class _Loop:
             self.pipelines,
             seed=self.seed,
             realisation=self.realisation,
-            detector=self.observatory.detector,
+            detector=self.telescope_model.detector,
         )
         gains = np.where([arm.true_slopes for arm in self.arms], 1.0, gains)
         return gains, np.where([arm.correct_gain for arm in self.arms], gains, 1.0)
@@ -249,8 +249,8 @@ class _Loop:
     def step(self, frame: int) -> None:
         """Simulate one frame."""
         number, commands = int(self.which[frame]), self.line.acting
-        time = self.idealised.time_s(frame, self.configuration.control.frame_rate_hz)
-        after, seen = self.observatory.wavefronts(time, commands)
+        time = self.disabled_errors.time_s(frame, self.configuration.control.frame_rate_hz)
+        after, seen = self.telescope_model.wavefronts(time, commands)
         self._observe(frame, time, after)
         slopes = self._measure(frame, seen)
         error = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
@@ -261,7 +261,7 @@ class _Loop:
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
         """Take the science image and write down the truth."""
-        truth = self.observatory.truth(time, wavefront)
+        truth = self.telescope_model.truth(time, wavefront)
         self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
         if frame >= self.configuration.run.settle_frames:
             self.images[self.which[frame]] += self.optics.science.image(truth.field)
@@ -274,12 +274,12 @@ class _Loop:
         prior = None
         if self.arms[number].predict_prior:
             prior = self.controllers[number].expected().mean_px
-        slopes = self.pipelines[number](self.observatory.frame(frame, wavefront), prior)
-        known = self.lights[number]
+        slopes = self.pipelines[number](self.telescope_model.frame(frame, wavefront), prior)
+        known = self.fluxes[number]
         if known is not None:
-            self.lights[number] = known.updated(slopes.flux)
-            self._follow_light(number)
-        if self.idealised.exact_gain and frame >= self.configuration.run.settle_frames:
+            self.fluxes[number] = known.updated(slopes.flux)
+            self._follow_flux(number)
+        if self.disabled_errors.exact_gain and frame >= self.configuration.run.settle_frames:
             true = sensor.mean_slopes_px(wavefront)
             self.regression[:, number] += slopes.vector.astype(np.float64) @ true, true @ true
         return slopes
@@ -352,5 +352,5 @@ def _checked_schedule(
 def _typical_spots(
     configuration: LoopConfiguration, seed: int, realisation: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    optics, air = prepare(configuration), air_of(configuration, seed, realisation)
-    return typical_spots(configuration, optics.sensor, optics.mirror, air, optics.reconstructor.matrix)
+    optics, atmosphere = prepare(configuration), atmosphere_of(configuration, seed, realisation)
+    return typical_spots(configuration, optics.sensor, optics.mirror, atmosphere, optics.reconstructor.matrix)

@@ -1,4 +1,4 @@
-"""The Shack-Hartmann sensor: from the wavefront in the pupil to the light on the camera."""
+"""The Shack-Hartmann sensor: from the wavefront in the pupil to the flux on the camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ShackHartmann:
     """Lenslets behind the pupil.
 
     Each lenslet images the field of its own square of points (Fraunhofer), so that turbulence inside it
-    speckles its spot; light does not stray into neighbours' windows. All frames hold the light of the whole
+    speckles its spot; light does not stray into neighbours' windows. All frames hold the flux of the whole
     exposure, with the wavefront of its middle.
     """
 
@@ -54,7 +54,7 @@ class ShackHartmann:
         return part
 
     def spots(self, wavefront_nm: NDArray[np.floating], displacement_px: float = 0.0) -> Floats:
-        """Return the light of every spot, (n, pixels, pixels); a fully lit lenslet's whole spot holds 1.
+        """Return the flux of every spot, (n, pixels, pixels); a fully lit lenslet's whole spot holds 1.
 
         Parameters
         ----------

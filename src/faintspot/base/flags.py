@@ -8,7 +8,7 @@ from enum import IntFlag
 class SubapertureFlag(IntFlag):
     """Bits of `Slopes.flags`. The first two make a slope invalid; the others only inform."""
 
-    NO_LIGHT = 1
+    NO_FLUX = 1
     """Nothing usable is left after the background subtraction; the slope is that of the reference (0)."""
     TOO_MANY_BAD_PIXELS = 2
     """More bad pixels than the settings allow; the slope is that of the reference (0).
@@ -28,4 +28,4 @@ class SubapertureFlag(IntFlag):
     """The slope ends at `search_range_px`, along x or y: the spot may be beyond."""
 
 
-INVALID = SubapertureFlag.NO_LIGHT | SubapertureFlag.TOO_MANY_BAD_PIXELS
+INVALID = SubapertureFlag.NO_FLUX | SubapertureFlag.TOO_MANY_BAD_PIXELS

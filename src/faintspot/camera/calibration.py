@@ -45,7 +45,7 @@ class Calibration:
     Parameters
     ----------
     dark : float or (h, w) array, optional, ADU
-        What a frame without light holds: bias and dark current. NaN marks a bad pixel. Default: not known,
+        What a frame without flux holds: bias and dark current. NaN marks a bad pixel. Default: not known,
         counted as 0; 0 says that there is none.
     rough_dark : bool
         Whether `dark` is only near the truth, such as the background of frames with light in them.
@@ -137,7 +137,7 @@ class Calibration:
 
     @property
     def vouches_for_dark(self) -> bool:
-        """Whether the level of a frame without light is known; else estimators may fit it."""
+        """Whether the level of a frame without flux is known; else estimators may fit it."""
         return self.dark is not None and not self.rough_dark
 
     @property

@@ -1,4 +1,4 @@
-"""A camera's detector: from the mean light on each pixel to what is read out."""
+"""A camera's detector: from the mean flux on each pixel to what is read out."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LARGEST_MEAN_E = 1e12
 class Detector:
     """A CCD, CMOS or electron-multiplying CCD with its noise.
 
-    In the order of the light: photo-electrons of the star, background and dark current (each Poisson),
+    In the order of the flux: photo-electrons of the star, background and dark current (each Poisson),
     full well, multiplication register, read noise (Gaussian), conversion to ADU, quantisation.
 
     The convention for ADU is ``adu = offset_adu + electrons_out / gain_e_per_adu``, where electrons_out is

@@ -45,10 +45,10 @@ class DetectorMeasurement:
     read_noise_e, read_noise_e_error : float or None
         Read noise in electrons at the camera's output, as `faintspot.simulate.Detector` counts it.
     faint_gain_e_per_adu, bright_gain_e_per_adu : float or None
-        Gain from the pixels with the fainter and the brighter half of the light alone.
+        Gain from the pixels with the fainter and the brighter half of the flux alone.
     reliable : bool
         False when the gain should not be believed: the variance is no straight line in the mean, does not
-        rise with the light, or the light moves too much. The last of `notes` says which.
+        rise with the flux, or the flux moves too much. The last of `notes` says which.
     notes : tuple of str
         How each value was found, and what is wrong with it.
     """
@@ -83,11 +83,11 @@ class _Value(NamedTuple):
 
 
 class _Curve(NamedTuple):
-    """One photon-transfer point a pixel: variance = intercept * share + slope * light, expected."""
+    """One photon-transfer point a pixel: variance = intercept * share + slope * flux, expected."""
 
     variance: Floats
     share: Floats  # of its own variance that is left once common changes are taken out
-    light: Floats  # mean above the dark level, weighted likewise
+    flux: Floats  # mean above the dark level, weighted likewise
     mean: Floats  # plain mean above the dark level
     degrees: float  # of freedom of each variance
 
@@ -119,9 +119,9 @@ def measure_detector(
     Parameters
     ----------
     frames : (n, h, w) array, optional
-        ADU, at least 2 consecutive frames of a light that moves by less than about 0.2 px.
+        ADU, at least 2 consecutive frames of a flux that moves by less than about 0.2 px.
     darks : (n, h, w) array, optional
-        ADU, at least 2 frames without light. Their dark current's noise counts as read noise. Without them,
+        ADU, at least 2 frames without flux. Their dark current's noise counts as read noise. Without them,
         the read noise is that of the darkest pixels of `frames`, to about 10 % where these see some light.
     layout : Layout, optional
         Use these sub-apertures of `frames`, each of which moves on its own, instead of the whole frame.
@@ -214,7 +214,7 @@ def _dark_without_darks(frames: Floats, dark_level_adu: float | None) -> tuple[_
 
 
 def _read_noise_without_darks(curve: _Curve, line: _Line | None) -> _Value:
-    """Take the read noise from the darkest pixels, less the photon noise that the line gives their light."""
+    """Take the read noise from the darkest pixels, less the photon noise that the line gives their flux."""
     darkest = curve.mean <= np.quantile(curve.mean, _DARKEST_FOR_NOISE)
     # The median of a chi-squared distribution lies below its mean.
     correction = curve.degrees / float(chi2.median(curve.degrees))
@@ -234,14 +234,14 @@ def _photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, ord
     worked out for v = 1 (`share`) and v = light.
     """
     mean = frames.mean(axis=0)
-    light = np.broadcast_to(mean - dark_level, mean.shape)
+    flux = np.broadcast_to(mean - dark_level, mean.shape)
     slope_y, slope_x = _derivative(mean, 0), _derivative(mean, 1)
     seconds = [_derivative(slope_y, 0), _derivative(slope_y, 1), _derivative(slope_x, 1)]
-    maps = np.stack([light, slope_x, slope_y, *seconds][: 3 * order], axis=-1)
+    maps = np.stack([flux, slope_x, slope_y, *seconds][: 3 * order], axis=-1)
     differences = np.diff(frames, axis=0)
     parts = []
     for tile in _tiles(mean.shape, layout):
-        here = light[tile].ravel()
+        here = flux[tile].ravel()
         left, size, _ = np.linalg.svd(maps[tile].reshape(len(here), -1), full_matrices=False)
         modes = left[:, size > 1e-9 * max(float(size[0]), 1e-300)]
         change = differences[(slice(None), *tile)].reshape(len(differences), -1)
@@ -292,12 +292,12 @@ def _within(curve: _Curve, range_adu: tuple[float, float] | None) -> _Curve:
 
 
 def _chosen(curve: _Curve, pixels: NDArray[np.bool_]) -> _Curve:
-    variance, share, light, mean = (values[pixels] for values in curve[:4])
-    return _Curve(variance, share, light, mean, curve.degrees)
+    variance, share, flux, mean = (values[pixels] for values in curve[:4])
+    return _Curve(variance, share, flux, mean, curve.degrees)
 
 
 def _halves(curve: _Curve) -> tuple[_Curve, _Curve]:
-    """Split the pixels where the fainter ones hold half of the light."""
+    """Split the pixels where the fainter ones hold half of the flux."""
     order = np.argsort(curve.mean)
     collected = np.cumsum(np.maximum(curve.mean[order], 0.0))
     split = curve.mean[order][np.searchsorted(collected, 0.5 * collected[-1])]
@@ -305,8 +305,8 @@ def _halves(curve: _Curve) -> tuple[_Curve, _Curve]:
 
 
 def _fit(curve: _Curve) -> _Line | None:
-    """Fit variance = intercept * share + slope * light; errors by leaving out groups of pixels in turn."""
-    terms = np.stack([curve.share, curve.light], axis=1)
+    """Fit variance = intercept * share + slope * flux; errors by leaving out groups of pixels in turn."""
+    terms = np.stack([curve.share, curve.flux], axis=1)
     n = len(terms)
     if n < 2 * _GROUPS or np.ptp(curve.mean) == 0:
         return None
@@ -370,7 +370,7 @@ def _result(
 
 
 def _gain(line: _Line | None, em_gain: float) -> _Value | None:
-    """Return electrons per ADU and its error: variance in ADU is excess * em_gain * light / gain."""
+    """Return electrons per ADU and its error: variance in ADU is excess * em_gain * flux / gain."""
     if line is None or line.slope <= 0:
         return None
     gain = (2.0 * em_gain if em_gain > 1 else 1.0) / line.slope
@@ -383,11 +383,11 @@ def _problem(line: _Line | None, coarse: _Line | None, halves: tuple[_Line | Non
     Where second derivatives of the image matter for what movements leave behind, third ones may too.
     """
     if line is None or coarse is None or line.slope <= 3 * line.slope_error:
-        return "the variance does not rise with the light: more light or more frames are needed"
+        return "the variance does not rise with the flux: more flux or more frames are needed"
     second_order = coarse.slope - line.slope
     moving = second_order > max(_LARGEST_SECOND_ORDER * line.slope, 4 * line.slope_error)
     if moving or line.scatter > _LARGEST_SCATTER:
-        return "the light moves too much between frames: the gain is too low"
+        return "the flux moves too much between frames: the gain is too low"
     faint, bright = halves
     if faint is None or bright is None:
         return None
@@ -396,6 +396,6 @@ def _problem(line: _Line | None, coarse: _Line | None, halves: tuple[_Line | Non
     if difference <= max(4 * noise, _LARGEST_CURVATURE * line.slope):
         return None
     return (
-        "faint and bright pixels disagree about the gain: the light moves or fluctuates too much, "
+        "faint and bright pixels disagree about the gain: the flux moves or fluctuates too much, "
         "pixels saturate or are cut off, or the camera has two gains"
     )

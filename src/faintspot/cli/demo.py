@@ -104,7 +104,7 @@ def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
     gain = comparison.flux_gain(rng)
     value, low, high = gain.magnitudes
     saved = (
-        f"denoising saves a factor {gain.in_words()} of light: {value:.2f} ({low:.2f} to {high:.2f}) mag"
+        f"denoising saves a factor {gain.in_words()} of flux: {value:.2f} ({low:.2f} to {high:.2f}) mag"
         if 0 < gain.factor < np.inf
         else "no flux that was simulated gives the same error with denoising"
     )

@@ -30,7 +30,11 @@ _MOST_FRAMES = 200  # averaged to find the spots
 _MOST_NAMED = 12  # sub-apertures in one line
 _FIRST_FRAMES = 20  # measured for the settings
 # What the finder calls what these options give.
-_OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels": "--bad-pixels"}
+_OPTIONS = {
+    "pitch_px": "--pitch",
+    "illuminated_fraction": "--illuminated-fraction",
+    "bad_pixels": "--bad-pixels",
+}
 
 
 @click.command(short_help="Find the sub-apertures in a frame and write a configuration.")
@@ -65,7 +69,7 @@ _OPTIONS = {"pitch_px": "--pitch", "lit_fraction": "--lit-fraction", "bad_pixels
 )
 @click.option("--window", metavar="NY,NX", help="Height and width of a window that is not square, pixels.")
 @click.option(
-    "--lit-fraction",
+    "--illuminated-fraction",
     type=float,
     metavar="PART",
     help="Least flux of a lit lenslet, as a part of the median. Default: where fewest are, 0.18 to 0.5; "
@@ -135,7 +139,7 @@ def command(
     pitch: float | None,
     pixels: int | None,
     window: str | None,
-    lit_fraction: float | None,
+    illuminated_fraction: float | None,
     pupil: str | None,
     exclude: str | None,
     roi: str | None,
@@ -157,7 +161,7 @@ def command(
     FRAME is a file with spots, from one frame to many of the same field (the first 200 are averaged). Square
     and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are lit.
     Spots of quad cells (2 x 2 pixels) overlap and cannot be found; --grid gives the array. A picture shows
-    the frame with the windows that were found: look at it. --lit-fraction, --pupil and --exclude correct
+    the frame with the windows that were found: look at it. --illuminated-fraction, --pupil, --exclude correct
     which are lit.
 
     A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
@@ -180,7 +184,7 @@ def command(
         "geometry": geometry,
         "pitch_px": pitch,
         "pixels": layout_options.window(pixels, window),
-        "lit_fraction": lit_fraction,
+        "illuminated_fraction": illuminated_fraction,
         "pupil": layout_options.numbers("--pupil", pupil, (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
         "roi": layout_options.numbers("--roi", roi, (4,), "X0,Y0,X1,Y1 in pixels"),
         "move_windows": move_windows,
@@ -271,9 +275,7 @@ def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
     ]
     lines += layout_options.largest_window_note(layout)
     if found.lenslets.doubt:
-        lines.append(
-            f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch, --lit-fraction, --pupil)"
-        )
+        lines.append(f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch, --pupil)")
     if len(found.cut):
         lines.append(
             f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "

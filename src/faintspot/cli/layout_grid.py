@@ -29,7 +29,9 @@ def illuminated(
     try:
         return find_illuminated(mean, shape, has_dark=calibration.dark is not None, **kept)
     except InputError as error:
-        raise InputError(f"{description}: {str(error).replace('lit_fraction', '--lit-fraction')}") from None
+        raise InputError(
+            f"{description}: {str(error).replace('illuminated_fraction', '--illuminated-fraction')}"
+        ) from None
 
 
 def is_quad_cell(layout: Layout) -> bool:

@@ -109,7 +109,7 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
-    with _workplace(**where) as place:
+    with _worker_pool(**where) as place:
         result = run_interleaved(loop, folder, quick=quick, place=place, overwrite=overwrite)
     click.echo(interleaved_summary(result))
     _report(folder)
@@ -153,7 +153,7 @@ def magnitude(
     folder = output or _folder(loop.name, quick)
     fluxes = None if photons is None else [_number(text) for text in _listed(photons)]
     names = None if arms is None else _arms(arms)
-    with _workplace(**where) as place:
+    with _worker_pool(**where) as place:
         result = run_magnitude(loop, folder, names, fluxes, quick=quick, place=place, overwrite=overwrite)
     click.echo(magnitude_summary(result))
     _report(folder)
@@ -183,7 +183,7 @@ def budget(
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
     names = None if arms is None else _arms(arms)
-    with _workplace(**where) as place:
+    with _worker_pool(**where) as place:
         result = run_budget(loop, folder, names, quick=quick, place=place, overwrite=overwrite)
     click.echo(budget_summary(result))
     _report(folder)
@@ -231,7 +231,7 @@ def engine(configuration: str, folder: str, control: str, rate: float | None) ->
 
 
 @contextmanager
-def _workplace(workers: int | None, scheduler: str | None) -> Iterator[WorkerPool]:
+def _worker_pool(workers: int | None, scheduler: str | None) -> Iterator[WorkerPool]:
     """Yield where the work is done, with a progress bar."""
     from faintspot.experiments.running import WorkerPool
 

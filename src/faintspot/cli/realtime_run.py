@@ -56,10 +56,10 @@ from faintspot.realtime.private_socket import socket_path
 @click.option("--close-loop", is_flag=True, help="Close the loop with the first frame; see loop.")
 @click.option("--no-control", is_flag=True, help="Make no commands, whatever [control] says.")
 @click.option(
-    "--mean-light",
+    "--mean-flux",
     type=click.FloatRange(1),
     metavar="FRAMES",
-    help="Tell estimators the light of every sub-aperture, averaged over so many frames.",
+    help="Tell estimators the flux of every sub-aperture, averaged over so many frames.",
 )
 @click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
 @click.option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
@@ -76,7 +76,7 @@ def run(
     images_every: int,
     close_loop: bool,
     no_control: bool,
-    mean_light: float | None,
+    mean_flux: float | None,
     frames: int | None,
     live: bool,
 ) -> None:
@@ -121,7 +121,7 @@ def run(
         deadline_s=deadline * 1e-6,
         images_every=images_every,
         control=control,
-        mean_light=mean_light,
+        mean_flux=mean_flux,
     )
     if engine.loop is not None and close_loop:
         engine.loop.close()

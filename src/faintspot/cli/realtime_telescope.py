@@ -84,7 +84,7 @@ def telescope(
         click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
     say = partial(click.echo, err=True)
     with SimulatedTelescope(observed, name, say=lambda line: say(f"{name}: {line}"), **options) as simulated:
-        optics = simulated.observatory.optics
+        optics = simulated.telescope_model.optics
         rows, columns = optics.sensor.layout.frame_shape
         server = ControlServer(socket_path(name, TELESCOPE), commands_of(simulated), lengthy=LENGTHY)
         with server, real_time(), stop_on_signal() as stop:

@@ -49,9 +49,9 @@ from faintspot.recorded import Summary, measure_recorded
     help="Unit of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
 )
 @click.option(
-    "--mean-light",
+    "--mean-flux",
     is_flag=True,
-    help="Take the light of spots as their mean over the recording, not that of each frame: for steady, "
+    help="Take the flux of spots as their mean over the recording, not that of each frame: for steady, "
     "faint stars.",
 )
 @REFERENCE
@@ -71,7 +71,7 @@ def command(
     preset: str | None,
     device: str,
     unit: str,
-    mean_light: bool,
+    mean_flux: bool,
     reference: str | None,
     key: str | None,
     threads: int | None,
@@ -96,7 +96,7 @@ def command(
       faintspot slopes night1.fits -o plain.zarr --no-denoise
       faintspot slopes night1.fits -o slopes.zarr --preset fast
       faintspot slopes night1.fits -o ml.zarr --estimator ml --set model_error=0.1
-      faintspot slopes night1.fits -o window.zarr --estimator window --mean-light
+      faintspot slopes night1.fits -o window.zarr --estimator window --mean-flux
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
     _check_format(output)
@@ -113,7 +113,7 @@ def command(
             preset=preset,
             device=device,
             unit=unit,
-            mean_light=mean_light,
+            mean_flux=mean_flux,
             reference=reference,
             key=key,
             threads=threads,
@@ -150,7 +150,7 @@ def describe(summary: Summary, output: str) -> list[str]:
             f"  went on at frame {summary.resumed_at} (counted from 0); the counts are from there on"
         )
     texts = {
-        SubapertureFlag.NO_LIGHT: "without light",
+        SubapertureFlag.NO_FLUX: "without flux",
         SubapertureFlag.TOO_MANY_BAD_PIXELS: "with too many bad pixels",
         SubapertureFlag.BAD_PIXELS: "with a few bad pixels, filled from their neighbours",
         SubapertureFlag.SATURATED: "with saturated pixels",

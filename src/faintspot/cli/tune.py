@@ -61,7 +61,7 @@ _VALUES: tuple[tuple[str, Any, str | None, str], ...] = (
     ("pixel_scale_arcsec", float, "ARCSEC", "Side of a pixel on the sky."),
     ("r0_m", float, "M", "Fried parameter at 500 nm: tells whether spots are speckled."),
     ("magnitude", float, "MAG", "Of the guide star; needs --lenslet-m and --frame-rate-hz."),
-    ("flux_e", float, "E", "Or its light: detected photons per sub-aperture and frame."),
+    ("flux_e", float, "E", "Or its flux: detected photons per sub-aperture and frame."),
     ("band", click.Choice(list(ZERO_POINTS)), None, f"Of the magnitude. Default: {DEFAULT_BAND}."),
     (
         "zero_point",
@@ -98,7 +98,7 @@ def _values(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.command(short_help="Say which estimator and settings suit a camera and a star.")
 @click.option("--camera", metavar="TOML", help="File of what is known; options count more.")
 @click.option("--frames", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest in.")
-@click.option("--dark", multiple=True, metavar="FILE", help="Frames without light.")
+@click.option("--dark", multiple=True, metavar="FILE", help="Frames without flux.")
 @click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @_values
 @click.option(

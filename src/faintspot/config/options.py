@@ -43,7 +43,7 @@ class Option:
     per_subaperture : bool
         Whether every sub-aperture may have its own.
     automatic : bool
-        Whether it may be "auto": found from light, camera and spot.
+        Whether it may be "auto": found from flux, camera and spot.
     optional : bool
         Whether it may be None: not needed, or found by itself.
     """

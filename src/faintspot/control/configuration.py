@@ -75,7 +75,7 @@ class ControlOptions(Options):
     centroid_gain: float = _setting(
         1.0,
         "What the estimator shows of a slope of 1 px of the interaction matrix; slopes are divided by it. 1 "
-        "for a matrix that was measured with the same estimator and as much light.",
+        "for a matrix that was measured with the same estimator and as high flux.",
         low=0.01,
         high=100,
     )

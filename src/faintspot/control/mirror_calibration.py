@@ -111,7 +111,7 @@ def calibrate_mirror(
         if pokes.rounds >= most:
             raise InputError(
                 f"relative_error = {wanted:g}: after {most} rounds it is still {error:.2g}; poke more, give "
-                "more light, or allow more rounds"
+                "more flux, or allow more rounds"
             )
     pokes.refuse_saturated()
     pokes.refuse_unsettled()
@@ -229,7 +229,7 @@ class _Pokes:
         if invalid > _MOST_INVALID * total:
             raise InputError(
                 f"{100 * invalid / total:.0f} % of the slopes are not valid, expected at most "
-                f"{100 * _MOST_INVALID:g} %: the sensor needs more light"
+                f"{100 * _MOST_INVALID:g} %: the sensor needs more flux"
             )
         if error > 1:
             noise = float(np.median(self.columns[1])) * self.amplitude

@@ -116,7 +116,7 @@ def make_subtract(strips: Strips) -> Any:
 
 
 def make_centroid(strips: Strips) -> Any:
-    """Return the function that sums an image and finds its centre of gravity; (0, 0) without light."""
+    """Return the function that sums an image and finds its centre of gravity; (0, 0) without flux."""
     rows = strips.rows
 
     @device
@@ -143,7 +143,7 @@ def make_standard_errors(strips: Strips) -> Any:
         image: Any, left: Any, from_x: Any, from_y: Any, variance: Any, excess: Any, total: Any
     ) -> Any:
         """`from_x` and `from_y`: of the thread's first pixel from the centre of gravity, px."""
-        within = float32(1.0 / 12.0)  # of the light in a pixel, where in it is not known: px^2
+        within = float32(1.0 / 12.0)  # of the flux in a pixel, where in it is not known: px^2
         noise, noise_y = float32(0.0), float32(0.0)
         for r in range(rows):
             if left[r] != float32(0.0):

@@ -46,7 +46,7 @@ from faintspot.kernels.groups import (
     EXCESS,
     LIMIT_ROUNDING_PX,
     MOST_BAD,
-    NO_LIGHT,
+    NO_FLUX,
     RANGE,
     SATURATED,
     TOO_MANY_BAD_PIXELS,
@@ -72,7 +72,7 @@ def within(slope: Any, reach: Any) -> Any:
 
 @device
 def judge(bad: Any, saturated: Any, most_bad: Any, converged: Any, infeasible: Any) -> Any:
-    """Flags of a sub-aperture as far as its light does not matter."""
+    """Flags of a sub-aperture as far as its flux does not matter."""
     bits = int32(SATURATED) if saturated > float32(0.0) else int32(0)
     if bad > most_bad:
         return bits | int32(TOO_MANY_BAD_PIXELS)  # which says it all
@@ -104,11 +104,11 @@ def make_store(strips: Strips) -> Any:
         """`found`: flux, x, y; `errors`: of x and y."""
         total, x, y = found
         # A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
-        lit = total > table[FLOOR, s] * brightest
+        illuminated = total > table[FLOOR, s] * brightest
         inside = abs(x) <= float32(half_x) and abs(y) <= float32(half_y)
-        if not (bits & int32(TOO_MANY_BAD_PIXELS) or (lit and inside)):
-            bits |= int32(NO_LIGHT)
-        valid = bits & int32(NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
+        if not (bits & int32(TOO_MANY_BAD_PIXELS) or (illuminated and inside)):
+            bits |= int32(NO_FLUX)
+        valid = bits & int32(NO_FLUX | TOO_MANY_BAD_PIXELS) == 0
         known = valid and table[VARIANCE, s] >= float32(0.0)
         reach, scale = table[RANGE, s], table[ERROR_SCALE, s]
         away_x, away_y = x - table[ZERO_X, s], y - table[ZERO_Y, s]

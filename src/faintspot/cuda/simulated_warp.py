@@ -20,10 +20,10 @@ _boards: NDArray[np.float32] = np.zeros((2, 32), np.float32)
 def _exchange(value: Any) -> NDArray[np.float32]:
     """What all threads of the warp hold."""
     thread: Any = threading.current_thread()
-    thread.turn = board = 1 - getattr(thread, "turn", 0)
-    _boards[board, cuda.threadIdx.x] = value
+    thread.turn = latest_messages = 1 - getattr(thread, "turn", 0)
+    _boards[latest_messages, cuda.threadIdx.x] = value
     cuda.syncthreads()
-    values: NDArray[np.float32] = _boards[board]
+    values: NDArray[np.float32] = _boards[latest_messages]
     return values
 
 

@@ -18,7 +18,7 @@ from faintspot.base.errors import InputError
 from faintspot.config.options import Options, is_auto
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.kernels.groups import COMMON_ROWS, light_of_groups
+from faintspot.kernels.groups import COMMON_ROWS, flux_of_groups
 from faintspot.spots.score import TrainedScore
 
 Floats = NDArray[np.float64]
@@ -126,8 +126,8 @@ class Estimator(Options):
         return self.needs
 
     @property
-    def uses_light(self) -> bool:
-        """Whether it is better for knowing the mean light, as `faintspot.MeanFlux` finds it."""
+    def uses_flux(self) -> bool:
+        """Whether it is better for knowing the mean flux, as `faintspot.MeanFlux` finds it."""
         return False
 
     @property
@@ -148,8 +148,8 @@ class Estimator(Options):
         """Return the same with the options that follow from a scene alone, before any are tuned."""
         return self
 
-    def for_bright_light(self) -> Estimator:
-        """Return what measures the same in images of plenty of light and no noise, as for references."""
+    def for_bright_flux(self) -> Estimator:
+        """Return what measures the same in images of plenty of flux and no noise, as for references."""
         return self
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
@@ -158,7 +158,7 @@ class Estimator(Options):
 
     # What a pipeline asks for -----------------------------------------------------------------------
 
-    def prepared(self, sensor: Sensor) -> Prepared | None:
+    def prepared(self, sensor: Sensor) -> EstimatorPlan | None:
         """Return what is computed once for a sensor, before the first frame; None: `locate` does the work.
 
         Raises
@@ -237,7 +237,7 @@ class Positions(NamedTuple):
     valid: NDArray[np.bool_] | None = None
 
 
-class Prepared:
+class EstimatorPlan:
     """What an estimator has computed for one sensor, in the form that its kernel reads.
 
     Parameters
@@ -250,12 +250,12 @@ class Prepared:
     """Compiled function that measures groups of sub-apertures: see `faintspot.kernels.groups`."""
     setting_rows: int = COMMON_ROWS
     """Of the table of settings."""
-    needs_light: bool = False
-    """Whether the light must be measured in every frame."""
-    light_kernel: Any = staticmethod(light_of_groups)
+    needs_flux: bool = False
+    """Whether the flux must be measured in every frame."""
+    flux_kernel: Any = staticmethod(flux_of_groups)
     """Compiled function that measures it."""
-    light_step: float = 1.02
-    """Measured light counts in steps of this factor, so that settings vary slowly."""
+    flux_step: float = 1.02
+    """Measured flux counts in steps of this factor, so that settings vary slowly."""
     prior_weight_row: int | None = None
     """Of the table of settings: 1 / prior_std_px^2, for a prior whose width may change between frames."""
     fewer_lanes_are_faster: bool = False
@@ -276,10 +276,10 @@ class Prepared:
         return self.estimator.values(name, self.sensor.n, self.sensor.pixels)
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """Write the estimator's own rows of a table of settings that do not depend on the light."""
+        """Write the estimator's own rows of a table of settings that do not depend on the flux."""
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """Write those that do, for a light (electrons) of every sub-aperture; NaN where it is not known."""
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """Write those that do, for a flux (electrons) of every sub-aperture; NaN where it is not known."""
 
     @property
     def tables(self) -> Any:
@@ -297,9 +297,9 @@ __all__ = [
     "CALIBRATED",
     "RAW",
     "Estimator",
+    "EstimatorPlan",
     "Need",
     "Positions",
-    "Prepared",
     "Step",
     "Style",
 ]

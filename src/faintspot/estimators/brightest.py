@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.estimators.base import Style
-from faintspot.estimators.gravity import GravityPrepared, KeepingBrightest
+from faintspot.estimators.gravity import GravityPlan, KeepingBrightest
 from faintspot.estimators.registry import register
 from faintspot.estimators.sensor import Sensor
 
@@ -38,6 +38,6 @@ class BrightestPixels(KeepingBrightest):
         """See `KeepingBrightest`."""
         return images
 
-    def prepared(self, sensor: Sensor) -> GravityPrepared:
+    def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return GravityPrepared(self, sensor)
+        return GravityPlan(self, sensor)

@@ -1,11 +1,11 @@
-"""The plain centre of gravity, of all the light in the window."""
+"""The plain centre of gravity, of all the flux in the window."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from faintspot.estimators.base import CALIBRATED, RAW, Style
-from faintspot.estimators.gravity import Centroid, GravityPrepared
+from faintspot.estimators.gravity import Centroid, GravityPlan
 from faintspot.estimators.registry import register
 from faintspot.estimators.sensor import Sensor
 
@@ -22,6 +22,6 @@ class CentreOfGravity(Centroid):
     style = Style("#666666", ":", "x")
     steps_shown = (RAW, CALIBRATED)
 
-    def prepared(self, sensor: Sensor) -> GravityPrepared:
+    def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return GravityPrepared(self, sensor)
+        return GravityPlan(self, sensor)

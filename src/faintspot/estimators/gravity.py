@@ -15,7 +15,7 @@ from faintspot.algorithms.brightest import RULES, most_kept, threshold_rank
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.errors import InputError
 from faintspot.config.options import is_auto, option
-from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Need, Prepared, Step
+from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, EstimatorPlan, Need, Step
 from faintspot.estimators.scene import PIXEL_BLUR_PX2, Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
@@ -35,7 +35,7 @@ class Centroid(Estimator):
 
     flux_floor: Any = option(
         FLUX_FLOOR,
-        "A sub-aperture is flagged NO_LIGHT when the flux that is left after the background subtraction is "
+        "A sub-aperture is flagged NO_FLUX when the flux that is left after the background subtraction is "
         "not above this fraction of its image's largest pixel.",
         low=0.0,
         high=1.0,
@@ -68,13 +68,13 @@ class KeepingBrightest(Centroid):
     """What `automatic_kept_pixels` calls it."""
 
     @property
-    def uses_light(self) -> bool:
+    def uses_flux(self) -> bool:
         """See `Estimator`."""
         return self.is_automatic
 
     @property
     def is_automatic(self) -> bool:
-        """Whether some option follows from the light."""
+        """Whether some option follows from the flux."""
         return is_auto(self.keep_brightest)
 
     @property
@@ -95,8 +95,8 @@ class KeepingBrightest(Centroid):
         """
         return None
 
-    def for_bright_light(self) -> Estimator:
-        """Keep the usual number of pixels where it follows from the light."""
+    def for_bright_flux(self) -> Estimator:
+        """Keep the usual number of pixels where it follows from the flux."""
         return self.replaced({"keep_brightest": None}) if is_auto(self.keep_brightest) else self
 
     def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
@@ -106,14 +106,14 @@ class KeepingBrightest(Centroid):
         return f"{number} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Numbers of kept pixels around the automatic one; speckles spread the light over more."""
+        """Numbers of kept pixels around the automatic one; speckles spread the flux over more."""
         kept = float(automatic_kept_pixels(**scene.rule_arguments, method=self.automatic_method))
         kept *= max(1.0, scene.d_over_r0)
         numbers = (int(np.clip(round(kept * factor), 1, scene.pixels - 1)) for factor in _KEPT)
         return {"keep_brightest": list(dict.fromkeys(numbers))}
 
 
-class GravityPrepared(Prepared):
+class GravityPlan(EstimatorPlan):
     """Settings and tables of a centre of gravity."""
 
     kernel = staticmethod(gravity.gravity_of_groups)
@@ -126,7 +126,7 @@ class GravityPrepared(Prepared):
         super().__init__(estimator, sensor)
         self._keeping = estimator if isinstance(estimator, KeepingBrightest) else None
         automatic = self._keeping is not None and self._keeping.is_automatic
-        self.needs_light = automatic and bool(np.isnan(sensor.flux_e).all())
+        self.needs_flux = automatic and bool(np.isnan(sensor.flux_e).all())
 
     # What the kernels read -------------------------------------------------------------------------------
 
@@ -144,22 +144,22 @@ class GravityPrepared(Prepared):
 
     @property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         return self.first_step
 
     @property
     def own_scratch(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         return gravity.gravity_scratch
 
     # Settings ---------------------------------------------------------------------------------------
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         table[gravity.FLOOR] = self.each("flux_floor")
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
         if self._keeping is None:
             keep_all(table)
             return
@@ -181,7 +181,7 @@ class GravityPrepared(Prepared):
             table[gravity.SUBTRACT, selected] = rule != "threshold"
 
     def rule_arguments(self, flux_e: Floats) -> dict[str, Any]:
-        """Return what the automatic rules ask: light, camera, and the spots before the pixels blur them."""
+        """Return what the automatic rules ask: flux, camera, and the spots before the pixels blur them."""
         sensor, fwhm = self.sensor, self.sensor.spot_fwhm_px
         optical = np.sqrt(np.maximum(fwhm**2 - PIXEL_BLUR_PX2, 0.25 * fwhm**2))
         # As the kernel's table holds them.

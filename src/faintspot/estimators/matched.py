@@ -11,7 +11,7 @@ from faintspot.estimators.base import Need, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.estimators.spots import BLURS, PSFPrepared
+from faintspot.estimators.spots import BLURS, PSFPlan
 from faintspot.estimators.stepping import Stepping
 
 
@@ -47,7 +47,7 @@ class Fitted(Stepping):
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Matched(Fitted):
-    """Matched filter: least squares of position and light, all pixels weighted alike."""
+    """Matched filter: least squares of position and flux, all pixels weighted alike."""
 
     name = "matched"
     label = "matched filter"
@@ -55,6 +55,6 @@ class Matched(Fitted):
     cost = 0.26
     style = Style("#CC79A7", "--", "v")
 
-    def prepared(self, sensor: Sensor) -> PSFPrepared:
+    def prepared(self, sensor: Sensor) -> PSFPlan:
         """See `Estimator`."""
-        return PSFPrepared(self, sensor)
+        return PSFPlan(self, sensor)

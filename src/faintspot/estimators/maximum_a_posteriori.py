@@ -1,4 +1,4 @@
-"""Maximum a posteriori: likelihood with a prior on the position; the posterior's mean at very low light."""
+"""Maximum a posteriori: likelihood with a prior on the position; the posterior's mean at very low flux."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from faintspot.config.options import option
 from faintspot.config.presets import PRESETS
 from faintspot.estimators import spot_tables
 from faintspot.estimators.base import Style
-from faintspot.estimators.maximum_likelihood import Likelihood, LikelihoodPrepared
+from faintspot.estimators.maximum_likelihood import Likelihood, LikelihoodPlan
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spot_tables import NO_POSTERIOR, PosteriorGrid
-from faintspot.kernels import located
-from faintspot.kernels.groups import RANGE, light_above_edges
+from faintspot.kernels import spot_fits
+from faintspot.kernels.groups import RANGE, flux_above_edges
 
 Floats = NDArray[np.float64]
 
-# Levels of measured light, a tenth apart, that must fit into memory: a factor of two. Beyond what fits, the
+# Levels of measured flux, a tenth apart, that must fit into memory: a factor of two. Beyond what fits, the
 # nearest one's tables serve.
 _LEVELS = 8
 
@@ -59,7 +59,7 @@ class MaximumAPosteriori(Likelihood):
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 3, "fast": 2}
 
     @property
-    def uses_light(self) -> bool:
+    def uses_flux(self) -> bool:
         """See `Estimator`."""
         return True
 
@@ -67,29 +67,29 @@ class MaximumAPosteriori(Likelihood):
         """Take the spread of positions that are uniform within their range."""
         return super().for_scene(scene).replaced({"prior_std_px": scene.position_range_px / math.sqrt(3)})
 
-    def for_bright_light(self) -> Self:
+    def for_bright_flux(self) -> Self:
         """Leave out the prior."""
-        return super().for_bright_light().replaced({"prior_std_px": None})
+        return super().for_bright_flux().replaced({"prior_std_px": None})
 
-    def prepared(self, sensor: Sensor) -> LikelihoodPrepared:
+    def prepared(self, sensor: Sensor) -> LikelihoodPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(LikelihoodPrepared):
-    """Tables of the posterior, too, for every level of light that occurs."""
+class _Plan(LikelihoodPlan):
+    """Tables of the posterior, too, for every level of flux that occurs."""
 
-    kernel = staticmethod(located.posterior_of_groups)
-    prior_weight_row = located.PRIOR_WEIGHT
-    light_step = 1.1  # larger than others', as each level has its tables
+    kernel = staticmethod(spot_fits.posterior_of_groups)
+    prior_weight_row = spot_fits.PRIOR_WEIGHT
+    flux_step = 1.1  # larger than others', as each level has its tables
 
     def __init__(self, estimator: MaximumAPosteriori, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
-        self.needs_light = bool(np.isnan(sensor.flux_e).all())
+        self.needs_flux = bool(np.isnan(sensor.flux_e).all())
         if self.fits_background:
-            self.light_kernel = light_above_edges
+            self.flux_kernel = flux_above_edges
         self._posteriors: list[PosteriorGrid] = []
-        self._levels: dict[float, int] = {}  # first table of every level of light that was measured
+        self._levels: dict[float, int] = {}  # first table of every level of flux that was measured
         self._scratch: tuple[int, Any] = (-1, None)
         self._grid, self._spacing = NO_POSTERIOR.grid, NO_POSTERIOR.spacing
         self.table_shape = (0, 0, 0)
@@ -97,54 +97,54 @@ class _Prepared(LikelihoodPrepared):
 
     @property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         if len(self._posteriors) > 1:
             self._posteriors = [spot_tables.joined(self._posteriors)]
         found = self._posteriors[0] if self._posteriors else NO_POSTERIOR
-        return located.PosteriorTables(
+        return spot_fits.PosteriorTables(
             self.model_tables, found.tables, found.constants, found.grid, found.spacing
         )
 
     @property
     def own_scratch(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         positions = len(self.tables.grid)
         if self._scratch[0] != positions:
             make = partial(
-                located.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2], positions=positions
+                spot_fits.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2], positions=positions
             )
             self._scratch = positions, make
         return self._scratch[1]
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         super().fill(table)
-        table[located.PRIOR_WEIGHT] = np.nan_to_num(self.each("prior_std_px") ** -2.0)
+        table[spot_fits.PRIOR_WEIGHT] = np.nan_to_num(self.each("prior_std_px") ** -2.0)
         sensor = self.sensor
         reach = float(np.abs(sensor.zero).max() + table[RANGE].max())
         self._grid, self._spacing = spot_tables.posterior_grid(
             reach, float(self.psf.fwhm_px.min()), sensor.window
         )
         self.table_shape = spot_tables.posterior_shape(len(self._grid), sensor.window, sensor.width)
-        flux = np.zeros(sensor.n) if self.needs_light else sensor.flux_e
-        kinds = len(self._kinds(flux)[0]) * (_LEVELS if self.needs_light else 1)
+        flux = np.zeros(sensor.n) if self.needs_flux else sensor.flux_e
+        kinds = len(self._kinds(flux)[0]) * (_LEVELS if self.needs_flux else 1)
         check_size(
             "map: tables of the posterior (kinds, positions, rows, columns)",
             (kinds, *self.table_shape),
             hint="give search_range_px, smaller windows, or one flux_e for all",
         )
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
-        super().fill_light(table, flux_e)
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        super().fill_flux(table, flux_e)
         sensor = self.sensor
         kinds, which = self._kinds(flux_e)
         before = sum(len(part.tables) for part in self._posteriors)
         if self._levels and (before + len(kinds)) * math.prod(self.table_shape) > MOST_NUMBERS:
             nearest = min(self._levels, key=lambda level: abs(math.log(level / flux_e[0])))
-            table[located.KIND] = self._levels[nearest] + which
+            table[spot_fits.KIND] = self._levels[nearest] + which
             return
-        if self.needs_light:
+        if self.needs_flux:
             self._levels[float(flux_e[0])] = before
         made = spot_tables.posterior_tables(
             self.psf,
@@ -158,10 +158,10 @@ class _Prepared(LikelihoodPrepared):
             sensor.width,
         )
         self._posteriors.append(made)
-        table[located.KIND] = before + which
+        table[spot_fits.KIND] = before + which
 
     def _kinds(self, flux_e: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Return PSF, light and floor of every kind of sub-aperture, (n_kinds, 3), and the kind of each."""
+        """Return PSF, flux and floor of every kind of sub-aperture, (n_kinds, 3), and the kind of each."""
         columns = [self.psf.index_of(self.sensor.n), flux_e, self.each("weight_floor")]
         kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
         return kinds, which.reshape(-1)

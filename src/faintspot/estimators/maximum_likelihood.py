@@ -16,8 +16,8 @@ from faintspot.estimators.matched import Fitted
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
-from faintspot.estimators.spots import PSFPrepared
-from faintspot.kernels import located
+from faintspot.estimators.spots import PSFPlan
+from faintspot.kernels import spot_fits
 
 _MODEL_ERRORS = (0.3, 0.0, 1.0)  # of speckled spots
 _LEARNT_WEIGHT_FLOOR = 1e-3
@@ -31,13 +31,13 @@ class Likelihood(Fitted):
     model_error: Any = option(
         0.0,
         "How far the spots differ from the PSF, as a fraction of each pixel's light: bright pixels are "
-        "trusted no more than that. 0.1 to 0.5 for speckled spots; counts no more than sqrt(300 e- / light).",
+        "trusted no more than that. 0.1 to 0.5 for speckled spots; counts no more than sqrt(300 e- / flux).",
         low=0.0,
         high=10.0,
     )
     weight_floor: Any = option(
         2e-4,
-        "Variance, as a fraction of the light, that is added to every pixel's weight, so that small errors "
+        "Variance, as a fraction of the flux, that is added to every pixel's weight, so that small errors "
         "of the PSF in dark wings carry no large weights.",
         low=0.0,
         high=1.0,
@@ -49,8 +49,8 @@ class Likelihood(Fitted):
         """Trust the wings of a learnt PSF less."""
         return self.replaced({"weight_floor": _LEARNT_WEIGHT_FLOOR}) if scene.learnt else self
 
-    def for_bright_light(self) -> Self:
-        """Make no more steps: they would follow the weights of bright light, which are not those of faint."""
+    def for_bright_flux(self) -> Self:
+        """Make no more steps: they would follow the weights of high flux, which are not those of faint."""
         return self
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
@@ -62,7 +62,7 @@ class Likelihood(Fitted):
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaximumLikelihood(Likelihood):
-    """Position and light of maximum likelihood, by Fisher scoring."""
+    """Position and flux of maximum likelihood, by Fisher scoring."""
 
     name = "ml"
     label = "maximum likelihood"
@@ -70,12 +70,12 @@ class MaximumLikelihood(Likelihood):
     cost = 0.27
     style = Style("#0072B2", "-", "P")
 
-    def prepared(self, sensor: Sensor) -> LikelihoodPrepared:
+    def prepared(self, sensor: Sensor) -> LikelihoodPlan:
         """See `Estimator`."""
-        return LikelihoodPrepared(self, sensor)
+        return LikelihoodPlan(self, sensor)
 
 
-class LikelihoodPrepared(PSFPrepared):
+class LikelihoodPlan(PSFPlan):
     """Tables of a fit with weights; images of low noise are rounded to whole electrons."""
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
@@ -87,7 +87,7 @@ class LikelihoodPrepared(PSFPrepared):
 
     @property
     def rounds_electrons(self) -> bool:
-        """See `SpotPrepared`."""
+        """See `SpotPlan`."""
         camera = self.sensor.calibration
         noise = camera.read_noise_photoelectrons
         low = noise is not None and noise < _WHOLE_ELECTRONS_BELOW
@@ -95,8 +95,8 @@ class LikelihoodPrepared(PSFPrepared):
         return low and whole
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         super().fill(table)
-        table[located.WEIGHT_FLOOR] = self.each("weight_floor")
-        table[located.WEIGHT_EXCESS] = self.sensor.excess_noise
-        table[located.MODEL_ERROR] = self.each("model_error")
+        table[spot_fits.WEIGHT_FLOOR] = self.each("weight_floor")
+        table[spot_fits.WEIGHT_EXCESS] = self.sensor.excess_noise
+        table[spot_fits.MODEL_ERROR] = self.each("model_error")

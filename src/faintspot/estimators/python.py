@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.base.errors import InputError
 from faintspot.base.flags import INVALID, SubapertureFlag
-from faintspot.estimators.base import Estimator, Positions, Prepared
+from faintspot.estimators.base import Estimator, EstimatorPlan, Positions
 from faintspot.estimators.faults import faults_of
 from faintspot.estimators.gravity import keep_all
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity, groups
 from faintspot.kernels.groups import SlopeArrays
 
-_NO_LIGHT = np.uint8(SubapertureFlag.NO_LIGHT)
+_NO_FLUX = np.uint8(SubapertureFlag.NO_FLUX)
 _TYPICAL_FLUX_E = 300.0
 _AT_SEARCH_LIMIT = np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)
 
@@ -42,7 +42,7 @@ def typical_images(n: int, window: tuple[int, int]) -> NDArray[np.float32]:
     return np.tile(spot, (n, 1, 1))
 
 
-class PythonPrepared(Prepared):
+class PythonPlan(EstimatorPlan):
     """The kernel calibrates images and flags what is bad; `locate` then finds the positions.
 
     Parameters
@@ -72,16 +72,16 @@ class PythonPrepared(Prepared):
 
     @property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         return gravity.GravityTables()
 
     @property
     def own_scratch(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         return gravity.gravity_scratch
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: NDArray[np.float64]) -> None:
-        """See `Prepared`."""
+    def fill_flux(self, table: NDArray[np.float32], flux_e: NDArray[np.float64]) -> None:
+        """See `EstimatorPlan`."""
         keep_all(table)
 
     def found(self, images: NDArray[np.float32], prior: NDArray[np.float64]) -> Positions:
@@ -99,7 +99,7 @@ class PythonPrepared(Prepared):
             Whatever `locate` raises, and when it returns another shape: one line that names the estimator.
         """
         n, kind = self.sensor.n, type(self.estimator)
-        light = images.sum(axis=(1, 2))  # before `locate`, which may write into the images
+        flux = images.sum(axis=(1, 2))  # before `locate`, which may write into the images
         file = getattr(sys.modules.get(kind.__module__), "__file__", None)
         title = f"estimator {self.estimator.name!r} of {file or kind.__module__}"
         with faults_of(title, file), np.errstate(all="ignore"):
@@ -109,7 +109,7 @@ class PythonPrepared(Prepared):
                 if array.shape != (n, 2):
                     raise InputError(f"locate: expected shape ({n}, 2), got {array.shape}")
                 found = Positions(array[:, 0], array[:, 1])
-            found = found._replace(flux=light if found.flux is None else found.flux)
+            found = found._replace(flux=flux if found.flux is None else found.flux)
             values = [None if value is None else np.asarray(value, np.float64) for value in found]
             for name, value in zip(Positions._fields, values, strict=True):
                 if value is not None and value.shape != (n,):
@@ -158,8 +158,8 @@ class PythonPrepared(Prepared):
         usable &= np.abs(found.flux) <= LARGEST_FLOAT32
         usable &= True if found.valid is None else found.valid != 0
         flags = slopes.flags[frame]
-        flags &= ~_NO_LIGHT
-        flags[~usable & (flags & INVALID == 0)] |= _NO_LIGHT
+        flags &= ~_NO_FLUX
+        flags[~usable & (flags & INVALID == 0)] |= _NO_FLUX
         valid = (flags & INVALID) == 0
         slopes.flux[frame] = np.where(usable, found.flux, 0.0)
         positions = np.stack([found.x, found.y], axis=1)

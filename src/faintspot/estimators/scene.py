@@ -12,7 +12,7 @@ PIXEL_BLUR_PX2 = 0.46
 
 @dataclass(frozen=True)
 class Scene:
-    """Light, camera and spots of a star.
+    """Flux, camera and spots of a star.
 
     Parameters
     ----------

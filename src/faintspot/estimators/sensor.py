@@ -30,7 +30,7 @@ class Sensor:
     search_range_px : (n,) array
         How far from it a position may be; infinite where anywhere.
     flux_e : (n,) array
-        Expected light, electrons; NaN where it is not known.
+        Expected flux, electrons; NaN where it is not known.
     given_fwhm_px : (n, 2) array
         Full width at half maximum of the spots along x and y; NaN where it is not given.
     width : int

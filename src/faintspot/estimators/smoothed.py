@@ -14,7 +14,7 @@ from faintspot.algorithms.automatic import automatic_smoothing
 from faintspot.config.options import option
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Step, Style
 from faintspot.estimators.brightest import BrightestPixels
-from faintspot.estimators.gravity import GravityPrepared, KeepingBrightest
+from faintspot.estimators.gravity import GravityPlan, KeepingBrightest
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
@@ -78,16 +78,16 @@ class Smoothed(KeepingBrightest):
         smoothed: NDArray[np.float32] = gaussian_filter(images, width, mode="constant", axes=(-2, -1))
         return smoothed
 
-    def prepared(self, sensor: Sensor) -> GravityPrepared:
+    def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(GravityPrepared):
+class _Plan(GravityPlan):
     """Taps of the smoothing."""
 
     @cached_property
     def first_step(self) -> gravity.GravityTables:
-        """See `GravityPrepared`."""
+        """See `GravityPlan`."""
         std = np.repeat(self.each("smoothing_px")[:, None], 2, axis=1)
         return gravity.GravityTables(taps=gaussian_taps(std, self.sensor.window))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.sizes import check_size
-from faintspot.kernels.located import SMALLEST_VARIANCE
 from faintspot.kernels.profiles import MARGIN, PHASES
+from faintspot.kernels.spot_fits import SMALLEST_VARIANCE
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore
 
@@ -43,8 +43,8 @@ class SpotModel:
     """Of the spots, (n_models, 2)."""
     taps: NDArray[np.float32]
     """Of the smoothing that finds the start, (n_models, 2, 1 + reach)."""
-    start_light: Floats
-    """What the brightest pixel of a smoothed spot has of its light, (n_models,)."""
+    start_flux: Floats
+    """What the brightest pixel of a smoothed spot has of its flux, (n_models,)."""
     gain: Floats
     """Factor on the steps of the weighted centre of gravity, (n_models, 2)."""
 
@@ -59,9 +59,9 @@ def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int) -> SpotM
     along, across = psf.separable_terms
     tables = [_profile_tables(terms, psf.oversampling, window, width) for terms in (along, across)]
     taps = gaussian_taps(START_SMOOTHING * psf.fwhm_px, window)
-    light = _start_light(psf, taps)
-    ones = np.ones((len(light), 2))
-    return SpotModel(np.stack(tables, axis=1), psf.index_of(n), psf.fwhm_px, taps, light, ones)
+    flux = _start_flux(psf, taps)
+    ones = np.ones((len(flux), 2))
+    return SpotModel(np.stack(tables, axis=1), psf.index_of(n), psf.fwhm_px, taps, flux, ones)
 
 
 def model_of_weights(
@@ -85,8 +85,8 @@ def model_of_weights(
         spots, planes, gains = gaussian_psf(fwhm), np.arange(len(fwhm)), 1.0 + (fwhm / weights) ** 2
     else:
         gains = np.stack([_weighted_gain(spots, int(i), own) for i, own in zip(planes, std, strict=True)])
-    light = np.array([_start_light(spots, taps[i : i + 1], int(k))[0] for i, k in enumerate(planes)])
-    return SpotModel(np.stack(tables, axis=1), index.reshape(-1), fwhm, taps, light, gains)
+    flux = np.array([_start_flux(spots, taps[i : i + 1], int(k))[0] for i, k in enumerate(planes)])
+    return SpotModel(np.stack(tables, axis=1), index.reshape(-1), fwhm, taps, flux, gains)
 
 
 def gaussian_psf(fwhm_px: Floats) -> PSF:
@@ -144,17 +144,17 @@ def _gaussian_tables(std_px: Floats, window: tuple[int, int], width: int) -> NDA
     return np.ascontiguousarray(values[:, None], np.float32)
 
 
-def _start_light(psf: PSF, taps: NDArray[np.float32], plane: int | None = None) -> Floats:
+def _start_flux(psf: PSF, taps: NDArray[np.float32], plane: int | None = None) -> Floats:
     """Mean over sub-pixel positions of the smoothed spot's brightest pixel."""
     offsets = np.array([(x, y) for x in _START_OFFSETS for y in _START_OFFSETS])
     reach = taps.shape[2] - 1
     side = 2 * reach + 1
-    light = np.empty(len(taps))
+    flux = np.empty(len(taps))
     for i, (along, across) in enumerate(taps.astype(np.float64)):
         images = psf.images(offsets, (side, side), which=i if plane is None else plane)
         both = [np.concatenate([values[:0:-1], values]) for values in (along, across)]
-        light[i] = np.einsum("nyx,x,y->n", images, both[0], both[1]).mean()
-    return np.maximum(light, 1e-6)
+        flux[i] = np.einsum("nyx,x,y->n", images, both[0], both[1]).mean()
+    return np.maximum(flux, 1e-6)
 
 
 def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:
@@ -175,10 +175,10 @@ def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:
     return 1.0 / np.maximum(seen, 0.05)
 
 
-def least_light(
+def least_flux(
     psf: PSF, plane: int, variance: float, excess: float, search_range_px: float, side: int
 ) -> float:
-    """Return the light (electrons) below which about 1 % of a spot's positions are those of noise.
+    """Return the flux (electrons) below which about 1 % of a spot's positions are those of noise.
 
     A spot is confused with one of the n places in the search range where the noise may make another when the
     difference of two log-likelihood ratios, of variance twice its mean, goes the wrong way: t such that
@@ -230,7 +230,7 @@ NO_POSTERIOR = PosteriorGrid(
 
 
 def joined(parts: list[PosteriorGrid]) -> PosteriorGrid:
-    """Return the tables of several levels of light, on one grid, one after the other."""
+    """Return the tables of several levels of flux, on one grid, one after the other."""
     return PosteriorGrid(
         np.concatenate([part.tables for part in parts]),
         np.concatenate([part.constants for part in parts]),

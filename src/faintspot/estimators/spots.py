@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.estimators import spot_tables
-from faintspot.estimators.base import Prepared
+from faintspot.estimators.base import EstimatorPlan
 from faintspot.estimators.spot_tables import SpotModel
 from faintspot.estimators.stepping import Stepping
-from faintspot.kernels import located
+from faintspot.kernels import spot_fits
 from faintspot.kernels.groups import RANGE
 
 Floats = NDArray[np.float64]
@@ -21,10 +21,10 @@ BLURS = (0.4, 0.0, 0.8, 1.2)
 """Of a speckled spot's PSF, in units of lambda / d."""
 
 
-class SpotPrepared(Prepared):
+class SpotPlan(EstimatorPlan):
     """Settings and tables of an estimator that reads profiles of spots, or of weights that follow them."""
 
-    setting_rows = located.SETTING_ROWS
+    setting_rows = spot_fits.SETTING_ROWS
 
     estimator: Stepping
 
@@ -55,39 +55,39 @@ class SpotPrepared(Prepared):
         return choice == "on" or (choice == "auto" and not self.sensor.calibration.vouches_for_dark)
 
     @property
-    def model_tables(self) -> located.ModelTables:
+    def model_tables(self) -> spot_fits.ModelTables:
         """What the kernels read that follow a profile."""
-        return located.ModelTables(
+        return spot_fits.ModelTables(
             self.step_count, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
         )
 
     @property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         return self.model_tables
 
     @cached_property
     def own_scratch(self) -> Any:
-        """See `Prepared`."""
-        return partial(located.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
+        """See `EstimatorPlan`."""
+        return partial(spot_fits.spot_scratch, rank=self.model.rank, taps=self.taps.shape[2])
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         model, index = self.model, self.model.index
-        table[located.MODEL] = index
-        start_light = model.start_light[index]
+        table[spot_fits.MODEL] = index
+        start_flux = model.start_flux[index]
         if self.fits_background:  # the image's mean, the spot's own light in it, is taken off
-            start_light = np.maximum(start_light - 1.0 / self.sensor.pixels, 0.1 * start_light)
-        table[located.START_LIGHT] = start_light
-        table[located.GAIN_X], table[located.GAIN_Y] = model.gain[index].T
-        table[located.LEAST_LIGHT] = self._least_light(table[RANGE])
+            start_flux = np.maximum(start_flux - 1.0 / self.sensor.pixels, 0.1 * start_flux)
+        table[spot_fits.START_FLUX] = start_flux
+        table[spot_fits.GAIN_X], table[spot_fits.GAIN_Y] = model.gain[index].T
+        table[spot_fits.LEAST_FLUX] = self._least_flux(table[RANGE])
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
-        table[located.FLUX] = np.nan_to_num(flux_e)
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        table[spot_fits.FLUX] = np.nan_to_num(flux_e)
 
-    def _least_light(self, search_range_px: NDArray[np.float32]) -> Floats:
-        """Light of every sub-aperture below which outliers are to be expected."""
+    def _least_flux(self, search_range_px: NDArray[np.float32]) -> Floats:
+        """Flux of every sub-aperture below which outliers are to be expected."""
         sensor = self.sensor
         if sensor.psf is None:
             widths, index = np.unique(sensor.spot_fwhm_px, axis=0, return_inverse=True)
@@ -97,11 +97,11 @@ class SpotPrepared(Prepared):
         table: Floats = np.column_stack([index, search_range_px])
         pairs, which = np.unique(table, axis=0, return_inverse=True)
         side = max(sensor.window)
-        light = [
-            spot_tables.least_light(spots, int(plane), self.variance, sensor.excess_noise, float(reach), side)
+        flux = [
+            spot_tables.least_flux(spots, int(plane), self.variance, sensor.excess_noise, float(reach), side)
             for plane, reach in pairs
         ]
-        least: Floats = np.array(light)[which.reshape(-1)]
+        least: Floats = np.array(flux)[which.reshape(-1)]
         return least
 
     @cached_property
@@ -111,10 +111,10 @@ class SpotPrepared(Prepared):
         return psf.blurred(blur) if psf is not None and blur > 0 else psf
 
 
-class PSFPrepared(SpotPrepared):
+class PSFPlan(SpotPlan):
     """The same for a fit of the PSF itself."""
 
-    kernel = staticmethod(located.fitted_of_groups)
+    kernel = staticmethod(spot_fits.fitted_of_groups)
 
     @cached_property
     def model(self) -> SpotModel:

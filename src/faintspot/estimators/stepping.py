@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 from faintspot.config.options import option
 from faintspot.estimators.base import Estimator
 
-_STEPS_IN_BRIGHT_LIGHT = 12
+_STEPS_IN_BRIGHT_FLUX = 12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,9 +26,9 @@ class Stepping(Estimator):
         """Number of steps, also where none is given."""
         return int(self.steps or self.usual_steps[getattr(self, "preset", "accurate")])
 
-    def for_bright_light(self) -> Self:
+    def for_bright_flux(self) -> Self:
         """Make more steps: without noise, what is left of where they began is a bias."""
-        return self.replaced({"steps": max(self.step_count, _STEPS_IN_BRIGHT_LIGHT)})
+        return self.replaced({"steps": max(self.step_count, _STEPS_IN_BRIGHT_FLUX)})
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.config.options import option
 from faintspot.estimators.base import Style
-from faintspot.estimators.gravity import Centroid, Floats, GravityPrepared
+from faintspot.estimators.gravity import Centroid, Floats, GravityPlan
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
@@ -51,8 +51,8 @@ class Thresholded(Centroid):
         ]
         return {"threshold_e": list(dict.fromkeys(max(float(f"{e:.3g}"), _SMALLEST_E) for e in levels))}
 
-    def for_bright_light(self) -> Thresholded:
-        """Take nothing off: a level for faint light is none for bright."""
+    def for_bright_flux(self) -> Thresholded:
+        """Take nothing off: a level for faint flux is none for bright."""
         return self.replaced({"threshold_e": 0.0})
 
     def check(self, sensor: Sensor) -> None:
@@ -62,12 +62,12 @@ class Thresholded(Centroid):
                 f"estimator.threshold_e: expected a level (electrons) for estimator {self.name!r}, got none"
             )
 
-    def prepared(self, sensor: Sensor) -> GravityPrepared:
+    def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(GravityPrepared):
+class _Plan(GravityPlan):
     """Thresholds, and what the kernel takes that measures pixels in rows, where that is possible."""
 
     def __init__(self, estimator: Thresholded, sensor: Sensor) -> None:
@@ -81,7 +81,7 @@ class _Prepared(GravityPrepared):
 
     @cached_property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         tables = super().tables
         if not self._widths:
             return tables
@@ -90,6 +90,6 @@ class _Prepared(GravityPrepared):
         ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
         return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables)
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
         table[gravity.LEVEL], table[gravity.SUBTRACT] = self.each("threshold_e"), 1.0

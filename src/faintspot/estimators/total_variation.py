@@ -18,7 +18,7 @@ from faintspot.config.options import PerSubaperture, is_auto, option
 from faintspot.config.presets import PRESETS, of_denoising
 from faintspot.estimators.base import BACKGROUND, CALIBRATED, RAW, Estimator, Step, Style
 from faintspot.estimators.brightest import BrightestPixels
-from faintspot.estimators.gravity import Floats, GravityPrepared, KeepingBrightest
+from faintspot.estimators.gravity import Floats, GravityPlan, KeepingBrightest
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
@@ -95,9 +95,9 @@ class TotalVariation(KeepingBrightest):
         """See `Estimator`."""
         return BrightestPixels.like(self)
 
-    def for_bright_light(self) -> Estimator:
+    def for_bright_flux(self) -> Estimator:
         """Do not denoise: an image without noise has nothing to take off."""
-        return self.without_denoising().for_bright_light()
+        return self.without_denoising().for_bright_flux()
 
     def default_of(self, name: str, pixels: int) -> Any:
         """See `Options`."""
@@ -135,7 +135,7 @@ class TotalVariation(KeepingBrightest):
     def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
         """See `KeepingBrightest`."""
         if is_auto(self.noise_std):
-            return None  # it follows from the light
+            return None  # it follows from the flux
         limits = {name: getattr(self, name) for name in ("tolerance", "max_iterations")}
         result: NDArray[np.float32] = tv_denoise(
             images,
@@ -147,31 +147,31 @@ class TotalVariation(KeepingBrightest):
         )
         return result
 
-    def prepared(self, sensor: Sensor) -> GravityPrepared:
+    def prepared(self, sensor: Sensor) -> GravityPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(GravityPrepared):
+class _Plan(GravityPlan):
     """Strengths, and what the denoising starts with."""
 
     estimator: TotalVariation
 
     @cached_property
     def first_step(self) -> gravity.GravityTables:
-        """See `GravityPrepared`."""
+        """See `GravityPlan`."""
         return gravity.GravityTables(
             flat_start_table(*self.sensor.window), ALGORITHMS[self.estimator.algorithm]
         )
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         super().fill(table)
         table[gravity.TOLERANCE], table[gravity.LIMIT] = self.each("tolerance"), self.each("max_iterations")
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
-        super().fill_light(table, flux_e)
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
+        super().fill_flux(table, flux_e)
         automatic = is_auto(self.estimator.noise_std)
         strength = automatic_strength(**self.rule_arguments(flux_e)) if automatic else self.each("noise_std")
         table[gravity.STRENGTH] = strength

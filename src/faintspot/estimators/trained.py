@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.estimators import spot_tables
-from faintspot.estimators.base import Estimator, Need, Prepared, Style
+from faintspot.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.sensor import Sensor
-from faintspot.kernels import located
+from faintspot.kernels import spot_fits
 from faintspot.spots.score import TrainedScore
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Trained(Estimator):
     takes_prior = True
 
     @property
-    def uses_light(self) -> bool:
+    def uses_flux(self) -> bool:
         """See `Estimator`."""
         return True
 
@@ -49,29 +49,29 @@ class Trained(Estimator):
                 f"score.index: expected {sensor.n} numbers, one per sub-aperture, got {len(kinds)}"
             )
 
-    def prepared(self, sensor: Sensor) -> Prepared:
+    def prepared(self, sensor: Sensor) -> EstimatorPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(Prepared):
+class _Plan(EstimatorPlan):
     """Tables of the score."""
 
-    kernel = staticmethod(located.scored_of_groups)
-    setting_rows = located.SETTING_ROWS
+    kernel = staticmethod(spot_fits.scored_of_groups)
+    setting_rows = spot_fits.SETTING_ROWS
 
     def __init__(self, estimator: Trained, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         assert isinstance(sensor.score, TrainedScore)
         self._score = sensor.score
-        self.needs_light = bool(np.isnan(sensor.flux_e).all())
+        self.needs_flux = bool(np.isnan(sensor.flux_e).all())
 
     @cached_property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         score, sensor = self._score, self.sensor
         std = np.full((sensor.n, 2), max(score.smoothing_px, _LEAST_SMOOTHING_PX))
-        return located.ScoreTables(
+        return spot_fits.ScoreTables(
             score.passes,
             score.start == "peak",
             spot_tables.gaussian_taps(std, sensor.window),
@@ -80,22 +80,22 @@ class _Prepared(Prepared):
 
     @cached_property
     def own_scratch(self) -> Any:
-        """See `Prepared`."""
-        return partial(located.spot_scratch, taps=self.tables.taps.shape[2])
+        """See `EstimatorPlan`."""
+        return partial(spot_fits.spot_scratch, taps=self.tables.taps.shape[2])
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
-        table[located.START_LIGHT] = 1.0  # the light is expected, not measured at the start
+        """See `EstimatorPlan`."""
+        table[spot_fits.START_FLUX] = 1.0  # the flux is expected, not measured at the start
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
         score = self._score
-        table[located.FLUX] = np.nan_to_num(flux_e)
+        table[spot_fits.FLUX] = np.nan_to_num(flux_e)
         classes = score.flux_class(flux_e)
         kinds = 0 if score.index is None else score.index
-        table[located.KIND] = kinds * len(score.flux_e) + classes
+        table[spot_fits.KIND] = kinds * len(score.flux_e) + classes
         levels = [score.standard_error(float(flux)) for flux in np.unique(flux_e)]
         errors = np.stack(levels)[np.unique(flux_e, return_inverse=True)[1]]
         own = np.arange(self.sensor.n) if score.index is not None else 0
         errors = errors[np.arange(self.sensor.n), own]
-        table[located.TRAINED_ERROR_X], table[located.TRAINED_ERROR_Y] = errors.T
+        table[spot_fits.TRAINED_ERROR_X], table[spot_fits.TRAINED_ERROR_Y] = errors.T

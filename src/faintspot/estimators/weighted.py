@@ -17,9 +17,9 @@ from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spot_tables import SpotModel
-from faintspot.estimators.spots import SpotPrepared
+from faintspot.estimators.spots import SpotPlan
 from faintspot.estimators.stepping import Stepping
-from faintspot.kernels import located
+from faintspot.kernels import spot_fits
 
 _WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # times the spot's
 
@@ -56,15 +56,15 @@ class Weighted(Stepping):
         """Widths around the spot's."""
         return {"weight_fwhm_px": [factor * scene.seen_fwhm_px for factor in _WIDTHS]}
 
-    def prepared(self, sensor: Sensor) -> SpotPrepared:
+    def prepared(self, sensor: Sensor) -> SpotPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(SpotPrepared):
+class _Plan(SpotPlan):
     """Profiles of the weights."""
 
-    kernel = staticmethod(located.weighted_of_groups)
+    kernel = staticmethod(spot_fits.weighted_of_groups)
 
     @cached_property
     def model(self) -> SpotModel:

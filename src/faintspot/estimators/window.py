@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.config.options import option
-from faintspot.estimators.base import Estimator, Need, Prepared, Style
+from faintspot.estimators.base import Estimator, EstimatorPlan, Need, Style
 from faintspot.estimators.registry import register
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
@@ -28,14 +28,14 @@ _WIDTHS_OF_SPECKLES = (2.0, 1.0, 1.25, 1.6, 2.8, 4.0)
 _LEAST_WEIGHT = 1e-4  # of the window's middle: what is less counts nothing, and need not be read
 _STEP_PX = 0.25  # by which the spot is moved to find the gain
 _SMALLEST_GAIN = 0.02
-_LEAST_LIGHT = 1e-6  # of the brightest spot's
+_LEAST_FLUX = 1e-6  # of the brightest spot's
 MEAN, FRAME, NONE = "mean", "frame", "none"
 
 
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Window(Estimator):
-    """Centre of gravity under a fixed window over its mean light and its gain (Nicolle et al. 2004)."""
+    """Centre of gravity under a fixed window over its mean flux and its gain (Nicolle et al. 2004)."""
 
     window_fwhm_px: Any = option(
         None,
@@ -57,9 +57,9 @@ class Window(Estimator):
     )
     normalisation: Any = option(
         None,
-        'What the sums are divided by: "mean", the light that is expected (`flux_e`, or a running mean); '
-        '"frame", the light of the frame itself under the window; "none": nothing. Default: "mean" where '
-        'the light is known, else "frame".',
+        'What the sums are divided by: "mean", the flux that is expected (`flux_e`, or a running mean); '
+        '"frame", the flux of the frame itself under the window; "none": nothing. Default: "mean" where '
+        'the flux is known, else "frame".',
         choices=(MEAN, FRAME, NONE),
         per_subaperture=False,
     )
@@ -74,13 +74,13 @@ class Window(Estimator):
 
     name = "window"
     label = "fixed window"
-    method = "centre of gravity under a fixed window, over its mean light and gain"
+    method = "centre of gravity under a fixed window, over its mean flux and gain"
     needs = frozenset({Need.WIDTH})
     cost = 0.08
     style = Style("#8C510A", "-", "p")
 
     @property
-    def uses_light(self) -> bool:
+    def uses_flux(self) -> bool:
         """See `Estimator`."""
         return self.normalisation in (None, MEAN)
 
@@ -89,9 +89,9 @@ class Window(Estimator):
         factors = _WIDTHS_OF_SPECKLES if scene.d_over_r0 > 1 else _WIDTHS
         return {"window_fwhm_px": [factor * scene.seen_fwhm_px for factor in factors]}
 
-    def for_bright_light(self) -> Window:
-        """Divide by the light that is there."""
-        return self.replaced({"normalisation": FRAME}) if self.uses_light else self
+    def for_bright_flux(self) -> Window:
+        """Divide by the flux that is there."""
+        return self.replaced({"normalisation": FRAME}) if self.uses_flux else self
 
     def check(self, sensor: Sensor) -> None:
         """See `Estimator`."""
@@ -105,16 +105,16 @@ class Window(Estimator):
             super().check(sensor)
         if self.normalisation == MEAN and np.isnan(sensor.flux_e).any():
             raise InputError(
-                f"settings.flux_e: expected the light of the spots (electrons) for estimator {self.name!r} "
+                f"settings.flux_e: expected the flux of the spots (electrons) for estimator {self.name!r} "
                 'with normalisation "mean", got none'
             )
 
-    def prepared(self, sensor: Sensor) -> Prepared:
+    def prepared(self, sensor: Sensor) -> EstimatorPlan:
         """See `Estimator`."""
-        return _Prepared(self, sensor)
+        return _Plan(self, sensor)
 
 
-class _Prepared(Prepared):
+class _Plan(EstimatorPlan):
     """Weights of every sub-aperture, and what follows from them."""
 
     setting_rows = window.SETTING_ROWS
@@ -124,7 +124,7 @@ class _Prepared(Prepared):
 
     @property
     def kernel(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         return window.window_of_groups if self._columns is None else window.window_in_rows
 
     @cached_property
@@ -138,8 +138,8 @@ class _Prepared(Prepared):
             return given
         kinds, gain = given.kinds(sensor.n), np.nan_to_num(gain, nan=1.0)[:, None, None]
         inside = ~_outside(*_offsets(sensor.layout.offsets, sensor.window), region)
-        x, y, spot, light = (maps[kinds] for maps in (given.x, given.y, given.mean_spot, given.light))
-        return FixedWeights(inside * x / gain, inside * y / gain, spot, inside * light, np.arange(sensor.n))
+        x, y, spot, flux = (maps[kinds] for maps in (given.x, given.y, given.mean_spot, given.flux))
+        return FixedWeights(inside * x / gain, inside * y / gain, spot, inside * flux, np.arange(sensor.n))
 
     def _gaussian(self) -> FixedWeights:
         """Windows around the reference positions."""
@@ -183,7 +183,7 @@ class _Prepared(Prepared):
     def _maps(self) -> Floats:
         """Weights of every kind, (n_kinds, ny, nx, 3)."""
         weights = self.weights
-        return np.stack([weights.x, weights.y, weights.light], axis=-1)
+        return np.stack([weights.x, weights.y, weights.flux], axis=-1)
 
     @cached_property
     def _region(self) -> tuple[int, int, int, int]:
@@ -207,7 +207,7 @@ class _Prepared(Prepared):
 
     @cached_property
     def tables(self) -> Any:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         sensor, kinds = self.sensor, self.weights.kinds(self.sensor.n)
         top, left, bottom, right = self._region
         n_groups = -(-sensor.n // sensor.width)
@@ -247,24 +247,24 @@ class _Prepared(Prepared):
         )
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """See `Prepared`."""
+        """See `EstimatorPlan`."""
         weights, sensor = self.weights, self.sensor
         kinds = weights.kinds(sensor.n)
         fixed = isinstance(sensor.score, FixedWeights)
         table[window.HOME_X], table[window.HOME_Y] = (sensor.layout.offsets if fixed else sensor.zero).T
         photons = sensor.excess_noise * np.maximum(weights.mean_spot, 0.0)
         rows = zip(
-            (window.DARK_X, window.DARK_Y, window.DARK_LIGHT),
-            (window.PHOTON_X, window.PHOTON_Y, window.PHOTON_LIGHT),
-            (weights.x, weights.y, weights.light),
+            (window.DARK_X, window.DARK_Y, window.DARK_FLUX),
+            (window.PHOTON_X, window.PHOTON_Y, window.PHOTON_FLUX),
+            (weights.x, weights.y, weights.flux),
             strict=True,
         )
         for dark, photon, maps in rows:
             table[dark] = self.variance * np.square(maps).sum(axis=(1, 2))[kinds]
             table[photon] = (photons * np.square(maps)).sum(axis=(1, 2))[kinds]
 
-    def fill_light(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """See `Prepared`."""
+    def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
+        """See `EstimatorPlan`."""
         weights, how = self.weights, self.estimator.normalisation
         kinds = weights.kinds(self.sensor.n)
         offsets = [(maps * weights.mean_spot).sum(axis=(1, 2))[kinds] for maps in (weights.x, weights.y)]
@@ -273,9 +273,9 @@ class _Prepared(Prepared):
         elif how == FRAME:
             table[window.DIVISOR] = 0.0
         else:
-            # A spot that is known to have no light is none; where nothing is known, the frame says it.
-            lit = np.where(flux_e > _LEAST_LIGHT * np.nan_to_num(flux_e).max(), flux_e, -1.0)
-            table[window.DIVISOR] = np.where(np.isnan(flux_e), 0.0, lit)
+            # A spot that is known to have no flux is none; where nothing is known, the frame says it.
+            illuminated = np.where(flux_e > _LEAST_FLUX * np.nan_to_num(flux_e).max(), flux_e, -1.0)
+            table[window.DIVISOR] = np.where(np.isnan(flux_e), 0.0, illuminated)
         table[window.OFFSET_X], table[window.OFFSET_Y] = offsets
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.control.learning import INTEGRATOR
 from faintspot.experiments import answer_text
 from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, SECOND
-from faintspot.report.drawing import GREY, LIGHT_GREY, new_figure, plain_ticks, styled
+from faintspot.report.drawing import FLUX_GREY, GREY, new_figure, plain_ticks, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +53,7 @@ def tune_figure(answer: Answer) -> Figure:
     _mark_budget(axes, answer)
     _electrons_above(axes, answer)
     plain_ticks(axes.yaxis, _TICKS)
-    axes.grid(which="major", color=LIGHT_GREY, lw=0.7)
+    axes.grid(which="major", color=FLUX_GREY, lw=0.7)
     if answer.promise is not None and answer.promise.contradicted:
         axes.set_title(answer_text.promise_lines(answer)[-1], color="#b00020", loc="left")
     axes.set_xlabel(answer.magnitude_label)
@@ -207,7 +207,7 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
             "the star", where, xycoords=("data", "axes fraction"), xytext=(4, -10), textcoords="offset points"
         )
     axes.set_ylim(0, 1)
-    axes.grid(color=LIGHT_GREY, lw=0.7)
+    axes.grid(color=FLUX_GREY, lw=0.7)
     loop = answer.question.configuration
     axes.set_xlabel(f"guide star magnitude ({loop.camera.band}); markers are measured, lines interpolated")
     axes.set_ylabel(f"Strehl ratio at {1e6 * loop.science.wavelength_m:.3g} µm")
@@ -251,7 +251,7 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
     axes.set_xticks(range(len(PLACES)), [place.replace(" degrees", "°") for place in PLACES])
     axes.set_ylabel(f"sky with such a star within {answer.question.radius:.3g}″ (%)")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.grid(axis="y", color=LIGHT_GREY, lw=0.7)
+    axes.grid(axis="y", color=FLUX_GREY, lw=0.7)
     axes.set_axisbelow(True)
     axes.set_title(
         f"thick: error of the limits; thin: with {100 * MODEL_ERROR:.0f} % of the star counts, common to all",

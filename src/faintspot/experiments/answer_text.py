@@ -126,10 +126,10 @@ def foundations(answer: Answer) -> list[str]:
         "drifts, no flat-field errors, no scintillation"
     )
     if question.photometry is not None:
-        light = question.photometry
+        flux = question.photometry
         lines.append(
-            f"photometry: {light.zero_point:.3g} photons/s/m^2 at {light.band} = 0, throughput "
-            f"{light.throughput:g}, quantum efficiency {light.quantum_efficiency:g}"
+            f"photometry: {flux.zero_point:.3g} photons/s/m^2 at {flux.band} = 0, throughput "
+            f"{flux.throughput:g}, quantum efficiency {flux.quantum_efficiency:g}"
         )
     if question.d_over_r0:
         lines.append("the bound is that of spots without speckles, and of estimators without a prior")

@@ -45,10 +45,10 @@ TERMS = {
     term.name: term
     for term in (
         Term(_NOTHING, "the loop as it is", DisabledErrors()),
-        Term("photon and read noise", "mean light in every pixel", DisabledErrors(noiseless=True)),
+        Term("photon and read noise", "mean flux in every pixel", DisabledErrors(noiseless=True)),
         Term(
             "servo lag",
-            "ten times the frame rate, as much light in every frame, in stretches over the same time",
+            "ten times the frame rate, as high flux in every frame, in stretches over the same time",
             DisabledErrors(faster=_FASTER),
         ),
         Term(
@@ -153,7 +153,7 @@ def budget_run(
         [arm],
         realisation=realisation,
         progress=lambda done, total: advance(done),
-        idealised=off,
+        disabled_errors=off,
     )
     scored = record.scored & off.settled(record.frames)
     return {

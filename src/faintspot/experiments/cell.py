@@ -183,8 +183,8 @@ def measure_cell(cell: Cell, specification: StudySpecification) -> dict[str, NDA
     arms: CellArms | None = None
     for stack in _stacks(realisations(cell, half, rng), cell.pixels):
         if arms is None:
-            light = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
-            arms = CellArms(cell, specification, float(light.mean()))
+            flux = np.concatenate([images.sum(axis=(1, 2), dtype=np.float64) for images, _ in stack])
+            arms = CellArms(cell, specification, float(flux.mean()))
             tuning = Tuning(arms, specification)
         tuning.add(stack)
     assert arms is not None

@@ -18,7 +18,7 @@ from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.scene import Scene
 from faintspot.experiments.arms import Kind, keeps_every_k, kind_of, score_for_scene
-from faintspot.kernels import scoring
+from faintspot.kernels import every_k
 from faintspot.pipeline.images import measure_images
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slopes import Slopes
@@ -36,7 +36,7 @@ Images = NDArray[np.float32]
 
 _KEPT = "keep_brightest"
 _TRAINING = 1  # word that is added to a cell's seed
-_LEAST_LIGHT_E = 1e-3  # a mean of noise may be negative
+_LEAST_FLUX_E = 1e-3  # a mean of noise may be negative
 
 # In a cell ------------------------------------------------------------------------------------------------
 
@@ -64,13 +64,13 @@ class CellArms:
     ----------
     cell : Cell
     specification : StudySpecification
-    light_e : float, optional
+    flux_e : float, optional
         Mean electrons of an image as measured, which arms without a table are told. Default: the cell's.
     """
 
-    def __init__(self, cell: Cell, specification: StudySpecification, light_e: float | None = None) -> None:
+    def __init__(self, cell: Cell, specification: StudySpecification, flux_e: float | None = None) -> None:
         self.cell, self._specification = cell, specification
-        self.light_e = max(cell.flux_e if light_e is None else light_e, _LEAST_LIGHT_E)
+        self.flux_e = max(cell.flux_e if flux_e is None else flux_e, _LEAST_FLUX_E)
         self.search_range_px = specification.search_range_of(cell)
         self._within_px = min(self.search_range_px, cell.pixels / 2)
         self.kinds = {arm: kind_of(arm) for arm in specification.arms}
@@ -103,7 +103,7 @@ class CellArms:
             told["spot_fwhm_px"], told["spot_fwhm_y_px"] = self._spot_fwhm_px
         return Arm(
             estimator.label,
-            Settings(estimator, search_range_px=self._within_px, flux_e=self.light_e, **told),
+            Settings(estimator, search_range_px=self._within_px, flux_e=self.flux_e, **told),
             psf=self._psf if Need.PSF in estimator.needs else None,
             score=self._score if Need.SCORE in estimator.needs else None,
         )
@@ -139,7 +139,7 @@ class CellArms:
         """What estimators are told of the cell that tune options of their own."""
         cell = self.cell
         return Scene(
-            flux_e=self.light_e,
+            flux_e=self.flux_e,
             read_noise_e=cell.read_noise_e,
             window=(cell.pixels, cell.pixels),
             spot_fwhm_px=FWHM_OF_SIZE_1_PX[cell.profile] * cell.size * math.sqrt(cell.elongation),
@@ -182,7 +182,7 @@ def _psf_of(profile: str, size: float, elongation: float, radius_px: float) -> P
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-RULES = {"subtract_next": scoring.SUBTRACT_NEXT, "threshold": scoring.THRESHOLD}
+RULES = {"subtract_next": every_k.SUBTRACT_NEXT, "threshold": every_k.THRESHOLD}
 
 
 def error_sums(
@@ -218,7 +218,7 @@ def error_table(
     errors = np.empty((len(images), prepared.shape[1] - 1), np.float32)
     valid = np.empty(errors.shape, np.bool_)
     how = images.shape[-1], RULES[estimator.rule], estimator.flux_floor, search_range_px
-    scoring.errors_of_every_k(prepared, *how, truth, 0, len(images), errors, valid)
+    every_k.errors_of_every_k(prepared, *how, truth, 0, len(images), errors, valid)
     return errors, valid
 
 
@@ -230,7 +230,7 @@ def position_table(
     positions = np.empty((len(images), prepared.shape[1] - 1, 2))
     valid = np.empty(positions.shape[:2], np.bool_)
     how = images.shape[-1], RULES[estimator.rule], estimator.flux_floor, search_range_px
-    scoring.positions_of_every_k(prepared, *how, 0, len(images), positions, valid)
+    every_k.positions_of_every_k(prepared, *how, 0, len(images), positions, valid)
     return positions, valid
 
 

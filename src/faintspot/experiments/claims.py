@@ -69,7 +69,7 @@ _CLAIMS: tuple[tuple[str, str, _Judge], ...] = (
         judges.thirty_equal_eighty,
     ),
     (
-        "A factor 2 to 3 less light, up to one magnitude",
+        "A factor 2 to 3 less flux, up to one magnitude",
         "Of each configuration (Nyquist-sampled, 16 × 16 px) the flux with the largest gain by the "
         "interval's lower end. Holds where the interval reaches 2; in part where it reaches half of "
         "that in magnitudes, a factor 1.41.",
@@ -95,7 +95,7 @@ _CLAIMS: tuple[tuple[str, str, _Judge], ...] = (
         judges.less_dependence_on_k,
     ),
     (
-        "Elongated spots: the gain grows with read noise, up to 25 % less light above 3 e-",
+        "Elongated spots: the gain grows with read noise, up to 25 % less flux above 3 e-",
         f"Flux gains at R = {judges.LEVEL_PX} px. Holds where ln(gain) grows with log(read noise) by 1.96 "
         "standard errors and the interval of the largest saving at 3 e- or more reaches 25 %; in part for "
         "one of the two.",
@@ -180,7 +180,7 @@ def _best_k(best: list[_Compared]) -> str:
     factors = np.array([item.gain.factor for item in best])
     median = float(np.median(factors))
     start = (
-        f"With the best k in every arm, and compared at R = {LEVEL_PX} px, TV needs less light than "
+        f"With the best k in every arm, and compared at R = {LEVEL_PX} px, TV needs less flux than "
         f"brightest pixels alone in {len(better)} of {len(best)} configurations, more in {len(worse)}; in "
         f"{len(best) - len(better) - len(worse)} the 95 % interval contains 1. "
     )
@@ -201,7 +201,7 @@ def _where(best: list[_Compared]) -> list[str]:
     else:
         paragraphs.append(f"In no configuration is the gain above {_WORTH_IT:g} beyond its error.")
     if costs:
-        paragraphs.append(f"It loses light in {len(costs)}, most in: {_listed(costs)}")
+        paragraphs.append(f"It loses flux in {len(costs)}, most in: {_listed(costs)}")
     return [*paragraphs, *_with_noise(best)]
 
 
@@ -274,7 +274,7 @@ def _against_gaussian(best: list[_Compared]) -> list[str]:
     median = float(np.median([over.factor for _, over in known]))
     text = (
         f"Against linear Gaussian smoothing of the best width with the best k, at R = {LEVEL_PX} px, TV "
-        f"needs less light in {len(tv)} of {len(known)} configurations and more in {len(gaussian)}; median "
+        f"needs less flux in {len(tv)} of {len(known)} configurations and more in {len(gaussian)}; median "
         f"flux gain of TV over it {median:.2f}. "
     )
     if len(tv) > len(gaussian):
@@ -313,12 +313,12 @@ def _recommendation(best: list[_Compared]) -> str:
     if not worth:
         return (
             "Advice: do not use TV on the strength of this study. In no configuration does it save "
-            f"more than a factor {_WORTH_IT:g} of light with a tuned k."
+            f"more than a factor {_WORTH_IT:g} of flux with a tuned k."
         )
     if not use:
         return (
             f"Advice: tune k first, and smooth with a Gaussian before you think of TV. TV saves more than a "
-            f"factor {_WORTH_IT:g} of light with a tuned k in {worth} of {len(best)} configurations, but in "
+            f"factor {_WORTH_IT:g} of flux with a tuned k in {worth} of {len(best)} configurations, but in "
             "none of them is it ahead of Gaussian smoothing: use it only where smoothing is not at hand."
         )
     where = sorted(use, key=lambda item: -item.gain.low)
@@ -331,7 +331,7 @@ def _recommendation(best: list[_Compared]) -> str:
     also = " and beats Gaussian smoothing" if any(item.over_gaussian for item in use) else ""
     return (
         f"Advice: use TV in the {len(use)} of {len(best)} configurations in which it saves more than a "
-        f"factor {_WORTH_IT:g} of light with a tuned k{also}: {_listed(where)}{tail}"
+        f"factor {_WORTH_IT:g} of flux with a tuned k{also}: {_listed(where)}{tail}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Curves of the slope error against the light, and the light that a method saves, with intervals.
+"""Curves of the slope error against the flux, and the flux that a method saves, with intervals.
 
 The Strehl ratio of a closed loop against the star's magnitude is no such curve: there the same few
 realisations of the air are seen at every magnitude, and whole realisations are drawn again, while here each
@@ -93,7 +93,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Gain:
-    """By what factor less light a method reaches the same R, with its confidence interval."""
+    """By what factor less flux a method reaches the same R, with its confidence interval."""
 
     factor: float
     """inf: the method's R is smaller than that at the lowest flux measured; 0: it never gets there."""
@@ -134,7 +134,7 @@ def gain_at_flux(
     method: str,
     reference: str,
 ) -> Gain | None:
-    """Return by how much less light `method` reaches the R that `reference` has at a flux.
+    """Return by how much less flux `method` reaches the R that `reference` has at a flux.
 
     log R is interpolated monotonically (PCHIP) in log flux. The 95 % interval is a parametric bootstrap: R of
     both arms is drawn from the normal distribution of their standard errors and covariance.
@@ -166,7 +166,7 @@ def gain_at_error(
     method: str,
     reference: str,
 ) -> Gain | None:
-    """Return by how much less light `method` reaches a given R than `reference`; see `gain_at_flux`.
+    """Return by how much less flux `method` reaches a given R than `reference`; see `gain_at_flux`.
 
     Returns
     -------

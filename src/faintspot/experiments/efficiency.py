@@ -26,13 +26,13 @@ ENOUGH_PHOTONS = {0.1: 30.0, 3.0: 120.0, 16.0: 500.0}
 """Fewest electrons, by read noise, at which an estimator that knows the spot is expected at the bound."""
 ML, MAP = MaximumLikelihood.name, MaximumAPosteriori.name
 EXPECTED_EFFICIENCY = {ML: 0.95, MAP: 0.95, Weighted.name: 0.75}
-"""Least photon efficiency, by arm, where there is light enough."""
+"""Least photon efficiency, by arm, where there is flux enough."""
 NEAR_BEST = 1.04
 """Gain-corrected rms over the smallest of all arms up to which an arm counts as near the best."""
 _OF_WINDOWS = (
     "True positions are uniform within plus and minus the range that stands behind each cell (±1 px in "
     "most) on each axis; how near to the limit an arm comes depends on it, that of a fixed window (`window`, "
-    "told the mean light as `trained` is) above all: it lives from a narrow one, as in a closed loop."
+    "told the mean flux as `trained` is) above all: it lives from a narrow one, as in a closed loop."
 )
 _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dominate its error
 
@@ -43,7 +43,7 @@ def compares_estimators(dataset: xarray.Dataset) -> bool:
 
 
 def enough_photons(read_noise_e: float, flux_e: float) -> bool:
-    """Whether there is light enough for the bound to be within reach.
+    """Whether there is flux enough for the bound to be within reach.
 
     Between the read noises of `ENOUGH_PHOTONS`, logarithms are interpolated.
     """
@@ -80,7 +80,7 @@ class _Cells:
         return f"{self.coordinate('flux_e')[cell]:g} e-, {configuration.in_words()}"
 
     def order(self) -> list[int]:
-        """Indices by spot, camera and light."""
+        """Indices by spot, camera and flux."""
         names = ("profile", "elongation", "size", "pixels", "position_range_px", "read_noise_e")
         keys = [self.coordinate(name) for name in (*names, "d_over_r0", "flux_e")]
         return [int(index) for index in np.lexsort(keys[::-1])]
@@ -110,7 +110,7 @@ def _efficient(cells: _Cells) -> list[str]:
             reached = int(np.sum(values[enough] >= target))
             found.append(
                 f"{arm}: photon efficiency of at least {target:g} in {reached} of {enough.sum()} cells that "
-                f"have light enough (30 e- at 0.1 e- read noise, 120 at 3, 500 at 16; in between in "
+                f"have flux enough (30 e- at 0.1 e- read noise, 120 at 3, 500 at 16; in between in "
                 f"proportion); lowest {values[lowest]:.3f} ({cells.words(lowest)})."
             )
     return found

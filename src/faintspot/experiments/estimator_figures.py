@@ -131,8 +131,8 @@ def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
         panel.set_ylim(0, 1.35)
     _label(axes, group, "photon efficiency")
     caption = (
-        "The light with which an estimator at the Cramer-Rao bound would have the same R, over the light "
-        "that was used. More than 1 at little light: there the search range says more than the light. "
+        "The flux with which an estimator at the Cramer-Rao bound would have the same R, over the flux "
+        "that was used. More than 1 at low flux: there the search range says more than the flux. "
         "What lies above 1.35 is cut off; the numbers are in the data. The range of true positions is in the "
         "title; a fixed window depends on it most."
     )

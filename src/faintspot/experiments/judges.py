@@ -87,7 +87,7 @@ def thirty_equal_eighty(dataset: xarray.Dataset, mode: str, rng: np.random.Gener
             continue
         finding = (
             f"R {with_error(*with_tv)} px with TV at 30 e-, {with_error(*without)} px without at 80 e-; for "
-            f"the latter TV needs {gain.in_words()} times less light than 80 e- (claimed: 2.67)"
+            f"the latter TV needs {gain.in_words()} times less flux than 80 e- (claimed: 2.67)"
         )
         cases.append(Case(key.in_words(), finding, _reaches(gain, 80 / 30)))
     return cases
@@ -221,7 +221,7 @@ def elongated(dataset: xarray.Dataset, mode: str, rng: np.random.Generator) -> l
         )
         reached = most is not None and most[2] >= 25
         if most is not None:
-            finding += f"; most light saved at 3 e- or more: {most[0]:.0f} % ({most[1]:.0f} to {most[2]:.0f})"
+            finding += f"; most flux saved at 3 e- or more: {most[0]:.0f} % ({most[1]:.0f} to {most[2]:.0f})"
         grows = slope > _SIGMAS * error
         cases.append(
             Case(_shared_words(known, "read_noise_e"), finding, judged(grows and reached, grows or reached))

@@ -258,7 +258,7 @@ class LoopAnswer:
         path, flux, best = Path(path), self.at_star, self.best
         arm, star = self.arm(best.name, flux), self.star(flux)
         settings = arm.settings
-        if settings.estimator.uses_light:
+        if settings.estimator.uses_flux:
             settings = settings.replace(flux_e=float(f"{star.photons:.4g}"))
         psf = arm.psf
         if psf is None and settings.estimator.needs & {Need.PSF, Need.WIDTH}:  # what the loop gives it

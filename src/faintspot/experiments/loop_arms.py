@@ -123,7 +123,7 @@ class ArmKind:
         return ", ".join(parts if self.control == INTEGRATOR else [*parts, CONTROLS[self.control]])
 
     def tuned(self, configuration: LoopConfiguration) -> dict[str, Tunable]:
-        """Return what is tuned for a configuration's light: the loop gain and options of the estimator."""
+        """Return what is tuned for a configuration's flux: the loop gain and options of the estimator."""
         estimator = self._untuned(configuration)
         declared = estimator.declared()
         options = {

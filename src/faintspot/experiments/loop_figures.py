@@ -27,7 +27,7 @@ from faintspot.experiments.loop_analysis import (
 from faintspot.experiments.loop_arms import CONTROL_SIGN, VARIANTS
 from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.statistics import paired_mean
-from faintspot.report.drawing import GREY, LIGHT_GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
+from faintspot.report.drawing import FLUX_GREY, GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
 
 @styled
 def gain_figure(result: MagnitudeResult) -> FigureWithData:
-    """Draw the centroid gain of every arm against the star's light."""
+    """Draw the centroid gain of every arm against the star's flux."""
     figure = new_figure(WIDTH * 0.7, 5.2)
     panel = figure.subplots()
     rows = []
@@ -281,7 +281,7 @@ def differences_figure(table: Measurements) -> FigureWithData:
     panel = figure.subplots()
     single, denoised = paired_differences(table), table.group(TV)
     panel.axhline(0, color=GREY, lw=1)
-    panel.axvspan(*BEST_STRENGTHS, color=LIGHT_GREY, lw=0, zorder=0)
+    panel.axvspan(*BEST_STRENGTHS, color=FLUX_GREY, lw=0, zorder=0)
     panel.plot(table.strength_e[denoised], single[denoised], **_marker(TV))
     found = differences_by_strength(table)
     rows = [[r.strength_e, r.difference.value, r.difference.low, r.difference.high, r.count] for r in found]
@@ -308,7 +308,7 @@ def seeing_figure(table: Measurements) -> FigureWithData:
     known = np.isfinite(table.r0_m)
     top = 110 * float(max(np.percentile(table.r0_m[known], 98), table.true_r0_m.max()))
     ends = np.array([0.0, top])
-    panel.fill_between(ends, 0.9 * ends, 1.1 * ends, color=LIGHT_GREY, lw=0, label="within 10 %")
+    panel.fill_between(ends, 0.9 * ends, 1.1 * ends, color=FLUX_GREY, lw=0, label="within 10 %")
     panel.plot(ends, ends, color=GREY, lw=1)
     for name in (TV, TV_BEST, NO_TV):
         chosen = known & (table.group(name) if name != TV else table.group(TV) & ~table.group(TV_BEST))

@@ -349,16 +349,21 @@ def _facts(results: LoopResults) -> dict[str, str]:
     configuration = configuration_of(results)
     if configuration is None:
         return {}
-    telescope, sensor, air = configuration.telescope, configuration.sensor, configuration.atmosphere
+    telescope, sensor, atmosphere = configuration.telescope, configuration.sensor, configuration.atmosphere
     camera, control = configuration.camera, configuration.control
-    r0 = f"{air.r0_m[0]:g} to {air.r0_m[1]:g}" if isinstance(air.r0_m, tuple) else f"{air.r0_m:g}"
+    r0 = (
+        f"{atmosphere.r0_m[0]:g} to {atmosphere.r0_m[1]:g}"
+        if isinstance(atmosphere.r0_m, tuple)
+        else f"{atmosphere.r0_m:g}"
+    )
     return {
         "Telescope": f"{telescope.diameter_m:g} m, central obstruction {telescope.obstruction:g} of the "
         "diameter",
         "Sensor": f"{sensor.subapertures} × {sensor.subapertures} sub-apertures of "
         f"{configuration.subaperture_m:.2g} m, "
         f"{sensor.pixels} × {sensor.pixels} px, {sensor.wavelength_m * 1e9:.0f} nm",
-        "Air": f"r0 {r0} m at 500 nm, outer scale {air.outer_scale_m:g} m, {len(air.fraction)} layers",
+        "Atmosphere": f"r0 {r0} m at 500 nm, outer scale {atmosphere.outer_scale_m:g} m, "
+        f"{len(atmosphere.fraction)} layers",
         "Camera": f"read noise {camera.read_noise_e / camera.em_gain:.3g} e⁻"
         + (f", multiplication gain {camera.em_gain:g}" if camera.em_gain > 1 else ""),
         "Star": f"{configuration.photons:g} photo-electrons of a sub-aperture in a frame, where not varied",

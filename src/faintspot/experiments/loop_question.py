@@ -114,12 +114,12 @@ def isoplanatic_angle_arcsec(configuration: LoopConfiguration) -> float:
     InputError
         When all turbulence is on the ground.
     """
-    air = configuration.atmosphere
-    strength = np.array(air.fraction) / np.sum(air.fraction)
-    altitude = float((strength @ np.array(air.altitude_m) ** (5 / 3)) ** 0.6)
+    atmosphere = configuration.atmosphere
+    strength = np.array(atmosphere.fraction) / np.sum(atmosphere.fraction)
+    altitude = float((strength @ np.array(atmosphere.altitude_m) ** (5 / 3)) ** 0.6)
     if altitude <= 0:
         raise InputError("atmosphere.altitude_m: expected a layer above the ground for an isoplanatic angle")
-    r0 = float(np.mean(air.r0_m)) * (configuration.science.wavelength_m / 500e-9) ** 1.2
+    r0 = float(np.mean(atmosphere.r0_m)) * (configuration.science.wavelength_m / 500e-9) ** 1.2
     return math.degrees(0.314 * r0 / altitude) * 3600.0
 
 
@@ -152,7 +152,7 @@ BASELINE, SECOND = "window", "brightest"
 """What every gain is stated against, first and second: both with the integrator."""
 _CANDIDATES = (SECOND, BASELINE, "map_predicted", "window+kalman", "map+kalman")
 _FAINTER = 4.0  # than the faintest star of the configuration: limiting magnitudes are there
-_AROUND = (1 / 8, 4.0)  # of the star's light, where the configuration has no other stars
+_AROUND = (1 / 8, 4.0)  # of the star's flux, where the configuration has no other stars
 _LEAST_PHOTONS = 0.5
 
 
@@ -163,10 +163,10 @@ class LoopQuestion:
     Parameters
     ----------
     configuration : LoopConfiguration
-        Telescope, sensor, camera, air and control; its light is that of the star.
+        Telescope, sensor, camera, air and control; its flux is that of the star.
     magnitudes : (float, float), optional
         First and last magnitude. Default: from the brightest star of the configuration's `run` to one four
-        times fainter than the faintest; without any, from four times the star's light to an eighth.
+        times fainter than the faintest; without any, from four times the star's flux to an eighth.
     arms : sequence of str, optional
         Names of candidates as for `arm_kind`; "window" and "brightest" always take part. Default: those,
         "map_predicted", and with the predictive Kalman filter "window+kalman" and "map+kalman" as far as the
@@ -281,8 +281,10 @@ class LoopQuestion:
         return min(isoplanatic_angle_arcsec(self.configuration), 3600.0)
 
     def _layers_above(self) -> list[Any]:
-        air = self.configuration.atmosphere
-        return [h > 0 and part > 0 for h, part in zip(air.altitude_m, air.fraction, strict=True)]
+        atmosphere = self.configuration.atmosphere
+        return [
+            h > 0 and part > 0 for h, part in zip(atmosphere.altitude_m, atmosphere.fraction, strict=True)
+        ]
 
 
 def magnitudes_apart(photons: Sequence[float]) -> float:

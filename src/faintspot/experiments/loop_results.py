@@ -100,7 +100,7 @@ class InterleavedResult:
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeResult(Stored):
-    """Strehl ratio against the star's light: A arms, F fluxes, R realisations of the air."""
+    """Strehl ratio against the star's flux: A arms, F fluxes, R realisations of the air."""
 
     WHAT: ClassVar[str] = "a magnitude experiment"
     FORMAT: ClassVar[int] = 3

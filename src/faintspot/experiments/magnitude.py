@@ -1,4 +1,4 @@
-"""Strehl ratio against the star's light, for any list of arms, each tuned at every flux."""
+"""Strehl ratio against the star's flux, for any list of arms, each tuned at every flux."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run_magnitude(
     place: WorkerPool | None = None,
     overwrite: bool = False,
 ) -> MagnitudeResult:
-    """Measure the Strehl ratio of arms against the star's light, or what is left of it.
+    """Measure the Strehl ratio of arms against the star's flux, or what is left of it.
 
     Each arm is tuned at each flux on air of its own, then scored on the configuration's number of
     realisations, which are the same for all. The result is also written to the folder.
@@ -215,11 +215,11 @@ def scored(
     store = unit_store(folder, name, experiment, units, overwrite=overwrite)
     results = run_units(function, units, store, place)
 
-    def gathered(variable: str) -> NDArray[Any]:
+    def page_state(variable: str) -> NDArray[Any]:
         values = np.array([results[unit.key][variable] for unit in units])
         return values.reshape(len(kinds), len(columns), len(runs), *values.shape[1:])
 
-    return gathered
+    return page_state
 
 
 def scored_run(

@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 _SPOTS, _FEWEST_SPOTS = 4096, 1024  # of 16 x 16 px; fewer of larger windows
 _COUNTABLE_E = 0.25  # read noise below which images hold whole electrons, which are dealt out one by one
 _FEWEST_FRAMES = 8
-_LARGEST_SHARE = 0.5  # of the light, for two images of a frame
+_LARGEST_SHARE = 0.5  # of the flux, for two images of a frame
 _TOLERANCE = 0.1  # relative, within which a promise counts as kept
 _SURELY = 3.0  # standard errors
 _NOISE_TOLERANCE = 0.1  # of the pixels' standard deviation, likewise
@@ -52,7 +52,7 @@ class Promise:
     """
 
     flux_e: float
-    """Light of the images, electrons per sub-aperture on average."""
+    """Flux of the images, electrons per sub-aperture on average."""
     predicted: Estimate
     """By simulation, as the answer: same camera, light and PSF, spots where they are in the recording."""
     measured: Estimate
@@ -62,7 +62,7 @@ class Promise:
     noise_ratio: float
     """Standard deviation of lit pixels about fitted spots over the one that was taken."""
     promised_px: float
-    """R at the star's light, as promised."""
+    """R at the star's flux, as promised."""
     unshared_px: float = 0.0
     """Error that the two images of a frame share and successive frames do not: scatter from frame to frame
     beyond noise and the movement that all methods see. Known where spots move less than the noise."""
@@ -131,7 +131,7 @@ def check_promises(
 ) -> dict[str, Promise]:
     """Predict and measure the slope errors of arms on the recording that a question brought along.
 
-    Of every frame two images with the star's light, or half the recording's where that is less, and with the
+    Of every frame two images with the star's flux, or half the recording's where that is less, and with the
     camera's own read noise are made: both are the frame, scaled, with noise that is opposite in the two and
     cancels what they have in common, and more noise of their own. What differs in their slopes is error; the
     spots' movement is the same in both. The same arms measure pairs of simulated spots at the same places.
@@ -160,8 +160,8 @@ def check_promises(
     """
     pair_rng, *exposures = spawn(np.random.default_rng(1) if rng is None else rng, 3)
     images, fitted = _recorded(question)
-    light, excess = float(fitted.flux_e.mean()), question.detector.excess_noise_factor
-    share = min(_LARGEST_SHARE, question.star_flux_e / light)
+    flux, excess = float(fitted.flux_e.mean()), question.detector.excess_noise_factor
+    share = min(_LARGEST_SHARE, question.star_flux_e / flux)
     dark = question.read_noise_photoelectrons**2 + excess * question.background_e
     flat = images.reshape(-1, *question.shape)
     ratio = variance_over_expected(flat, fitted, dark_variance_e2=dark, excess_noise=excess)
@@ -170,7 +170,7 @@ def check_promises(
     else:
         spots = np.maximum(fitted.psf.images(fitted.positions, question.shape, fitted.flux_e), 0.0)
         pair = _split(images, excess * spots.reshape(images.shape), dark, ratio, share, pair_rng)
-    mean = _simulated(question, fitted, share * light).reshape(images.shape)
+    mean = _simulated(question, fitted, share * flux).reshape(images.shape)
     camera = question.detector
     exposed = [np.asarray(camera.to_electrons(camera.expose(mean, each)), np.float64) for each in exposures]
     alike = [each - question.background_e for each in exposed]
@@ -178,7 +178,7 @@ def check_promises(
     for name, (arm, promised_px) in arms.items():
         first, second, *simulated = (_measure(question, arm, part) for part in (*pair, *alike))
         promises[name] = Promise(
-            share * light,
+            share * flux,
             _error_of(simulated[0] - simulated[1], 2),
             _error_of(first - second, 2),
             _frame_to_frame(first),
@@ -249,8 +249,8 @@ def _simulated(question: Question, fitted: LearntPSF, flux_e: float) -> Floats:
     mean, noise = away.mean(axis=0), np.mean(np.square(fitted.standard_error_px), axis=0)
     share = np.sqrt(np.maximum(1 - noise / np.maximum(away.var(axis=0), 1e-12), 0.0))
     places = middle + mean + share * (away - mean)
-    light = np.ones(len(question.layout)) if question.relative_light is None else question.relative_light
-    flux = flux_e * np.tile(light, n_frames)
+    relative = np.ones(len(question.layout)) if question.relative_flux is None else question.relative_flux
+    flux = flux_e * np.tile(relative, n_frames)
     return np.maximum(fitted.psf.images(places, question.shape, flux), 0.0)
 
 
@@ -262,7 +262,7 @@ def _split(
     share: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Return two images of a share of the light, the noise of both being the camera's and independent.
+    """Return two images of a share of the flux, the noise of both being the camera's and independent.
 
     The share's noise is the same in both, and so is its negative that is added to one and taken from the
     other: their covariance is zero. The rest of the noise is drawn.

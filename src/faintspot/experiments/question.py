@@ -91,7 +91,7 @@ class Question:
     psf : PSF, optional
         The spot itself, as learnt from frames; then no profile is assumed.
     flux_e : float, optional
-        Light of the star: detected photons (photo-electrons) per sub-aperture and frame.
+        Flux of the star: detected photons (photo-electrons) per sub-aperture and frame.
     magnitude : float, optional
         Instead of `flux_e`; needs `lenslet_m` and `frame_rate_hz`.
     band, zero_point, throughput, quantum_efficiency
@@ -103,8 +103,8 @@ class Question:
     budget : str or float, optional
         Slope error R that is allowed, "0.1", "0.1px", "0.05arcsec" or "50mas": asks for the limiting
         magnitude.
-    relative_light : (n,) array, optional
-        Light of sub-apertures in units of their mean. Default: all have the same.
+    relative_flux : (n,) array, optional
+        Flux of sub-apertures in units of their mean. Default: all have the same.
     recording : (n_frames, h, w) array, ADU, optional
         Frames, not used for what is said here, on which to check what is promised; needs `layout` and
         `calibration`.
@@ -150,7 +150,7 @@ class Question:
     quantum_efficiency: float = DEFAULT_QUANTUM_EFFICIENCY
     search_range_px: Any = None
     budget: Any = None
-    relative_light: NDArray[np.float64] | None = None
+    relative_flux: NDArray[np.float64] | None = None
     recording: NDArray[Any] | None = None
     layout: Layout | None = None
     calibration: Calibration | None = None
@@ -205,7 +205,7 @@ class Question:
         return float(self.read_noise_e / self.em_gain)
 
     def scene(self, flux_e: float) -> Scene:
-        """Return what estimators are told of spots of this light."""
+        """Return what estimators are told of spots of this flux."""
         return Scene(
             flux_e=flux_e,
             read_noise_e=self.read_noise_photoelectrons,
@@ -236,16 +236,16 @@ class Question:
 
     @property
     def star_flux_e(self) -> float:
-        """Light of the star, electrons per sub-aperture and frame."""
+        """Flux of the star, electrons per sub-aperture and frame."""
         if self.flux_e is not None:
             return float(self.flux_e)
         assert self.photometry is not None
         return float(self.photometry.electrons(self.magnitude))
 
     @property
-    def light_is_known(self) -> bool:
-        """Whether estimators are told the star's light: it is assumed, not that of a recording's spots."""
-        return self.relative_light is None and self.psf is None
+    def flux_is_known(self) -> bool:
+        """Whether estimators are told the star's flux: it is assumed, not that of a recording's spots."""
+        return self.relative_flux is None and self.psf is None
 
     @property
     def budget_px(self) -> float | None:

@@ -1,4 +1,4 @@
-"""The question from recorded frames: layout, camera, PSF, light and the spots' range are measured."""
+"""The question from recorded frames: layout, camera, PSF, flux and the spots' range are measured."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NOISE_AMONG_SPOTS = 0.95  # of the fitted flux, below which fits have taken noi
 _SURELY = 3.0  # standard errors
 _LEAST_VARIANCE = 0.01  # of a pixel, electrons squared
 _DARK_PIXELS = 1 << 24  # that the read noise is measured in
-_FEWEST_FOR_LIGHT = 4  # images of each sub-aperture that tell its light
+_FEWEST_FOR_FLUX = 4  # images of each sub-aperture that tell its flux
 
 
 def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **given: Any) -> Question:
@@ -41,7 +41,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
     The layout is found (`Layout.from_frame`), gain, read noise and dark level are measured
     (`faintspot.measure_detector`; about fitted spots, where these move too much for it). The PSF is learnt
     (`faintspot.learn_psf`) from every second frame, and fitted to its spots together with the background that
-    all share: this tells their light, how it differs between sub-apertures, and how far the spots move. The
+    all share: this tells their flux, how it differs between sub-apertures, and how far the spots move. The
     other frames are kept to check on them what is promised (`faintspot.experiments.check_promises`).
 
     Parameters
@@ -49,7 +49,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
     frames : (n, h, w) or (h, w) array, ADU
         Consecutive ones where the gain is to be measured.
     darks : (n, h, w) or (h, w) array, optional
-        Frames without light.
+        Frames without flux.
     **given
         What is known, as for `Question`: used instead of what would be measured. With `fwhm_px` no PSF is
         learnt.
@@ -104,7 +104,7 @@ def question_from_frames(frames: ArrayLike, darks: ArrayLike | None = None, **gi
             f"light measured by fitting spots and background: {given['flux_e']:.0f} electrons per "
             f"sub-aperture and frame, on average (pixels above the background add up to {sums:.0f})"
         )
-    given["relative_light"] = _relative_light(fitted, len(layout), facts)
+    given["relative_flux"] = _relative_flux(fitted, len(layout), facts)
     values = {
         "gain_e_per_adu": calibration.gain_e_per_adu,
         "em_gain": calibration.em_gain,
@@ -155,7 +155,7 @@ def _calibration(
                     "gain_e_per_adu: expected a value, as the frames do not tell the gain: "
                     f"{found.notes[-1]}; about fitted spots: {about_spots}"
                 )
-        else:  # where it is possible, it is the better one: movement and faint light do not bias it
+        else:  # where it is possible, it is the better one: movement and faint flux do not bias it
             gain, error = about_spots.gain_e_per_adu, about_spots.gain_e_per_adu_error
             way = "about fitted spots, wherever they move"
             if darks is None or len(darks) < 2:
@@ -272,8 +272,8 @@ def _range(images: NDArray[Any], calibration: Calibration, fitted: LearntPSF, la
     """Measure how far spots are from their references."""
     n, background = len(layout), float(fitted.background_e[0])
     each = fitted.flux_e.reshape(-1, n)
-    light = _relative_light(fitted, n, [])
-    flux = each.mean() * (np.ones(n) if light is None else light)
+    relative = _relative_flux(fitted, n, [])
+    flux = each.mean() * (np.ones(n) if relative is None else relative)
     noise = calibration.read_noise_photoelectrons
     assert noise is not None
     excess = calibration.excess_noise
@@ -318,16 +318,16 @@ def _without_background(
     return calibration
 
 
-def _relative_light(fitted: LearntPSF, n: int, facts: list[str]) -> NDArray[np.float64] | None:
-    """Light of every sub-aperture over the mean, where there are images enough to tell it from noise."""
+def _relative_flux(fitted: LearntPSF, n: int, facts: list[str]) -> NDArray[np.float64] | None:
+    """Flux of every sub-aperture over the mean, where there are images enough to tell it from noise."""
     each = fitted.flux_e.reshape(-1, n)
-    if len(each) < _FEWEST_FOR_LIGHT or each.mean() <= 0:
+    if len(each) < _FEWEST_FOR_FLUX or each.mean() <= 0:
         return None
-    light: NDArray[np.float64] = np.maximum(each.mean(axis=0), 0.0) / each.mean()
+    flux: NDArray[np.float64] = np.maximum(each.mean(axis=0), 0.0) / each.mean()
     scatter = float(np.sqrt(np.mean(each.var(axis=0, ddof=1)) / len(each)) / each.mean())
-    if light.std() < _SURELY * scatter:
+    if flux.std() < _SURELY * scatter:
         return None
-    low, high = np.quantile(light, [0.05, 0.95])
-    facts.append(f"light of the sub-apertures: {low:.2f} to {high:.2f} times the mean in nine of ten")
-    light /= light.mean()
-    return light
+    low, high = np.quantile(flux, [0.05, 0.95])
+    facts.append(f"flux of the sub-apertures: {low:.2f} to {high:.2f} times the mean in nine of ten")
+    flux /= flux.mean()
+    return flux

@@ -126,7 +126,7 @@ def tune(
     *,
     slopes: Choice | None = None,
 ) -> Tuned:
-    """Find the settings of an arm that give the highest Strehl ratio at the configuration's light.
+    """Find the settings of an arm that give the highest Strehl ratio at the configuration's flux.
 
     All combinations of a few values of each option first, then steps from the best ones to
     neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,

@@ -43,7 +43,7 @@ class SimulatedSpots:
     layout: Layout
     calibration: Calibration
     choosing: tuple[Floats, Floats]
-    scoring: tuple[Floats, Floats]
+    every_k: tuple[Floats, Floats]
 
     @classmethod
     def of(cls, question: Question, realisations: int, rng: np.random.Generator) -> SimulatedSpots:
@@ -69,7 +69,7 @@ class SimulatedSpots:
         """Return frames to choose on and frames to score on at a flux."""
         camera, (ny, nx) = self.question.detector, self.layout.window
         samples = []
-        for (images, truth), noise in zip((self.choosing, self.scoring), spawn(rng, 2), strict=True):
+        for (images, truth), noise in zip((self.choosing, self.every_k), spawn(rng, 2), strict=True):
             frames = camera.expose(flux_e * images, noise).reshape(-1, SPOTS_PER_FRAME * ny, nx)
             samples.append(Sample(frames, truth.reshape(-1, SPOTS_PER_FRAME, 2)))
         return samples[0], samples[1]
@@ -109,16 +109,16 @@ def unit_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Fl
     """Return images (n, ny, nx) of spots and their positions (n, 2), px.
 
     A spot that is not speckled and in the middle of its window leaves 1 e- in it, on average where
-    sub-apertures differ in their light.
+    sub-apertures differ in their flux.
     """
     images, positions = _even_spots(question, n, rng)
-    if question.relative_light is not None:
-        images = images * spawn(rng, 1)[0].choice(question.relative_light, n)[:, None, None]
+    if question.relative_flux is not None:
+        images = images * spawn(rng, 1)[0].choice(question.relative_flux, n)[:, None, None]
     return images, positions
 
 
 def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return such spots, all of the same light."""
+    """Return such spots, all of the same flux."""
     position_rng, phase_rng = spawn(rng, 2)
     half, shape = question.search_range_px, question.shape
     positions = position_rng.uniform(-half, half, (n, 2))
@@ -126,11 +126,11 @@ def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[F
     if question.psf is not None:
         which = phase_rng.integers(0, len(question.psf.samples), n)
         images = question.psf.images(positions, shape, which=which)
-        light = question.psf.images(np.repeat(middle, n, axis=0), shape, which=which).sum(axis=(1, 2))
+        flux = question.psf.images(np.repeat(middle, n, axis=0), shape, which=which).sum(axis=(1, 2))
         # A learnt PSF's wings may be a little negative; light is not.
-        return np.maximum(images / light[:, None, None], 0.0), positions
+        return np.maximum(images / flux[:, None, None], 0.0), positions
     form: dict[str, Any] = {"shape": shape, "profile": question.profile, "size": question.size}
-    light = spots(middle, **form).sum()
+    flux = spots(middle, **form).sum()
     if question.d_over_r0:
         images, _ = speckled_spots(
             n,
@@ -142,4 +142,4 @@ def _even_spots(question: Question, n: int, rng: np.random.Generator) -> tuple[F
         )
     else:
         images = spots(positions, **form)
-    return images / light, positions
+    return images / flux, positions

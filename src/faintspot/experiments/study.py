@@ -50,7 +50,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "chosen_model_error": (("cell", "arm", "mode"), "1", "model error chosen"),
     "error_at_k": (("cell", "arm", "k"), "px", "R for every number of kept pixels, candidate as in best"),
     "error_at_k_se": (("cell", "arm", "k"), "px", "standard error of R for every number of kept pixels"),
-    "invalid_fraction": (("cell", "arm", "mode"), "1", "fraction of positions without light, taken as 0"),
+    "invalid_fraction": (("cell", "arm", "mode"), "1", "fraction of positions without flux, taken as 0"),
     "gain": (("cell", "arm", "mode"), "1", "slope of the estimate against the truth, x and y pooled"),
     "gain_se": (("cell", "arm", "mode"), "1", "standard error of the gain"),
     "rms": (("cell", "arm", "mode"), "px", "root of the mean of (dx^2 + dy^2) / 2"),

@@ -194,7 +194,7 @@ def gains_section(dataset: xarray.Dataset) -> Section:
         why = "No configuration of this study has the error 0.15 px within its fluxes."
         return Section("gains", title, missing=why)
     caption = (
-        "By how many times less light TV reaches R = 0.15 px than no denoising, with its 95 % interval. "
+        "By how many times less flux TV reaches R = 0.15 px than no denoising, with its 95 % interval. "
         "“Fixed”: both arms keep the same number of pixels. “–”: the error without denoising does not pass "
         "that level within the study."
     )

@@ -94,9 +94,9 @@ class Cell:
 
     @property
     def pixel_noise_e(self) -> float:
-        """Standard deviation of a mean pixel's noise: read noise and the light's, spread over all pixels."""
-        light = self.flux_e / self.pixels**2 + self.background_e
-        return float(np.sqrt(self.read_noise_e**2 + self.excess_noise * light))
+        """Standard deviation of a mean pixel's noise: read noise and the flux's, spread over all pixels."""
+        flux = self.flux_e / self.pixels**2 + self.background_e
+        return float(np.sqrt(self.read_noise_e**2 + self.excess_noise * flux))
 
     def seed(self, study_seed: int) -> np.random.SeedSequence:
         """Return the cell's own seed, from the study's seed and its coordinates alone."""

@@ -52,7 +52,7 @@ _TIE_ERRORS = 2.0  # standard errors of the difference within which two arms are
 _ERROR_TOLERANCE = 0.05  # of the standard errors, below which they need no factor
 _SEARCHED_E = (0.1, 1e7)  # electrons within which the limiting flux is sought
 _SEARCH_STEPS = 4  # fluxes that are added at a time
-_BOUND_SHARES = 9  # quantiles of the sub-apertures' light that the bound is averaged over
+_BOUND_SHARES = 9  # quantiles of the sub-apertures' flux that the bound is averaged over
 _TRAINING_SHARE = 0.75  # of the scored spots, to train each class on
 
 
@@ -212,7 +212,7 @@ class _Trial:
         """Choose an estimator's options on the first sample, and score it on the second."""
         scene = self._question.scene(flux_e)
         arm = arm_for_scene(kind, scene, psf=self._psf, score=score)
-        if arm.estimator.uses_light and self._question.light_is_known:
+        if arm.estimator.uses_flux and self._question.flux_is_known:
             arm = arm.with_options({"flux_e": float(f"{flux_e:.4g}")})
         return _chosen_and_scored(arm, tuned_options(arm, scene), self._spots, *samples)
 
@@ -303,7 +303,7 @@ def _trained(
 
 
 def _chosen_and_scored(
-    arm: Arm, axes: Mapping[str, Sequence[Any]], spots: SimulatedSpots, choosing: Sample, scoring: Sample
+    arm: Arm, axes: Mapping[str, Sequence[Any]], spots: SimulatedSpots, choosing: Sample, every_k: Sample
 ) -> _Scored:
     """Choose an arm's options on one sample, and score it on the other."""
 
@@ -315,12 +315,12 @@ def _chosen_and_scored(
     chosen = chosen.with_options(
         {"error_scale": _error_scale(spots.measure(choosing, chosen), choosing.truth)}
     )
-    slopes = spots.measure(scoring, chosen)
+    slopes = spots.measure(every_k, chosen)
     return _Scored(
         chosen,
-        absolute_errors(slopes.x, slopes.y, scoring.truth).ravel(),
-        slope_statistics(slopes.x, slopes.y, scoring.truth),
-        _by_blocks(slopes, scoring.truth),
+        absolute_errors(slopes.x, slopes.y, every_k.truth).ravel(),
+        slope_statistics(slopes.x, slopes.y, every_k.truth),
+        _by_blocks(slopes, every_k.truth),
     )
 
 
@@ -383,8 +383,8 @@ def _bound(question: Question, flux: Floats) -> Floats:
     if question.psf is not None:
         form = {"psf": question.psf}
     shares = np.ones(1)
-    if question.relative_light is not None:
-        shares = np.quantile(question.relative_light, (np.arange(_BOUND_SHARES) + 0.5) / _BOUND_SHARES)
+    if question.relative_flux is not None:
+        shares = np.quantile(question.relative_flux, (np.arange(_BOUND_SHARES) + 0.5) / _BOUND_SHARES)
     errors = cramer_rao(
         np.outer(flux, shares).ravel(),
         shape=question.shape,

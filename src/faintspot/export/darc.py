@@ -155,12 +155,12 @@ def _of_estimator(pipeline: SlopePipeline) -> Iterator[Parameter]:
 def _brightest(pipeline: SlopePipeline) -> NDArray[np.int64]:
     """Numbers of brightest pixels of every sub-aperture, with the sign that says what is taken off."""
     estimator, n, pixels = pipeline.settings.estimator, len(pipeline.layout), pipeline.layout.pixels
-    if pipeline.preparation.needs_light:
+    if pipeline.plan.needs_flux:
         raise InputError(
-            'estimator.keep_brightest = "auto": expected the light of the spots, settings.flux_e, of which '
+            'estimator.keep_brightest = "auto": expected the flux of the spots, settings.flux_e, of which '
             "their number follows"
         )
-    rank = pipeline.preparation.settings[0][gravity.RANK].astype(np.int64)
+    rank = pipeline.plan.settings[0][gravity.RANK].astype(np.int64)
     rules = estimator.values("rule", n, pixels)
     # Where the pixel of that rank is taken off, it is not kept.
     kept: NDArray[np.int64] = np.where(rules == "threshold", rank, 1 - rank)
@@ -175,7 +175,7 @@ def _centre(pipeline: SlopePipeline) -> WeightedCentre:
         return centre_of(pipeline, fixed_weights(pipeline))
     n = len(pipeline.layout)
     same = np.ones((n, *pipeline.layout.window))
-    return WeightedCentre(same, np.ones((n, 2)), pipeline.preparation.sensor.zero)
+    return WeightedCentre(same, np.ones((n, 2)), pipeline.plan.sensor.zero)
 
 
 def _slope_gain(pipeline: SlopePipeline) -> NDArray[np.float32]:

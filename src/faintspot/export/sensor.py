@@ -62,7 +62,7 @@ def fixed_weights(pipeline: SlopePipeline) -> FixedWeights:
     Raises
     ------
     InputError
-        For another estimator, which has none, and for sums that are not divided by the light.
+        For another estimator, which has none, and for sums that are not divided by the flux.
     """
     estimator = pipeline.settings.estimator
     if not isinstance(estimator, Window):
@@ -72,9 +72,9 @@ def fixed_weights(pipeline: SlopePipeline) -> FixedWeights:
         )
     if estimator.normalisation == NONE:
         raise InputError('estimator.normalisation = "none": expected "mean" or "frame"')
-    found: FixedWeights = pipeline.preparation.prepared.weights  # type: ignore[attr-defined]
+    found: FixedWeights = pipeline.plan.prepared.weights  # type: ignore[attr-defined]
     kinds = found.kinds(len(pipeline.layout))
-    return FixedWeights(*(maps[kinds] for maps in (found.x, found.y, found.mean_spot, found.light)))
+    return FixedWeights(*(maps[kinds] for maps in (found.x, found.y, found.mean_spot, found.flux)))
 
 
 def offsets_of(pipeline: SlopePipeline) -> Floats:
@@ -82,7 +82,7 @@ def offsets_of(pipeline: SlopePipeline) -> Floats:
 
     Weights that were given are around the sub-apertures' centres, Gaussian windows around the references.
     """
-    sensor = pipeline.preparation.sensor
+    sensor = pipeline.plan.sensor
     given = isinstance(sensor.score, FixedWeights)
     return sensor.zero - sensor.layout.offsets if given else np.zeros_like(sensor.zero)
 

@@ -28,9 +28,9 @@ def export_weights(
     - CORNERS (n, 2), int32: row and column of each window's first pixel, counted from 0;
     - WEIGHTS: of a centre of gravity c of weighted pixels, the largest 1; GAIN and REFERENCE (n, 2), x and y:
       the slope is gain (c - reference), c and reference counted from the window's middle, px;
-    - LINEAR_X, LINEAR_Y, MEAN_SPOT: the same as sums, for light that is known: the slope is the sum of
-      LINEAR_X times (pixels over light - MEAN_SPOT) less OFFSET, px;
-    - LIGHT: the sum of LIGHT times the pixels is the light;
+    - LINEAR_X, LINEAR_Y, MEAN_SPOT: the same as sums, for flux that is known: the slope is the sum of
+      LINEAR_X times (pixels over flux - MEAN_SPOT) less OFFSET, px;
+    - FLUX: the sum of FLUX times the pixels is the flux;
     - OFFSET (n, 2): what references add to the sums' slopes.
 
     WEIGHTS, GAIN and REFERENCE are absent for weights that are none of one centre of gravity.
@@ -70,7 +70,7 @@ def export_weights(
     except InputError:
         pass  # they are no centre of gravity, and still sums
     images |= {"LINEAR_X": weights.x, "LINEAR_Y": weights.y, "MEAN_SPOT": weights.mean_spot}
-    images |= {"LIGHT": weights.light, "OFFSET": offsets_of(pipeline)}
+    images |= {"FLUX": weights.flux, "OFFSET": offsets_of(pipeline)}
     primary = fits.PrimaryHDU()
     primary.header["CREATOR"] = "faintspot"
     written = [primary]

@@ -46,12 +46,12 @@ from faintspot.kernels.spot_rows import (
     WEIGHT_VARIANCE,
 )
 
-_LEAST_LEFT = 1e-5  # of the information on the light: less is round-off, the spot looks like a constant
+_LEAST_LEFT = 1e-5  # of the information on the flux: less is round-off, the spot looks like a constant
 
 
 @compiled
-def subtract_background(lanes: Any, image: Any, pixels: Any, light: Any) -> None:
-    """Subtract from every lane's image the constant that leaves it `light` (a vector, electrons)."""
+def subtract_background(lanes: Any, image: Any, pixels: Any, flux: Any) -> None:
+    """Subtract from every lane's image the constant that leaves it `flux` (a vector, electrons)."""
     width = width_of(lanes)
     even, odd = splat(lanes, 0.0), splat(lanes, 0.0)  # neither addition waits for the other
     for i in range(0, pixels - 1, 2):
@@ -59,14 +59,14 @@ def subtract_background(lanes: Any, image: Any, pixels: Any, light: Any) -> None
         odd = odd + load(lanes, image, (i + 1) * width)
     if pixels % 2 == 1:
         even = even + load(lanes, image, (pixels - 1) * width)
-    level = (even + odd - light) * splat(lanes, 1.0 / pixels)
+    level = (even + odd - flux) * splat(lanes, 1.0 / pixels)
     for i in range(pixels):
         store(image, i * width, load(lanes, image, i * width) - level)
 
 
 @compiled
 def eliminate_background(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
-    """Turn the sums of a fit of x, y and the light into those of a fit that has a constant as well.
+    """Turn the sums of a fit of x, y and the flux into those of a fit that has a constant as well.
 
     Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
     """
@@ -91,12 +91,12 @@ def eliminate_background(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any
                 mx = multiply_add(load(lanes, profiles, (along + padded) * width), fy, mx)
                 my = multiply_add(fx, load(lanes, profiles, (across + padded) * width), my)
             m = flux * m
-            light = maximum(m, zero)
-            w = reciprocal(multiply_add(light, multiply_add(light, model_error, we), wv))
+            expected = maximum(m, zero)
+            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), wv))
             s = multiply_add(w, load(lanes, image, (y * nx + x) * width) - m, s)
             i, im = i + w, multiply_add(w, m, im)
             ix, iy = multiply_add(w, mx, ix), multiply_add(w, my, iy)
-            wt = w * (w * multiply_add(light, e, v))
+            wt = w * (w * multiply_add(expected, e, v))
             j, jm = j + wt, multiply_add(wt, m, jm)
             jx, jy = multiply_add(wt, mx, jx), multiply_add(wt, my, jy)
     inverse = splat(lanes, 1.0) / maximum(i, splat(lanes, 1e-30))

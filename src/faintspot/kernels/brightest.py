@@ -210,11 +210,11 @@ def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, lane_val
     """Write SUM, X and Y, (0, 0) where the sum is not positive; return 1 / SUM, or 1."""
     width = width_of(lanes)
     zero, one = splat(lanes, 0.0), splat(lanes, 1.0)
-    lit = total > zero
-    inverse = one / select(lit, total, one)
+    illuminated = total > zero
+    inverse = one / select(illuminated, total, one)
     store(lane_values, SUM * width, total)
-    store(lane_values, X * width, select(lit, moment_x * inverse, zero))
-    store(lane_values, Y * width, select(lit, moment_y * inverse, zero))
+    store(lane_values, X * width, select(illuminated, moment_x * inverse, zero))
+    store(lane_values, Y * width, select(illuminated, moment_y * inverse, zero))
     return inverse
 
 
@@ -281,7 +281,7 @@ def _store_error(
     """Write a standard error, from the noise's moments about the window's middle."""
     width = width_of(lanes)
     at = load(lanes, lane_values, position * width)
-    # Within a pixel, where in it the light is, is not known: px^2 / 12.
+    # Within a pixel, where in it the flux is, is not known: px^2 / 12.
     around = multiply_add(noise, multiply_add(at, at, splat(lanes, 1.0 / 12.0)), second)
     around = multiply_add(first, splat(lanes, -2.0) * at, around)
     store(lane_values, error * width, square_root(maximum(around, splat(lanes, 0.0))) * inverse)

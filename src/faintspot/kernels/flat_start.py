@@ -229,15 +229,15 @@ def start_flat(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, table: Any, 
     _solve_laplace(lanes, state, rows, ny, nx, table)
     inverse = inverse_radius * splat(lanes, math.sqrt(ny * nx) / FIRST_GUESS)
     norm, slope = _norm_and_slope(lanes, rows, ny, nx, twice * inverse)
-    lit = norm > zero
-    norm = half * square_root(select(lit, norm, one))
+    illuminated = norm > zero
+    norm = half * square_root(select(illuminated, norm, one))
     radius = one / inverse_radius
     steepness = half * half * slope / (norm * inverse)
     denominator = maximum(radius - steepness, splat(lanes, LEAST_SLOPE) * radius)
     better = inverse + (norm - radius * inverse) / denominator
     better = minimum(better, splat(lanes, LARGEST_STEP) * inverse)
     better = maximum(better, splat(lanes, 1.0 / LARGEST_STEP) * inverse)
-    inverse = select(lit, better, inverse)
+    inverse = select(illuminated, better, inverse)
     for y in range(ny):
         for x in range(nx):
             px, py = _field(lanes, rows, y, x, ny, nx, twice * inverse)

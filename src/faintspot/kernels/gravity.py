@@ -17,7 +17,7 @@ from faintspot.kernels.groups import (
     ERROR_Y,
     EXCESS,
     FLUX,
-    NO_LIGHT,
+    NO_FLUX,
     TOO_MANY_BAD_PIXELS,
     VARIANCE,
     X,
@@ -180,22 +180,22 @@ def _flag_lane(
             bits |= INFEASIBLE_STRENGTH
         if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:
             bits |= NOT_CONVERGED
-    light, largest = centroid[brightest.SUM * width + lane], centroid[brightest.LARGEST * width + lane]
+    flux, largest = centroid[brightest.SUM * width + lane], centroid[brightest.LARGEST * width + lane]
     x, y = centroid[brightest.X * width + lane], centroid[brightest.Y * width + lane]
-    scratch.flags[lane] = bits | lightless(ny, nx, bits, light, settings[FLOOR, s] * largest, x, y)
+    scratch.flags[lane] = bits | lightless(ny, nx, bits, flux, settings[FLOOR, s] * largest, x, y)
     scratch.iterations[lane] = counts[total_variation.ITERATIONS * width + lane]
 
 
 @compiled
-def lightless(ny: Any, nx: Any, bits: Any, light: Any, floor: Any, x: Any, y: Any) -> Any:
-    """NO_LIGHT where nothing usable was left of an image that is not invalid for another reason, else 0.
+def lightless(ny: Any, nx: Any, bits: Any, flux: Any, floor: Any, x: Any, y: Any) -> Any:
+    """NO_FLUX where nothing usable was left of an image that is not invalid for another reason, else 0.
 
     A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
     """
     inside = abs(x) <= 0.5 * nx and abs(y) <= 0.5 * ny
-    if bits & TOO_MANY_BAD_PIXELS or (light > floor and inside):
+    if bits & TOO_MANY_BAD_PIXELS or (flux > floor and inside):
         return 0
-    return NO_LIGHT
+    return NO_FLUX
 
 
 gravity_of_groups = driver_of(locate_gravity)

@@ -21,7 +21,7 @@ from faintspot.kernels.host import aligned_zeros
 from faintspot.kernels.simd import Lanes, load, maximum, select, splat, store, width_of
 from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
-NO_LIGHT = int(SubapertureFlag.NO_LIGHT)
+NO_FLUX = int(SubapertureFlag.NO_FLUX)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
 BAD_PIXELS = int(SubapertureFlag.BAD_PIXELS)
 SATURATED = int(SubapertureFlag.SATURATED)
@@ -37,7 +37,7 @@ LIMIT_ROUNDING_PX = 1e-4
 ZERO_X, ZERO_Y, RANGE, MOST_BAD, VARIANCE, EXCESS, ERROR_SCALE = range(7)
 COMMON_ROWS = 7
 
-# Rows of a group's results (RESULT_ROWS, W): position (px from the window's middle), light (e-), standard
+# Rows of a group's results (RESULT_ROWS, W): position (px from the window's middle), flux (e-), standard
 # errors.
 X, Y, FLUX, ERROR_X, ERROR_Y = range(5)
 RESULT_ROWS = 5
@@ -189,7 +189,7 @@ def store_slope(
     f: Any, s: Any, settings: Any, x: Any, y: Any, error_x: Any, error_y: Any, bits: Any, slopes: Any
 ) -> None:
     """Write position, flags and standard errors of one sub-aperture; the reference where it is invalid."""
-    valid = bits & (NO_LIGHT | TOO_MANY_BAD_PIXELS) == 0
+    valid = bits & (NO_FLUX | TOO_MANY_BAD_PIXELS) == 0
     reach = settings[RANGE, s]
     away_x, away_y = x - settings[ZERO_X, s], y - settings[ZERO_Y, s]
     slopes.x[f, s] = within(away_x, reach) if valid else 0.0
@@ -288,7 +288,7 @@ def copied(template: Any, kernel: Any, **replaced: Any) -> Any:
 
 
 @compiled
-def light_of_groups(source: Any, start: Any, stop: Any, scratch: Any, light: Any) -> None:
+def flux_of_groups(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
     """Sum the pixels of every sub-aperture, electrons, bad ones as 0, into (n_frames, n_subapertures)."""
     lanes = source.lanes
     width = width_of(lanes)
@@ -303,12 +303,12 @@ def light_of_groups(source: Any, start: Any, stop: Any, scratch: Any, light: Any
             total = total + select(g >= g, g, zero)
         store(scratch.results, 0, total)
         for lane in range(min(width, n - first)):
-            light[f, first + lane] = scratch.results[lane]
+            flux[f, first + lane] = scratch.results[lane]
 
 
 @compiled
-def light_above_edges(source: Any, start: Any, stop: Any, scratch: Any, light: Any) -> None:
-    """As `light_of_groups`, above the mean of the outermost pixels of each sub-aperture."""
+def flux_above_edges(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
+    """As `flux_of_groups`, above the mean of the outermost pixels of each sub-aperture."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
     n = source.corners.shape[0]
@@ -329,4 +329,4 @@ def light_above_edges(source: Any, start: Any, stop: Any, scratch: Any, light: A
                     inner, inner_count = inner + value, inner_count + count
         store(scratch.results, 0, inner - inner_count * (edge / maximum(edge_count, one)))
         for lane in range(min(width, n - first)):
-            light[f, first + lane] = scratch.results[lane]
+            flux[f, first + lane] = scratch.results[lane]

@@ -1,4 +1,4 @@
-"""Position and light of a spot by Fisher scoring: maximum likelihood, with a prior, or least squares.
+"""Position and flux of a spot by Fisher scoring: maximum likelihood, with a prior, or least squares.
 
 The image g has mean m = F f(u - x), f the PSF, and variance VARIANCE + EXCESS m; pixels are weighted with
 w = 1 / (WEIGHT_VARIANCE + WEIGHT_EXCESS m + MODEL_ERROR m^2). Parameters are x, y and the logarithm of F.
@@ -63,8 +63,8 @@ from faintspot.kernels.spot_rows import (
 )
 
 LARGEST_MOVE_PX = 1.0
-LARGEST_FACTOR = 2.0  # on the light, in one step
-LEAST_LIGHT_E = 1e-2
+LARGEST_FACTOR = 2.0  # on the flux, in one step
+LEAST_FLUX_E = 1e-2
 
 
 @compiled
@@ -89,13 +89,13 @@ def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lan
         for x in range(nx):
             fx, dx = load(lanes, profiles, x * width), load(lanes, profiles, (padded + x) * width)
             m = fx * fy
-            light = maximum(m, zero)
-            w = reciprocal(multiply_add(light, multiply_add(light, model_error, we), wv))
+            expected = maximum(m, zero)
+            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), wv))
             r = load(lanes, image, (y * nx + x) * width) - m
             wf, wd = w * fx, w * dx
             s0, s1 = multiply_add(r, wf, s0), multiply_add(r, wd, s1)
             i0, i1, i2 = multiply_add(wf, fx, i0), multiply_add(wd, fx, i1), multiply_add(wd, dx, i2)
-            wt = w * multiply_add(light, e, v)
+            wt = w * multiply_add(expected, e, v)
             tf, td = wt * wf, wt * wd
             j0, j1, j2 = multiply_add(tf, fx, j0), multiply_add(td, fx, j1), multiply_add(td, dx, j2)
         sx, sy, sf = multiply_add(s1, fy, sx), multiply_add(s0, dy, sy), multiply_add(s0, fy, sf)
@@ -138,14 +138,14 @@ def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_
                 )
                 m, mx, my = multiply_add(fx, fy, m), multiply_add(dx, fy, mx), multiply_add(fx, dy, my)
             m, mx, my = flux * m, flux * mx, flux * my
-            light = maximum(m, zero)
-            w = reciprocal(multiply_add(light, multiply_add(light, model_error, we), wv))
+            expected = maximum(m, zero)
+            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), wv))
             wr = w * (load(lanes, image, (y * nx + x) * width) - m)
             sx, sy, sf = multiply_add(wr, mx, sx), multiply_add(wr, my, sy), multiply_add(wr, m, sf)
             wx, wy, wm = w * mx, w * my, w * m
             ixx, iyy, iff = multiply_add(wx, mx, ixx), multiply_add(wy, my, iyy), multiply_add(wm, m, iff)
             ixy, ixf, iyf = multiply_add(wx, my, ixy), multiply_add(wx, m, ixf), multiply_add(wy, m, iyf)
-            wt = w * multiply_add(light, e, v)
+            wt = w * multiply_add(expected, e, v)
             wx, wy, wm = wt * wx, wt * wy, wt * wm
             jxx, jyy, jff = multiply_add(wx, mx, jxx), multiply_add(wy, my, jyy), multiply_add(wm, m, jff)
             jxy, jxf, jyf = multiply_add(wx, my, jxy), multiply_add(wx, m, jxf), multiply_add(wy, m, jyf)
@@ -208,7 +208,7 @@ def _move(lanes: Any, lane_values: Any) -> None:
         load(lanes, lane_values, I_XF * width),
         load(lanes, lane_values, I_YF * width),
     )
-    # The light is eliminated first, then y; a lane without information does not move.
+    # The flux is eliminated first, then y; a lane without information does not move.
     inverse_ff = one / maximum(load(lanes, lane_values, I_FF * width), tiny)
     cx, cy = ixf * inverse_ff, iyf * inverse_ff
     bx = load(lanes, lane_values, SCORE_X * width) - cx * sf
@@ -224,7 +224,7 @@ def _move(lanes: Any, lane_values: Any) -> None:
     sound = minimum(left - splat(lanes, 1e-5) * axx, ayy) > zero
     dx = select(sound, (bx - slope * by) / maximum(left, tiny), zero)
     dy = select(sound, (by - axy * dx) / maximum(ayy, tiny), zero)
-    # A step is too long by how much more light there is than the model has: linear is only their product.
+    # A step is too long by how much more flux there is than the model has: linear is only their product.
     growth = maximum((sf - ixf * dx - iyf * dy) * inverse_ff, one)
     dx, dy = dx / growth, dy / growth
     most, least = splat(lanes, LARGEST_MOVE_PX), splat(lanes, -LARGEST_MOVE_PX)
@@ -239,12 +239,12 @@ def _move(lanes: Any, lane_values: Any) -> None:
     )
     store(lane_values, X * width, x)
     store(lane_values, Y * width, y)
-    store(lane_values, FLUX * width, maximum(flux * factor, splat(lanes, LEAST_LIGHT_E)))
+    store(lane_values, FLUX * width, maximum(flux * factor, splat(lanes, LEAST_FLUX_E)))
 
 
 @compiled
 def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
-    """Write what a lane's sums, made with light `flux`, say: the light seen, and the standard errors.
+    """Write what a lane's sums, made with light `flux`, say: the flux seen, and the standard errors.
 
     Those are the square roots of the diagonal of A^-1 (J + prior) A^-1, A = I + prior.
     """
@@ -256,7 +256,7 @@ def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
     lane_values[SEEN_ERROR * width + lane] = math.inf
     if not iff > 0.0:
         return
-    # The model is proportional to the light: sum w g m / sum w m^2 is the light that fits best.
+    # The model is proportional to the flux: sum w g m / sum w m^2 is the flux that fits best.
     lane_values[SEEN * width + lane] = flux * (1.0 + lane_values[SCORE_F * width + lane] / iff)
     lane_values[SEEN_ERROR * width + lane] = flux / math.sqrt(iff)
     cx, cy = lane_values[I_XF * width + lane] / iff, lane_values[I_YF * width + lane] / iff
@@ -266,7 +266,7 @@ def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
     determinant = axx * ayy - axy * axy
     if not determinant > 1e-5 * axx * ayy:
         return
-    # With the light eliminated, the score is s - c s_F; so its covariance is
+    # With the flux eliminated, the score is s - c s_F; so its covariance is
     jxf, jyf, jff = (
         lane_values[J_XF * width + lane],
         lane_values[J_YF * width + lane],
@@ -296,7 +296,7 @@ def fit_group(
     starts: Any,
     profiles: Any,
 ) -> None:
-    """Fit position and light of the W spots of a group.
+    """Fit position and flux of the W spots of a group.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def fit_group(
     background : bool
         Whether a constant is fitted along.
     lane_values : (LANE_ROWS * W,)
-        The start (X, Y, FLUX) and everything marked "in" is read; position, light, errors and
+        The start (X, Y, FLUX) and everything marked "in" is read; position, flux, errors and
         what is SEEN are written.
     """
     width = width_of(lanes)

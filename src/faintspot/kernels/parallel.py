@@ -37,7 +37,7 @@ OwnScratch = Callable[[Lanes, int, int], tuple[Any, ...]]
 def _thread_scratch(lanes: Lanes, window: tuple[int, int], own: OwnScratch) -> Scratch:
     """Return the scratch of the calling thread, made anew only when the shape of the work changes.
 
-    Two shapes are remembered: a pipeline may look at the light of a frame before it measures it.
+    Two shapes are remembered: a pipeline may look at the flux of a frame before it measures it.
     """
     key = (lanes, window, own)
     known: dict[Any, Scratch] = vars(_local).setdefault("known", {})

@@ -1,6 +1,6 @@
-"""The posterior of a spot's position on a grid: at very low light it is far from a normal distribution.
+"""The posterior of a spot's position on a grid: at very low flux it is far from a normal distribution.
 
-With the light F known, the logarithm of the (quasi-)likelihood of an image g at a position p is linear in g,
+With the flux F known, the logarithm of the (quasi-)likelihood of an image g at a position p is linear in g,
 sum g k_p + c_p: a scalar product with a table for every position. For pixels of variance v + e m,
 k_p = log(1 + e m_p / v) / e and c_p = sum v / e^2 log(1 + e m_p / v) - m_p / e.
 """

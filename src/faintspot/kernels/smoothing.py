@@ -1,4 +1,4 @@
-"""Gaussian smoothing of a group of W sub-apertures; outside of the window there is no light."""
+"""Gaussian smoothing of a group of W sub-apertures; outside of the window there is no flux."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # In: allowed positions, px.
 LOW_X, HIGH_X, LOW_Y, HIGH_Y = range(4)
-# State and result: position (px), light (electrons), what of the position is not in the looked-up profiles.
+# State and result: position (px), flux (electrons), what of the position is not in the looked-up profiles.
 X, Y, FLUX, REST_X, REST_Y = range(4, 9)
 # In: variance of a pixel that collects m: VARIANCE + EXCESS * m; what is weighted with:
 # WEIGHT_VARIANCE + WEIGHT_EXCESS * m + MODEL_ERROR * m^2.
@@ -15,12 +15,12 @@ PRIOR_X, PRIOR_Y, PRIOR_WEIGHT = range(14, 17)
 SCORE_X, SCORE_Y, SCORE_F = range(17, 20)
 I_XX, I_YY, I_FF, I_XY, I_XF, I_YF = range(20, 26)
 J_XX, J_YY, J_FF, J_XY, J_XF, J_YF = range(26, 32)
-# Out: standard errors, px; light that the image itself gives, whatever was expected, and its standard error.
+# Out: standard errors, px; flux that the image itself gives, whatever was expected, and its standard error.
 ERROR_X, ERROR_Y, SEEN, SEEN_ERROR = range(32, 36)
-# In: what a spot's peak, smoothed, has of its light; factor on the steps of the weighted centre of gravity.
-START_LIGHT, GAIN_X, GAIN_Y = range(36, 39)
+# In: what a spot's peak, smoothed, has of its flux; factor on the steps of the weighted centre of gravity.
+START_FLUX, GAIN_X, GAIN_Y = range(36, 39)
 # Of the posterior on a grid of positions: mean, standard deviation, px, and the grid's spacing.
 MEAN_X, MEAN_Y, SPREAD_X, SPREAD_Y, SPACING = range(39, 44)
-# Where the smoothed image peaks, and the light that it shows there.
+# Where the smoothed image peaks, and the flux that it shows there.
 PEAK_X, PEAK_Y, PEAK_FLUX = range(44, 47)
 LANE_ROWS = 47

@@ -8,9 +8,9 @@ from typing import Any
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.simd import load, maximum, minimum, select, splat, store, width_of
 from faintspot.kernels.smoothing import smooth_pixel
-from faintspot.kernels.spot_rows import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, START_LIGHT, X, Y
+from faintspot.kernels.spot_rows import FLUX, HIGH_X, HIGH_Y, LOW_X, LOW_Y, START_FLUX, X, Y
 
-LEAST_LIGHT_E = 1.0  # an estimate of the light below this says nothing
+LEAST_FLUX_E = 1.0  # an estimate of the flux below this says nothing
 
 
 @compiled
@@ -31,7 +31,7 @@ def find_start(
 ) -> None:
     """Write X, Y and FLUX of every lane: its largest smoothed pixel within the allowed positions.
 
-    Of equal ones the first. FLUX follows from what such a pixel has of a spot's light, START_LIGHT.
+    Of equal ones the first. FLUX follows from what such a pixel has of a spot's flux, START_FLUX.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def find_start(
             larger = value > best
             best = select(larger, value, best)
             best_x, best_y = select(larger, u, best_x), select(larger, v, best_y)
-    light = best / load(lanes, lane_values, START_LIGHT * width)
+    flux = best / load(lanes, lane_values, START_FLUX * width)
     store(lane_values, X * width, minimum(maximum(best_x, low_x), high_x))
     store(lane_values, Y * width, minimum(maximum(best_y, low_y), high_y))
-    store(lane_values, FLUX * width, maximum(light, splat(lanes, LEAST_LIGHT_E)))
+    store(lane_values, FLUX * width, maximum(flux, splat(lanes, LEAST_FLUX_E)))

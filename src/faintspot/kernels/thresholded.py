@@ -30,7 +30,7 @@ from faintspot.kernels.simd import (
 )
 from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
-_WITHIN = 1.0 / 12.0  # of the light in a pixel, where in it is not known: px^2
+_WITHIN = 1.0 / 12.0  # of the flux in a pixel, where in it is not known: px^2
 
 
 class RowTables(NamedTuple):
@@ -87,7 +87,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     noise, noise_x, noise_xx, noise_y, noise_yy = zero, zero, zero, zero, zero
     for x in range(0, nx, width):
         column = load(pixels, ramp, x)
-        light, light_y, part, part_y, part_yy = zero, zero, zero, zero, zero
+        flux, flux_y, part, part_y, part_yy = zero, zero, zero, zero, zero
         row = splat(pixels, -0.5 * (ny - 1))
         for y in range(ny):
             here = corner + y * line + x
@@ -97,16 +97,16 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
             largest = maximum(absolute(value), largest)
             spoilt = multiply_add(value, zero, spoilt)  # 0, or NaN where a value is not finite
             left = select(value >= threshold, value - threshold, zero)
-            light = light + left
-            light_y = multiply_add(left, row, light_y)
+            flux = flux + left
+            flux_y = multiply_add(left, row, flux_y)
             variance = select(left > zero, multiply_add(maximum(value, zero), e, v), zero)
             part = part + variance
             variance_y = variance * row
             part_y = part_y + variance_y
             part_yy = multiply_add(variance_y, row, part_yy)
             row = row + one
-        total, moment_y = total + light, moment_y + light_y
-        moment_x = multiply_add(light, column, moment_x)
+        total, moment_y = total + flux, moment_y + flux_y
+        moment_x = multiply_add(flux, column, moment_x)
         noise, noise_y, noise_yy = noise + part, noise_y + part_y, noise_yy + part_yy
         part_x = part * column
         noise_x = noise_x + part_x
@@ -114,10 +114,10 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     good = select(spoilt >= zero, select(largest <= splat(pixels, LARGEST_FLOAT32), zero, one), one)
     if any_lane(good > zero):
         return False
-    light = sum_of(total)
+    flux = sum_of(total)
     position_x = position_y = deviation_x = deviation_y = np.float32(0.0)
-    if light > 0.0:
-        scale = np.float32(1.0) / light
+    if flux > 0.0:
+        scale = np.float32(1.0) / flux
         position_x, position_y = sum_of(moment_x) * scale, sum_of(moment_y) * scale
         # Second moments about the centre of gravity, from those about the window's middle.
         here = splat(pixels, -2.0 * position_x)
@@ -129,9 +129,9 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
         around = multiply_add(noise, splat(pixels, position_y * position_y + _WITHIN), around)
         deviation_y = _root(sum_of(around)) * scale
     bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
-    bits |= lightless(ny, nx, bits, light, settings[FLOOR, s] * largest_of(largest), position_x, position_y)
+    bits |= lightless(ny, nx, bits, flux, settings[FLOOR, s] * largest_of(largest), position_x, position_y)
     slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
-    slopes.flux[f, s] = light
+    slopes.flux[f, s] = flux
     store_slope(f, s, settings, position_x, position_y, deviation_x, deviation_y, bits, slopes)
     return True
 

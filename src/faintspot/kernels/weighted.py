@@ -28,7 +28,7 @@ from faintspot.kernels.spot_rows import (
 
 LARGEST_MOVE_PX = 1.0
 SMALLEST_VARIANCE = 1e-4  # of a pixel, electrons squared
-LEAST_FRACTION = 0.05  # of the light at the start: less under the weight would only amplify noise
+LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would only amplify noise
 
 
 @compiled
@@ -87,17 +87,17 @@ def _store_errors(
             dark_x = multiply_add(square * away_x, away_x, dark_x)
             dark_y = multiply_add(square * away_y, away_y, dark_y)
     least = splat(lanes, SMALLEST_VARIANCE)
-    lit = total > floor
+    illuminated = total > floor
     inverse = splat(lanes, 1.0) / maximum(total, floor)
     gain_x, gain_y = load(lanes, lane_values, GAIN_X * width), load(lanes, lane_values, GAIN_Y * width)
     unknown = splat(lanes, math.inf)
-    # Pixels that noise has made negative must not take away more than the light's own noise.
+    # Pixels that noise has made negative must not take away more than the flux's own noise.
     noise_x = maximum(noise_x, maximum(v, least) * dark_x)
     noise_y = maximum(noise_y, maximum(v, least) * dark_y)
     error_x = gain_x * gain_x * inverse * inverse * noise_x
     error_y = gain_y * gain_y * inverse * inverse * noise_y
-    store(lane_values, ERROR_X * width, select(lit, error_x, unknown))
-    store(lane_values, ERROR_Y * width, select(lit, error_y, unknown))
+    store(lane_values, ERROR_X * width, select(illuminated, error_x, unknown))
+    store(lane_values, ERROR_Y * width, select(illuminated, error_y, unknown))
     store(lane_values, SEEN * width, total)
     store(lane_values, SEEN_ERROR * width, maximum(noise, least))
     for lane in range(width):

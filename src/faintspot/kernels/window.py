@@ -17,7 +17,7 @@ from faintspot.kernels import groups
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     COMMON_ROWS,
-    NO_LIGHT,
+    NO_FLUX,
     SATURATED,
     TOO_MANY_BAD_PIXELS,
     Task,
@@ -41,16 +41,16 @@ from faintspot.kernels.simd import (
 from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 # Rows of the settings' table that follow the common ones: what the sums are divided by (0: the frame's own
-# light; negative: not measurable); position of a sum of 0; what a light of 1 e- at the reference adds to the
-# sums; variance of the sums in the dark and for a light of 1 e-; the same of the light under the weights.
+# light; negative: not measurable); position of a sum of 0; what a flux of 1 e- at the reference adds to the
+# sums; variance of the sums in the dark and for a flux of 1 e-; the same of the flux under the weights.
 DIVISOR, HOME_X, HOME_Y, OFFSET_X, OFFSET_Y = range(COMMON_ROWS, COMMON_ROWS + 5)
-DARK_X, DARK_Y, PHOTON_X, PHOTON_Y, DARK_LIGHT, PHOTON_LIGHT = range(COMMON_ROWS + 5, COMMON_ROWS + 11)
+DARK_X, DARK_Y, PHOTON_X, PHOTON_Y, DARK_FLUX, PHOTON_FLUX = range(COMMON_ROWS + 5, COMMON_ROWS + 11)
 SETTING_ROWS = COMMON_ROWS + 11
 
-X, Y, LIGHT = range(3)
+X, Y, FLUX = range(3)
 """Which weights, of those of a pixel."""
 LEAST_SIGNIFICANCE = 1.0
-"""Light of a frame that is less significant than this many standard deviations divides nothing."""
+"""Flux of a frame that is less significant than this many standard deviations divides nothing."""
 
 
 class WindowTables(NamedTuple):
@@ -95,7 +95,7 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     lanes, nx, image, found = group.lanes, group.nx, scratch.image, scratch.results
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
-    sum_x, sum_y, light = zero, zero, zero
+    sum_x, sum_y, flux = zero, zero, zero
     place = group.first * tables.rows * tables.columns * 3
     for y in range(tables.top, tables.top + tables.rows):
         row_x, row_y, row = zero, zero, zero  # a sum for each row: they need not wait for each other
@@ -103,12 +103,12 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
             g = load(lanes, image, (y * nx + x) * width)
             row_x = multiply_add(g, load(lanes, tables.weights, place + X * width), row_x)
             row_y = multiply_add(g, load(lanes, tables.weights, place + Y * width), row_y)
-            row = multiply_add(g, load(lanes, tables.weights, place + LIGHT * width), row)
+            row = multiply_add(g, load(lanes, tables.weights, place + FLUX * width), row)
             place += 3 * width
-        sum_x, sum_y, light = sum_x + row_x, sum_y + row_y, light + row
+        sum_x, sum_y, flux = sum_x + row_x, sum_y + row_y, flux + row
     store(found, groups.X * width, sum_x)
     store(found, groups.Y * width, sum_y)
-    store(found, groups.FLUX * width, light)
+    store(found, groups.FLUX * width, flux)
     for lane in range(width):
         s = min(group.first + lane, group.settings.shape[1] - 1)
         x, y, seen, error_x, error_y, usable = _solved(
@@ -122,27 +122,27 @@ def locate_window(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         found[groups.FLUX * width + lane] = seen
         found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
         if not usable and not scratch.flags[lane] & TOO_MANY_BAD_PIXELS:
-            scratch.flags[lane] |= NO_LIGHT
+            scratch.flags[lane] |= NO_FLUX
         scratch.iterations[lane] = 0
 
 
 @compiled
 def _solved(settings: Any, s: Any, sum_x: Any, sum_y: Any, seen: Any) -> Any:
-    """Turn sums into position, light, standard errors, and whether they are good for anything."""
+    """Turn sums into position, flux, standard errors, and whether they are good for anything."""
     divisor = settings[DIVISOR, s]
-    light = divisor
+    flux = divisor
     usable = divisor > 0.0
     if divisor == 0.0:
-        light = max(seen, np.float32(0.0))
-        variance = settings[DARK_LIGHT, s] + settings[PHOTON_LIGHT, s] * light
+        flux = max(seen, np.float32(0.0))
+        variance = settings[DARK_FLUX, s] + settings[PHOTON_FLUX, s] * flux
         usable = seen > LEAST_SIGNIFICANCE * math.sqrt(variance)
         divisor = seen
     usable = usable and abs(sum_x) + abs(sum_y) + abs(seen) < math.inf  # False for NaN, too
     inverse = np.float32(1.0) / divisor if usable else np.float32(0.0)
     x = settings[HOME_X, s] + (sum_x * inverse - settings[OFFSET_X, s])
     y = settings[HOME_Y, s] + (sum_y * inverse - settings[OFFSET_Y, s])
-    error_x = math.sqrt(settings[DARK_X, s] + settings[PHOTON_X, s] * light) * inverse
-    error_y = math.sqrt(settings[DARK_Y, s] + settings[PHOTON_Y, s] * light) * inverse
+    error_x = math.sqrt(settings[DARK_X, s] + settings[PHOTON_X, s] * flux) * inverse
+    error_y = math.sqrt(settings[DARK_Y, s] + settings[PHOTON_Y, s] * flux) * inverse
     usable = usable and abs(x) + abs(y) + error_x + error_y < math.inf
     return x, y, seen if abs(seen) < math.inf else np.float32(0.0), error_x, error_y, usable
 
@@ -186,7 +186,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     rows, vectors = tables.weights.shape[1], tables.weights.shape[2]
     corner = (corners[s, 0] + tables.top) * line + corners[s, 1] + tables.left
     zero = splat(pixels, 0.0)
-    sum_x, sum_y, light, spoilt, largest, brightest = zero, zero, zero, zero, zero, splat(pixels, -math.inf)
+    sum_x, sum_y, flux, spoilt, largest, brightest = zero, zero, zero, zero, zero, splat(pixels, -math.inf)
     level = splat(pixels, tables.level[s])
     place = s * rows * vectors * 3 * width
     for y in range(rows):
@@ -198,7 +198,7 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
             spoilt = multiply_add(g, zero, spoilt)  # 0, or NaN where a value is not finite
             sum_x = multiply_add(g, load(pixels, tables.weights, place + X * width), sum_x)
             sum_y = multiply_add(g, load(pixels, tables.weights, place + Y * width), sum_y)
-            light = multiply_add(g, load(pixels, tables.weights, place + LIGHT * width), light)
+            flux = multiply_add(g, load(pixels, tables.weights, place + FLUX * width), flux)
             place += 3 * width
     one = splat(pixels, 1.0)
     bad = select(spoilt >= zero, select(largest <= splat(pixels, LARGEST_FLOAT32), zero, one), one)
@@ -206,10 +206,10 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
         return False
     dark = tables.dark[s]
     x, y, seen, error_x, error_y, usable = _solved(
-        settings, s, sum_of(sum_x) - dark[X], sum_of(sum_y) - dark[Y], sum_of(light) - dark[LIGHT]
+        settings, s, sum_of(sum_x) - dark[X], sum_of(sum_y) - dark[Y], sum_of(flux) - dark[FLUX]
     )
     bits = SATURATED if any_lane(brightest >= splat(pixels, source.saturation)) else 0
-    bits |= 0 if usable else NO_LIGHT
+    bits |= 0 if usable else NO_FLUX
     slopes.iterations[f, s] = slopes.bad_pixels[f, s] = 0
     slopes.flux[f, s] = seen
     store_slope(f, s, settings, x, y, error_x, error_y, bits, slopes)

@@ -16,8 +16,8 @@ from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
 from faintspot.ao_loop.engine_files import write_engine_files
-from faintspot.ao_loop.observatory import prepare
 from faintspot.ao_loop.simulation import measure_gains
+from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.control.configuration import CONTROLLER, save_control

@@ -8,8 +8,8 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.live_page.batch import Source
-from faintspot.live_page.gathered import Gathered, flag_names
 from faintspot.live_page.messages import packed
+from faintspot.live_page.page_state import PageState, flag_names
 from faintspot.live_page.pictures import FrameDrawing
 
 UPDATE_S = 0.08
@@ -29,7 +29,7 @@ class Page:
 
     def __init__(self, source: Source, tell: Callable[[str, bytes | None], None]) -> None:
         self.source, self._tell = source, tell
-        self.gathered = Gathered([])
+        self.page_state = PageState([])
         self._drawing: FrameDrawing | None = None
         self._figures_s = self._arms_s = 0.0
         self._arms: list[dict[str, Any]] = []
@@ -45,12 +45,12 @@ class Page:
         if batch is not None:
             if batch.anew or self._drawing is None:
                 self._begin()
-            self.gathered.add(batch)
+            self.page_state.add(batch)
             if batch.picture is not None and self._drawing is not None:
-                record = self.gathered.record_of(batch.picture.frame)
+                record = self.page_state.record_of(batch.picture.frame)
                 self._tell("pictures", self._drawing.message(batch.picture, record))
             if len(batch.records) or batch.anew:
-                self._tell("now", packed("now", *self.gathered.now()))
+                self._tell("now", packed("now", *self.page_state.now()))
             self._tell_figures(now=batch.anew)
         if place != self._place:
             self._place = place
@@ -60,7 +60,7 @@ class Page:
         """Forget what another engine, or another part of the recording, has given."""
         layout = self.source.layout
         assert layout is not None
-        self.gathered = Gathered(self.source.arms)
+        self.page_state = PageState(self.source.arms)
         if self._drawing is None or self._drawing.layout is not layout:
             self._drawing = FrameDrawing(layout)
             self._tell("pictures", None)
@@ -71,6 +71,6 @@ class Page:
         if now or moment - self._figures_s >= _FIGURES_S:
             self._figures_s = moment
             if now or moment - self._arms_s >= _ARMS_S:
-                self._arms_s, self._arms = moment, self.gathered.arms_compared()
-            values = {**self.gathered.figures(), "arms": self._arms, "flags": flag_names()}
+                self._arms_s, self._arms = moment, self.page_state.arms_compared()
+            values = {**self.page_state.figures(), "arms": self._arms, "flags": flag_names()}
             self._tell("figures", packed("figures", values))

@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.io.telemetry import stored_names
 from faintspot.io.telemetry_parts import StoredTelemetry
 from faintspot.live_page.batch import Batch, Floats, Picture
-from faintspot.live_page.wishes import Wish
+from faintspot.live_page.client_requests import ClientRequest
 from faintspot.realtime.telemetry_segment import image_type, record_type
 from faintspot.sensor.layout import Layout
 
@@ -110,7 +110,7 @@ class RecordingSource:
 
     # What clients may ask for -------------------------------------------------------------------------------
 
-    def known(self) -> Mapping[str, Wish]:
+    def known(self) -> Mapping[str, ClientRequest]:
         """Return the functions."""
         return {"play": self._play}
 

@@ -18,10 +18,10 @@ from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import parse_json
 from faintspot.live_page.access import Access
 from faintspot.live_page.batch import Source
-from faintspot.live_page.board import Board
+from faintspot.live_page.client_requests import ClientRequests, answered
+from faintspot.live_page.latest_messages import LatestMessages
 from faintspot.live_page.messages import packed, plain
 from faintspot.live_page.page import UPDATE_S, Page
-from faintspot.live_page.wishes import ClientRequests, answered
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.control import in_thread
 
@@ -60,7 +60,7 @@ class LiveServer:
     Parameters
     ----------
     source : Source
-    wishes : Wishes
+    client_requests : Wishes
         What clients may ask for.
     access : Access
     address : str
@@ -76,12 +76,12 @@ class LiveServer:
     def __init__(
         self,
         source: Source,
-        wishes: ClientRequests,
+        client_requests: ClientRequests,
         access: Access,
         address: str = "127.0.0.1",
         port: int = 0,
     ) -> None:
-        self.access, self.wishes, self.board = access, wishes, Board()
+        self.access, self.client_requests, self.latest_messages = access, client_requests, LatestMessages()
         self.clients: set[Client] = set()
         self._loop = asyncio.get_running_loop()
         self._page = Page(source, self._tell)
@@ -140,9 +140,9 @@ class LiveServer:
     def _tell(self, kind: str, message: bytes | None) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
             if message is None:
-                self._loop.call_soon_threadsafe(self.board.forget, kind)
+                self._loop.call_soon_threadsafe(self.latest_messages.forget, kind)
             else:
-                self._loop.call_soon_threadsafe(self.board.post, kind, message)
+                self._loop.call_soon_threadsafe(self.latest_messages.post, kind, message)
 
 
 class _RateLimit(logging.Filter):
@@ -263,7 +263,7 @@ class Client(_Guarded, WebSocketHandler):
             reply = {"ok": False, "error": "watching only: changes need the token printed at the start"}
         else:
             # In a thread, since the engine may take its time.
-            reply = await in_thread(partial(answered, self.server.wishes, request))
+            reply = await in_thread(partial(answered, self.server.client_requests, request))
         with contextlib.suppress(WebSocketClosedError):
             await self.write_message(json.dumps({"id": number, **plain(reply)}, allow_nan=False))
         if self._feeding is None:
@@ -291,7 +291,7 @@ class Client(_Guarded, WebSocketHandler):
         seen = 0
         with contextlib.suppress(WebSocketClosedError):
             while True:
-                number, message = (await self.server.board.newer(seen))[0]
+                number, message = (await self.server.latest_messages.newer(seen))[0]
                 try:
                     await asyncio.wait_for(self.write_message(message, binary=True), _SLOW_S)
                 except TimeoutError:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from faintspot.live_page.access import Access
+from faintspot.live_page.client_requests import EngineRequests
 from faintspot.live_page.engine_source import EngineSource
 from faintspot.live_page.recording_source import RecordingSource
 from faintspot.live_page.server import LiveServer
 from faintspot.live_page.status import StatusPoller
-from faintspot.live_page.wishes import EngineWishes
 from faintspot.realtime.camera import StopEvent
 
 PORT = 8642
@@ -55,12 +55,13 @@ def serve_engine(
     """
 
     async def work() -> None:
-        source, wishes = EngineSource(name), EngineWishes(name, folder)
-        server = LiveServer(source, wishes, Access(address, private), address, port)
+        source, client_requests = EngineSource(name), EngineRequests(name, folder)
+        server = LiveServer(source, client_requests, Access(address, private), address, port)
 
         def told(kind: str, values: dict[str, Any]) -> None:
             server.tell(
-                kind, {**values, "recording": wishes.recording.status()} if kind == "status" else values
+                kind,
+                {**values, "recording": client_requests.recording.status()} if kind == "status" else values,
             )
 
         poller = StatusPoller(name, told)
@@ -69,7 +70,7 @@ def serve_engine(
             await server.run(stop)
         finally:
             poller.close()
-            wishes.close()
+            client_requests.close()
             source.close()
 
     asyncio.run(work())

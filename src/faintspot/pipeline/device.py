@@ -24,7 +24,7 @@ from faintspot.cuda.fused import (
     slopes_kernel,
 )
 from faintspot.cuda.strips import WARP
-from faintspot.estimators.gravity import GravityPrepared
+from faintspot.estimators.gravity import GravityPlan
 from faintspot.estimators.registry import estimators
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class DevicePipeline:
     ----------
     layout : Layout
     calibration : Calibration
-    preparation : Plan
+    plan : Plan
         The pipeline's tables.
 
     Raises
@@ -112,17 +112,17 @@ class DevicePipeline:
         For an estimator that runs on the CPU only, and windows that are too large for a warp.
     """
 
-    def __init__(self, layout: Layout, calibration: Calibration, preparation: Plan) -> None:
-        prepared = preparation.prepared
-        if not preparation.estimator.runs_on_gpu or not isinstance(prepared, GravityPrepared):
+    def __init__(self, layout: Layout, calibration: Calibration, plan: Plan) -> None:
+        prepared = plan.prepared
+        if not plan.estimator.runs_on_gpu or not isinstance(prepared, GravityPlan):
             able = ", ".join(repr(name) for name, kind in estimators().items() if kind.runs_on_gpu)
             raise InputError(
-                f'estimator = {preparation.estimator.name!r}: device="cuda" runs {able}; use one of these or '
+                f'estimator = {plan.estimator.name!r}: device="cuda" runs {able}; use one of these or '
                 'device="cpu"'
             )
         self.layout = layout
         self.calibration = calibration
-        self._preparation = preparation
+        self._plan = plan
         first_step = prepared.first_step
         self._kernel = slopes_kernel(layout.window, prepared.before, first_step.algorithm)
         height, line = layout.frame_shape
@@ -142,9 +142,9 @@ class DevicePipeline:
         self._first_variants = cuda.to_device(np.zeros(1, np.int32))
 
     @property
-    def needs_light(self) -> bool:
-        """Whether settings follow the light of each frame, which only the CPU measures."""
-        return self._preparation.needs_light
+    def needs_flux(self) -> bool:
+        """Whether settings follow the flux of each frame, which only the CPU measures."""
+        return self._plan.needs_flux
 
     def measure(self, frames: Any, *, stream: Any = 0) -> DeviceSlopes:
         """Measure frames that are in the GPU's memory; the slopes stay there.
@@ -162,9 +162,9 @@ class DevicePipeline:
         Raises
         ------
         InputError
-            For frames that are not of this kind or shape, and for settings that follow each frame's light.
+            For frames that are not of this kind or shape, and for settings that follow each frame's flux.
         """
-        self.check_constant_light()
+        self.check_constant_flux()
         array = frames if hasattr(frames, "copy_to_host") else _as_device_array(frames)
         if array.ndim == 2:
             array = array.reshape(1, *array.shape)
@@ -234,23 +234,23 @@ class DevicePipeline:
             results.flags,
         )
 
-    def check_constant_light(self) -> None:
-        """Refuse settings that follow each frame's light.
+    def check_constant_flux(self) -> None:
+        """Refuse settings that follow each frame's flux.
 
         Raises
         ------
         InputError
             For such.
         """
-        if self.needs_light:
+        if self.needs_flux:
             raise InputError(
-                "settings.flux_e: expected the light per sub-aperture, since automatic settings would follow "
+                "settings.flux_e: expected the flux per sub-aperture, since automatic settings would follow "
                 "each frame's, which is measured on the CPU only"
             )
 
     def _tables_on_device(self) -> Any:
         """The tables of settings, brought over anew only where there are new ones."""
-        tables = self._preparation.settings
+        tables = self._plan.settings
         if self._tables is None or self._tables[0] is not tables:
             self._tables = tables, cuda.to_device(np.ascontiguousarray(tables, np.float32))
         return self._tables[1]

@@ -29,7 +29,7 @@ class FrameStream:
     Parameters
     ----------
     pipeline : SlopePipeline
-        Made with device="cuda". Settings that follow the light of each frame need `flux_e`.
+        Made with device="cuda". Settings that follow the flux of each frame need `flux_e`.
     dtype : dtype
         Of the camera's pixels: uint16 or float32.
     capture : bool
@@ -53,7 +53,7 @@ class FrameStream:
     ) -> None:
         if pipeline.on_device is None:
             raise InputError('pipeline: expected one made with device="cuda"')
-        pipeline.on_device.check_constant_light()
+        pipeline.on_device.check_constant_flux()
         kind = np.dtype(dtype)
         if kind not in (np.uint16, np.float32):
             raise InputError(f"dtype = {kind}: expected uint16 or float32")

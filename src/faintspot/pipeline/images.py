@@ -32,7 +32,7 @@ def measure_images(
     images : (n, ny, nx) array
         ADU; electrons with the default calibration.
     settings : Settings or Estimator
-        Its arrays hold one value per image. Light that is not given (`flux_e`) is the mean of the stack.
+        Its arrays hold one value per image. Flux that is not given (`flux_e`) is the mean of the stack.
     calibration : Calibration, optional
         Without maps: gain, dark level, read noise.
     psf, score

@@ -1,4 +1,4 @@
-"""The light of every sub-aperture as a running mean: what a single faint frame cannot say."""
+"""The flux of every sub-aperture as a running mean: what a single faint frame cannot say."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import number_between, numbers_between, real_array
 from faintspot.base.errors import InputError
 
-_LEAST_LIGHT_E = 1e-3
+_LEAST_FLUX_E = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class MeanFlux:
-    """Mean light of every sub-aperture over the frames before; a value that is passed on, frame by frame.
+    """Mean flux of every sub-aperture over the frames before; a value that is passed on, frame by frame.
 
     ::
 
@@ -28,7 +28,7 @@ class MeanFlux:
     Parameters
     ----------
     flux_e : (n,) or (n_frames, n) array
-        Light, electrons, of one frame or of several, whose mean counts.
+        Flux, electrons, of one frame or of several, whose mean counts.
     time_constant_frames : float
         Frames after which a frame counts 1 / e times as much as the newest; before as many have been seen,
         all count alike.
@@ -38,7 +38,7 @@ class MeanFlux:
     Raises
     ------
     InputError
-        For light that is not finite, of another shape, or numbers out of range.
+        For flux that is not finite, of another shape, or numbers out of range.
 
     Examples
     --------
@@ -53,35 +53,35 @@ class MeanFlux:
     frames: float | None = None
 
     def __post_init__(self) -> None:
-        light = numbers_between("flux_e", self.flux_e, -1e12, 1e12)
-        if light.ndim not in (1, 2):
-            raise InputError(f"flux_e: expected shape (n,) or (n_frames, n), got {light.shape}")
+        flux = numbers_between("flux_e", self.flux_e, -1e12, 1e12)
+        if flux.ndim not in (1, 2):
+            raise InputError(f"flux_e: expected shape (n,) or (n_frames, n), got {flux.shape}")
         number_between("time_constant_frames", self.time_constant_frames, 1.0)
-        seen = 1 if light.ndim == 1 else len(light)
+        seen = 1 if flux.ndim == 1 else len(flux)
         frames = number_between("frames", seen if self.frames is None else self.frames, 0.0, low_open=True)
-        mean = light if light.ndim == 1 else light.mean(axis=0)
+        mean = flux if flux.ndim == 1 else flux.mean(axis=0)
         mean.flags.writeable = False
         object.__setattr__(self, "flux_e", mean)
         object.__setattr__(self, "frames", float(frames))
 
     def updated(self, flux_e: ArrayLike) -> MeanFlux:
-        """Return the mean with one more frame's light (n,), electrons; what is not finite counts nothing.
+        """Return the mean with one more frame's flux (n,), electrons; what is not finite counts nothing.
 
         Raises
         ------
         InputError
             For another number of sub-apertures.
         """
-        light = real_array("flux_e", flux_e)
-        if light.shape != self.flux_e.shape:
-            raise InputError(f"flux_e: expected shape {self.flux_e.shape}, got {light.shape}")
+        flux = real_array("flux_e", flux_e)
+        if flux.shape != self.flux_e.shape:
+            raise InputError(f"flux_e: expected shape {self.flux_e.shape}, got {flux.shape}")
         assert self.frames is not None
         frames = min(self.frames + 1.0, self.time_constant_frames)
-        change = np.where(np.isfinite(light), light - self.flux_e, 0.0) / frames
+        change = np.where(np.isfinite(flux), flux - self.flux_e, 0.0) / frames
         return replace(self, flux_e=self.flux_e + change, frames=frames)
 
     @property
     def positive_flux_e(self) -> NDArray[np.float64]:
         """The mean, and a thousandth of an electron where noise has made it less."""
-        light: NDArray[np.float64] = np.maximum(self.flux_e, _LEAST_LIGHT_E)
-        return light
+        flux: NDArray[np.float64] = np.maximum(self.flux_e, _LEAST_FLUX_E)
+        return flux

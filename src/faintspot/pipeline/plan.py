@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.camera.calibration import Calibration
-from faintspot.estimators.base import Estimator, Prepared
-from faintspot.estimators.python import PythonPrepared
+from faintspot.estimators.base import Estimator, EstimatorPlan
+from faintspot.estimators.python import PythonPlan
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import groups
 from faintspot.kernels.compiling import Direct
@@ -21,7 +21,7 @@ from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
 
-_MOST_LIGHT_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
+_MOST_FLUX_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> 
 
 
 class Plan:
-    """Settings of every sub-aperture and the estimator's tables, for every level of light that occurs.
+    """Settings of every sub-aperture and the estimator's tables, for every level of flux that occurs.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class Plan:
         self.estimator: Estimator = settings.estimator
         self.estimator.check(self.sensor)
         own = self.estimator.prepared(self.sensor)
-        self.prepared: Prepared = PythonPrepared(self.estimator, self.sensor) if own is None else own
+        self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if own is None else own
         self.no_prior = np.zeros((1, 2, n), np.float32)
         """The prior of slopes that nobody has predicted: 0."""
         self._fixed = self._fixed_table(each)
@@ -94,13 +94,13 @@ class Plan:
         self._kernels: dict[tuple[Any, str], Direct] = {}
         self._lock = threading.RLock()
         self._made: tuple[NDArray[np.float32], Any, Any] | None = None
-        if not self.needs_light:
+        if not self.needs_flux:
             self._add(self.sensor.flux_e)
 
     @property
-    def needs_light(self) -> bool:
-        """Whether the light must be measured in every frame."""
-        return self.prepared.needs_light
+    def needs_flux(self) -> bool:
+        """Whether the flux must be measured in every frame."""
+        return self.prepared.needs_flux
 
     @property
     def settings(self) -> NDArray[np.float32]:
@@ -116,9 +116,9 @@ class Plan:
         """Return the compiled function that measures groups of frames of this dtype."""
         return self._direct(self.prepared.kernel, frames)
 
-    def light_kernel(self, frames: NDArray[Any]) -> Direct:
-        """Return the compiled function that sums up their light."""
-        return self._direct(self.prepared.light_kernel, frames)
+    def flux_kernel(self, frames: NDArray[Any]) -> Direct:
+        """Return the compiled function that sums up their flux."""
+        return self._direct(self.prepared.flux_kernel, frames)
 
     def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
         key = kernel, frames.dtype.char
@@ -140,19 +140,19 @@ class Plan:
         return Task(settings, variants, self.no_prior if prior is None else prior, tables)
 
     def _arguments(self) -> tuple[NDArray[np.float32], Any, Any]:
-        """Settings, tables and scratch, made anew only where there is new light."""
+        """Settings, tables and scratch, made anew only where there is new flux."""
         with self._lock:
             if self._made is None or len(self._made[0]) != len(self._levels):
                 prepared = self.prepared
                 self._made = np.stack(self._levels), prepared.tables, prepared.own_scratch
             return self._made
 
-    def variants(self, light_e: Floats) -> NDArray[np.int64]:
-        """Return the variant of frames with that much light per sub-aperture; make those that are new."""
+    def variants(self, flux_e: Floats) -> NDArray[np.int64]:
+        """Return the variant of frames with that high flux per sub-aperture; make those that are new."""
         with np.errstate(invalid="ignore"):
-            light = np.clip(np.nan_to_num(light_e, nan=1.0, posinf=_MOST_LIGHT_E), 1.0, _MOST_LIGHT_E)
-        step = self.prepared.light_step
-        levels = np.rint(np.log(light) / math.log(step)).astype(np.int64)
+            flux = np.clip(np.nan_to_num(flux_e, nan=1.0, posinf=_MOST_FLUX_E), 1.0, _MOST_FLUX_E)
+        step = self.prepared.flux_step
+        levels = np.rint(np.log(flux) / math.log(step)).astype(np.int64)
         with self._lock:  # several threads may measure frames with one pipeline
             for level in np.unique(levels).tolist():
                 if level not in self._variants:
@@ -161,13 +161,13 @@ class Plan:
         return np.array([self._variants[level] for level in levels.tolist()], np.int64)
 
     def _add(self, flux_e: Floats) -> None:
-        """Add the settings' table of a light level."""
+        """Add the settings' table of a flux level."""
         table = self._fixed.copy()
-        self.prepared.fill_light(table, flux_e)
+        self.prepared.fill_flux(table, flux_e)
         self._levels.append(table)
 
     def _fixed_table(self, each: Any) -> NDArray[np.float32]:
-        """The settings that do not depend on the light."""
+        """The settings that do not depend on the flux."""
         sensor = self.sensor
         table = np.zeros((self.prepared.setting_rows, sensor.n), np.float32)
         table[groups.ZERO_X], table[groups.ZERO_Y] = sensor.zero.T

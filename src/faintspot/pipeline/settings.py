@@ -37,7 +37,7 @@ class SharedOptions(Options):
     error_scale: Any = option(1.0, "Factor on the standard errors.", low=0.0, high=1e3, low_open=True)
     flux_e: Any = option(
         None,
-        'Light expected of a spot in a frame, for estimators that use it and for "auto". Default: measured '
+        'Flux expected of a spot in a frame, for estimators that use it and for "auto". Default: measured '
         "in each frame, as the mean of all sub-apertures.",
         unit="e-",
         low=0.0,

@@ -16,7 +16,7 @@ from faintspot.base.checks import number_between, numbers_between, one_of, real_
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator
-from faintspot.estimators.python import PythonPrepared
+from faintspot.estimators.python import PythonPlan
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _NO_STAGES = np.empty((0, 0, 0, 0), np.float32)
-_LIGHT_COST = 0.1  # of summing up a sub-aperture's pixels, as `Estimator.cost`
+_FLUX_COST = 0.1  # of summing up a sub-aperture's pixels, as `Estimator.cost`
 
 
 class SlopePipeline:
@@ -105,7 +105,7 @@ class SlopePipeline:
         self._lanes = lanes_for(np.float32, width)
         self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
-        self.preparation = self._prepared()
+        self.plan = self._prepared()
         """What was computed beforehand."""
         self._identity = _identity(*self._parts)
         self.device = one_of("device", device, ("cpu", "cuda"))
@@ -128,7 +128,7 @@ class SlopePipeline:
         check_cuda()
         from faintspot.pipeline.device import DevicePipeline
 
-        return DevicePipeline(self.layout, self.calibration, self.preparation)
+        return DevicePipeline(self.layout, self.calibration, self.plan)
 
     @property
     def width(self) -> int:
@@ -146,7 +146,7 @@ class SlopePipeline:
         other = copy.copy(self)
         other._lanes = lanes_for(np.float32, width)
         other._calibration = packed_calibration(self.layout, self.calibration, width)
-        other.preparation = other._prepared()
+        other.plan = other._prepared()
         other.on_device = None if self.on_device is None else other._device_pipeline()
         return other
 
@@ -176,34 +176,36 @@ class SlopePipeline:
             device=self.device,
         )
 
-    def with_flux(self, light: MeanFlux | ArrayLike) -> SlopePipeline:
-        """Return the same pipeline for a mean light of its sub-apertures.
+    def with_flux(self, mean_flux: MeanFlux | ArrayLike) -> SlopePipeline:
+        """Return the same pipeline for a mean flux of its sub-apertures.
 
-        Estimators that use the light measure it in every frame where nobody tells them (`flux_e`), which
-        costs precision when a frame is faint. Light counts in steps of a few per cent: where it has not
+        Estimators that use the flux measure it in every frame where nobody tells them (`flux_e`), which
+        costs precision when a frame is faint. Flux counts in steps of a few per cent: where it has not
         changed by so much, this pipeline itself is returned, so that it may be called in every frame.
 
         Parameters
         ----------
-        light : MeanFlux, or float or (n,) array
+        mean_flux : MeanFlux, or float or (n,) array
             Electrons of a frame.
 
         Raises
         ------
         InputError
-            For light that is not positive, or of another number of sub-apertures.
+            For flux that is not positive, or of another number of sub-apertures.
         """
-        flux = light.positive_flux_e if isinstance(light, MeanFlux) else light
-        flux = numbers_between("light", flux, 0.0, 1e12, low_open=True)
-        if flux.shape not in ((), (len(self.layout),)):
-            raise InputError(f"light: expected one number or {len(self.layout)}, got shape {flux.shape}")
-        step = math.log(self.preparation.prepared.light_step)
-        known = self.preparation.sensor.flux_e
+        flux_e = mean_flux.positive_flux_e if isinstance(mean_flux, MeanFlux) else mean_flux
+        flux_e = numbers_between("mean_flux", flux_e, 0.0, 1e12, low_open=True)
+        if flux_e.shape not in ((), (len(self.layout),)):
+            raise InputError(
+                f"mean_flux: expected one number or {len(self.layout)}, got shape {flux_e.shape}"
+            )
+        step = math.log(self.plan.prepared.flux_step)
+        known = self.plan.sensor.flux_e
         with np.errstate(divide="ignore", invalid="ignore"):
-            steady = np.abs(np.log(flux / known)) <= step
+            steady = np.abs(np.log(flux_e / known)) <= step
         if steady.all():
             return self
-        rounded = np.exp(step * np.rint(np.log(flux) / step))
+        rounded = np.exp(step * np.rint(np.log(flux_e) / step))
         return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
 
     def for_images(self) -> SlopePipeline:
@@ -220,14 +222,14 @@ class SlopePipeline:
             background_e=camera.background_e,
         )
         other._calibration = packed_calibration(other.layout, other.calibration, self.width)
-        other.preparation = other._prepared()
+        other.plan = other._prepared()
         other.device, other.on_device = "cpu", None
         return other
 
     @property
-    def needs_light(self) -> bool:
-        """Whether settings follow the light of each frame, which is looked at before it is measured."""
-        return self.preparation.needs_light
+    def needs_flux(self) -> bool:
+        """Whether settings follow the flux of each frame, which is looked at before it is measured."""
+        return self.plan.needs_flux
 
     def fingerprint(self) -> bytes:
         """Return bytes that differ between pipelines that could give different slopes for the same frame."""
@@ -292,9 +294,9 @@ class SlopePipeline:
         frames = kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
         results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
-        prepared = self.preparation.prepared
+        prepared = self.plan.prepared
         stages = _NO_STAGES
-        if explain or isinstance(prepared, PythonPrepared):
+        if explain or isinstance(prepared, PythonPlan):
             stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
@@ -302,17 +304,17 @@ class SlopePipeline:
             measured = self.on_device.measure_from_host(frames, dtype, variants)
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
-        task = self.preparation.task(variants, predicted)
-        kernel = self.preparation.kernel(frames)
+        task = self.plan.task(variants, predicted)
+        kernel = self.plan.kernel(frames)
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
             kernel(source, task, start, stop, scratch, results, stages)
 
         n_groups = n_frames * -(-n // self._lanes.width)
-        own_scratch = self.preparation.own_scratch
-        cost = self.preparation.estimator.cost
+        own_scratch = self.plan.own_scratch
+        cost = self.plan.estimator.cost
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
-        if isinstance(prepared, PythonPrepared):
+        if isinstance(prepared, PythonPlan):
             images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
@@ -333,20 +335,20 @@ class SlopePipeline:
         return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
 
     def _variants(self, source: Source) -> NDArray[np.int64]:
-        """Which table of settings every frame is measured with, by its light where that matters."""
+        """Which table of settings every frame is measured with, by its flux where that matters."""
         n_frames, n = len(source.frames), len(self.layout)
-        if not self.needs_light:
+        if not self.needs_flux:
             return np.zeros(n_frames, np.int64)
-        light = np.empty((n_frames, n), np.float32)
+        flux = np.empty((n_frames, n), np.float32)
 
-        light_kernel = self.preparation.light_kernel(source.frames)
+        flux_kernel = self.plan.flux_kernel(source.frames)
 
         def job(start: int, stop: int, scratch: Scratch) -> None:
-            light_kernel(source, start, stop, scratch, light)
+            flux_kernel(source, start, stop, scratch, flux)
 
         n_groups = n_frames * -(-n // self._lanes.width)
-        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_LIGHT_COST)
-        return self.preparation.variants(light.mean(axis=1, dtype=np.float64))
+        run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, cost=_FLUX_COST)
+        return self.plan.variants(flux.mean(axis=1, dtype=np.float64))
 
 
 def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:

@@ -38,7 +38,7 @@ class Slopes:
     >>> float(slopes.x[0]), float(slopes.y[0]), float(slopes.flux[0])
     (1.0, -1.0, 200.0)
     >>> fs.SubapertureFlag(int(slopes.flags[1])).name
-    'NO_LIGHT'
+    'NO_FLUX'
     """
 
     x: NDArray[np.float32]

@@ -91,7 +91,7 @@ class StreamBridge:
         spins: bool | None = None,
     ) -> None:
         self.stream, self.name, self._slots = stream, name, slots
-        self._follower = Follower(stream, say or (lambda _: None), _unfit, lambda: "waiting")
+        self._follower = Follower(stream, say or (lambda _: None), _incompatible, lambda: "waiting")
         self.counters = BridgeCounters()
         enough = len(os.sched_getaffinity(0)) >= SPINNING_NEEDS
         self._spin_s = SPIN_S if (enough if spins is None else spins) else 0.0
@@ -226,6 +226,6 @@ class StreamBridge:
         self._silent = True
 
 
-def _unfit(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     """Return what is expected where these are no frames."""
     return "" if len(shape) == 2 and dtype.kind in "iuf" else "frames (rows, columns) of real numbers"

@@ -65,7 +65,7 @@ class CommandStream:
 
     def __init__(self, stream: str, commands: int, say: Callable[[str], None]) -> None:
         self.stream = stream
-        self._follower = Follower(stream, say, self._unfit, lambda: self._keeps)
+        self._follower = Follower(stream, say, self._incompatible, lambda: self._keeps)
         self.commands_nm: NDArray[np.float64] = np.zeros(commands)
         self.frame, self.counters = -1, CommandCounters()
         self._seen, self._next_look_s = 0, 0.0
@@ -128,7 +128,7 @@ class CommandStream:
             self._seen = 0
             follower.say(f"{source.shape[0]} commands ({source.dtype}), {source.maker}")
 
-    def _unfit(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
         """Return what is expected where these are no commands of the mirror."""
         expected = self.commands_nm.shape
         return "" if shape == expected and dtype.kind in "iuf" else f"{expected} real numbers, nm"

@@ -346,7 +346,7 @@ class Guard:
         self.flattens = False
         if self._invalid > options.most_invalid:
             parts = f"{100 * self._invalid:.0f} % of the slopes not valid, more than"
-            return self.end(f"too little light: {parts} {100 * options.most_invalid:g} %")
+            return self.end(f"too low flux: {parts} {100 * options.most_invalid:g} %")
         return ""
 
     @property

@@ -17,13 +17,13 @@ from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.realtime.control_loop import CLOSED, OPEN, STATES, ControlLoop
 from faintspot.realtime.engine_estimators import EngineEstimators
+from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
+from faintspot.realtime.flux_following import FluxFollower
 from faintspot.realtime.frame_path import FramePath
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM, Interleaving
-from faintspot.realtime.light_following import LightFollower
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
-from faintspot.realtime.prepared_settings import PreparedSettings, SettingsPreparer
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.slope_streams import SlopeStreams
 from faintspot.realtime.telemetry import TelemetryRing
@@ -75,8 +75,8 @@ class Engine:
     control : Control, optional
         Makes commands of slopes; the loop is open at first. Default: there are none. The reference slopes
         are for the pipelines.
-    mean_light : float, optional
-        Frames over which the light of every sub-aperture is averaged, which estimators that use it are told.
+    mean_flux : float, optional
+        Frames over which the flux of every sub-aperture is averaged, which estimators that use it are told.
         Default: they keep `flux_e`.
 
     Attributes
@@ -102,7 +102,7 @@ class Engine:
         deadline_s: float = DEADLINE_S,
         images_every: int = IMAGES_EVERY,
         control: Control | None = None,
-        mean_light: float | None = None,
+        mean_flux: float | None = None,
     ) -> None:
         self.name, self._deadline_ns, self._images_every = name, round(deadline_s * 1e9), images_every
         interleaving = Interleaving() if interleaving is None else interleaving
@@ -111,7 +111,7 @@ class Engine:
         """What of the real-time scheduling was not permitted."""
         self.advice: list[str] = []
         """What was last said to be better, for whoever asks for the status."""
-        self._source, self._unfit = source, ""
+        self._source, self._incompatible = source, ""
         self._path: FramePath | None = None
         self._waiting = False
         self._arrival, self._number = 0, -1  # of the frame that was measured last
@@ -120,9 +120,9 @@ class Engine:
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
         prior = None if control is None else Prior(len(control.interaction) // 2)
         self.preparer = SettingsPreparer(make_pipeline, interleaving, self._workers, deadline_s, prior)
-        self.live: LiveSettings[PreparedSettings] = LiveSettings(self.preparer.prepare, settings)
+        self.live: LiveSettings[EnginePlan] = LiveSettings(self.preparer.prepare, settings)
         self.estimators = EngineEstimators(self.live, self.preparer)
-        self._light = None if mean_light is None else LightFollower(self.live, mean_light)
+        self._flux = None if mean_flux is None else FluxFollower(self.live, mean_flux)
         layout = self.live.running.layout
         self._raw = np.zeros(layout.frame_shape, np.float32)
         if control is not None:
@@ -166,7 +166,7 @@ class Engine:
         return {
             "name": self.name,
             "source": None if ring is None else {"pid": ring.creator_pid, "frame": ring.progress()[0]},
-            "source_refused": self._unfit or None,
+            "source_refused": self._incompatible or None,
             "preparing": self.live.preparing,
             "counters": self.counters.as_dict(),
             "latency": self.latencies.as_dict(),
@@ -225,8 +225,8 @@ class Engine:
         """Measure frames until `stop`, or so many; wait for the source where there is none."""
         watcher = threading.Thread(target=self._watch, name="faintspot-watcher", daemon=True)
         watcher.start()
-        if self._light is not None:
-            self._light.start()
+        if self._flux is not None:
+            self._flux.start()
         waited = False
         try:
             with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time, and nobody reads it
@@ -249,8 +249,8 @@ class Engine:
         finally:
             self._stopping.set()
             watcher.join()
-            if self._light is not None:
-                self._light.close()
+            if self._flux is not None:
+                self._flux.close()
             if self._prediction is not None:
                 self._prediction.close()
             if self._workers is not None:
@@ -275,15 +275,15 @@ class Engine:
         try:
             ring = PixelRing.attach(self.name, follows=True)
         except InputError:
-            self._unfit = ""
+            self._incompatible = ""
             return None
         if ring.stale or ring.closed:
             return None
         shape, wanted = ring.shape, self.live.running.layout.frame_shape
         fits = shape == wanted and ring.dtype in (np.uint16, np.float32)
-        self._unfit = ""
+        self._incompatible = ""
         if not fits:
-            self._unfit = (
+            self._incompatible = (
                 f"frames of {shape[0]} x {shape[1]} pixels, {ring.dtype}; "
                 f"expected {wanted[0]} x {wanted[1]}, uint16 or float32"
             )
@@ -369,8 +369,8 @@ class Engine:
         self._streams.publish_marks((number, arm, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
         self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
-        if self._light is not None:
-            self._light.take(slopes.flux)
+        if self._flux is not None:
+            self._flux.take(slopes.flux)
         if self._streams.commands_lost:
             counters.commands_renewed += self._streams.renew_commands()
         if explained:
@@ -420,7 +420,7 @@ class Engine:
         And do all that takes time: tell telemetry what was changed, replace workers.
         """
         looks = told = 0
-        loop_told: dict[str, Any] = {}
+        loop_assumed: dict[str, Any] = {}
         while True:
             stopping = self._stopping.wait(_WATCH_S)
             looks += 1
@@ -436,7 +436,7 @@ class Engine:
                 self._prediction.look_after()
             if looks % _LOOKS_BETWEEN_STALE == 0:
                 self._streams.look_after_commands()
-            loop_told = self._tell_of_loop(loop_told)
+            loop_assumed = self._tell_of_loop(loop_assumed)
             self.counters.settings_changes = self.live.change_number
             for change in self.live.taken(after=told):
                 self._telemetry.write_change(*change)

@@ -10,10 +10,10 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.estimators import registry
+from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
 from faintspot.realtime.estimator_file import EstimatorFile, load_estimators
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM
 from faintspot.realtime.live import Change, LiveSettings
-from faintspot.realtime.prepared_settings import PreparedSettings, SettingsPreparer
 from faintspot.realtime.trial import Trial
 
 _EFFECT_TIMEOUT_S = 0.5
@@ -28,7 +28,7 @@ class EngineEstimators:
     preparer : SettingsPreparer
     """
 
-    def __init__(self, live: LiveSettings[PreparedSettings], preparer: SettingsPreparer) -> None:
+    def __init__(self, live: LiveSettings[EnginePlan], preparer: SettingsPreparer) -> None:
         self._live, self._preparer = live, preparer
         self._lock = threading.Lock()
         self.loaded: dict[str, EstimatorFile] = {}
@@ -98,12 +98,12 @@ class EngineEstimators:
         gc.collect()
         return {"frame": frame}
 
-    def fall_back(self, fallback: PreparedSettings, fault: str) -> None:
+    def fall_back(self, fallback: EnginePlan, fault: str) -> None:
         """Let what was prepared for that take over, from the next frame on; for the engine's thread."""
         self.fault = fault
         self._fallen_back(fallback, estimator_fault=fault)
 
-    def _fallen_back(self, fallback: PreparedSettings, **more: str) -> Change:
+    def _fallen_back(self, fallback: EnginePlan, **more: str) -> Change:
         self._preparer.interleaving = arms = fallback.interleaving
         changes = {"estimator": fallback.settings.estimator.name, **more}
         return self._live.offer(

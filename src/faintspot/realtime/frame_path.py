@@ -67,14 +67,14 @@ class _Groups:
     ) -> None:
         self._groups, self._shares = groups, shares
         self._last_rows = last_rows_of_groups(pipeline, pipeline.width)
-        task = pipeline.preparation.task(np.zeros(1, np.int64), None if prior is None else prior.mean_px)
+        task = pipeline.plan.task(np.zeros(1, np.int64), None if prior is None else prior.mean_px)
         task = task._replace(settings=task.settings.copy())
         self.settings: NDArray[np.float32] = task.settings[0]
         """What the kernel reads of every sub-aperture: rows as in `faintspot.kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
-        self._kernel = Direct(streamed(pipeline.preparation.prepared.kernel))
+        self._kernel = Direct(streamed(pipeline.plan.prepared.kernel))
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
-        own_scratch = pipeline.preparation.own_scratch
+        own_scratch = pipeline.plan.own_scratch
         self._scratch = [new_scratch(lanes, *window, own_scratch(lanes, *window)) for _ in range(shares)]
 
     def measure(
@@ -115,7 +115,7 @@ class FramePath:
     Raises
     ------
     InputError
-        When the slots do not fit the pipeline, or settings follow the light of the frame itself, which is not
+        When the slots do not fit the pipeline, or settings follow the flux of the frame itself, which is not
         known before its last row.
     """
 
@@ -145,7 +145,7 @@ class FramePath:
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide
         # What is left over is measured in a narrower group where that is faster: its rows come last.
-        faster = rest > 0 and pipeline.preparation.prepared.fewer_lanes_are_faster
+        faster = rest > 0 and pipeline.plan.prepared.fewer_lanes_are_faster
         narrow = [width for width in WIDTHS if rest <= width < wide] if faster else []
         self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares, prior)
         self._narrow = None
@@ -230,7 +230,7 @@ class FramePath:
     def _widen(self, prior: Prior) -> None:
         """Have the estimator's prior as wide as the predicted slopes are unsure, where that is known."""
         self._prior_changes = prior.changes
-        row = self.pipeline.preparation.prepared.prior_weight_row
+        row = self.pipeline.plan.prepared.prior_weight_row
         if row is None:
             return
         usual = np.inf if self._usual_std_px is None else self._usual_std_px[: prior.std_px.size]
@@ -253,15 +253,15 @@ class FramePath:
 
 
 def check_real_time(pipeline: SlopePipeline) -> None:
-    """Refuse a GPU, and settings that follow the light of a frame, which is not known before its last row."""
+    """Refuse a GPU, and settings that follow the flux of a frame, which is not known before its last row."""
     if pipeline.on_device is not None:
         raise InputError(
             f"pipeline: device = {pipeline.device!r}, but the real-time engine measures on the CPU; leave "
             "device out, or measure frames on the GPU with faintspot.pipeline.device_stream.FrameStream"
         )
-    if pipeline.needs_light:
+    if pipeline.needs_flux:
         raise InputError(
-            "settings.flux_e: expected the light (electrons) that a spot has in a frame, got none: in "
+            "settings.flux_e: expected the flux (electrons) that a spot has in a frame, got none: in "
             f'real time {pipeline.settings.estimator.label} and "auto" need it before the frame is there'
         )
 

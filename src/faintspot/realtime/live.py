@@ -27,7 +27,7 @@ _POLL_S = 0.001
 
 
 class HasSettings(Protocol):
-    """What is made from settings: a `SlopePipeline`, or an engine's `PreparedSettings`."""
+    """What is made from settings: a `SlopePipeline`, or an engine's `EnginePlan`."""
 
     @property
     def settings(self) -> Settings:
@@ -271,7 +271,7 @@ class LiveSettings(Generic[Prepared]):
         """Return values that run, by name (default: all), as plain numbers, texts and lists.
 
         Defaults are filled in. A setting that differs between sub-apertures is a list with one value for
-        each; None is what is not used, or not a number: found from the PSF or each frame's light, or without
+        each; None is what is not used, or not a number: found from the PSF or each frame's flux, or without
         a limit.
 
         Raises

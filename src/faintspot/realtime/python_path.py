@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
 from faintspot.estimators.base import Positions
-from faintspot.estimators.python import PythonPrepared
+from faintspot.estimators.python import PythonPlan
 from faintspot.kernels.groups import CALIBRATED
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -56,8 +56,8 @@ class PythonPath(FramePath):
         self, pipeline: SlopePipeline, *arguments: Any, budget_s: float = BUDGET_S, **options: Any
     ) -> None:
         super().__init__(pipeline, *arguments, **options)
-        prepared = pipeline.preparation.prepared
-        assert isinstance(prepared, PythonPrepared)
+        prepared = pipeline.plan.prepared
+        assert isinstance(prepared, PythonPlan)
         self._prepared, self._budget_s, self._failures = prepared, budget_s, 0
         self._images = self._stages[CALIBRATED, 0].reshape(-1, *pipeline.layout.window)
         self._requests: SimpleQueue[NDArray[np.float64] | None] = SimpleQueue()
@@ -75,13 +75,13 @@ class PythonPath(FramePath):
         """Measure a frame, waiting for its rows; see `FramePath.measure`."""
         if not super().measure(number, slot, explain=True):
             return False
-        found = self._located() if self.fault is None else self.fault
+        found = self._spot_fits() if self.fault is None else self.fault
         self.failed = isinstance(found, str)
         positions = None if isinstance(found, str) else found
         self._prepared.write(positions, self._wide.settings, 0, self._results)
         return True
 
-    def _located(self) -> Found:
+    def _spot_fits(self) -> Found:
         """Have the estimator's thread find the positions; set `fault` when it is given up."""
         zero, prior = self._prepared.sensor.zero, self._prior
         self._requests.put(zero.copy() if prior is None else zero + prior.mean_px[0].T)
@@ -129,12 +129,12 @@ def tried(
     """
     pipeline = make_pipeline(settings)
     check_real_time(pipeline)
-    prepared = pipeline.preparation.prepared
+    prepared = pipeline.plan.prepared
     for frame in trial_frames(pipeline):
         pipeline(frame)
         if prepared.faults:
             raise InputError(prepared.fault)
-    if not isinstance(prepared, PythonPrepared):
+    if not isinstance(prepared, PythonPlan):
         return pipeline
     images = pipeline.explain(typical_frame(pipeline)).calibrated
     shortest_s = math.inf
@@ -156,7 +156,7 @@ def _too_slow(pipeline: SlopePipeline, took_s: float, budget_s: float) -> str:
 
 
 def _serve(
-    prepared: PythonPrepared,
+    prepared: PythonPlan,
     images: NDArray[np.float32],
     requests: SimpleQueue[NDArray[np.float64] | None],
     replies: SimpleQueue[tuple[Found, float]],

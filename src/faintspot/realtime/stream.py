@@ -185,7 +185,7 @@ class Follower:
     name : str
     say : function
         Told in one line what happens to the stream.
-    unfit : function
+    incompatible : function
         Takes shape and type; returns why that is not what is wanted, "" where it is.
     meanwhile : function
         Returns what is done without a stream, for `say`.
@@ -201,11 +201,11 @@ class Follower:
         self,
         name: str,
         say: Callable[[str], None],
-        unfit: Callable[[tuple[int, ...], np.dtype[Any]], str],
+        incompatible: Callable[[tuple[int, ...], np.dtype[Any]], str],
         meanwhile: Callable[[], str],
     ) -> None:
         check_stream(name)
-        self.name, self._say, self._unfit, self._meanwhile = name, say, unfit, meanwhile
+        self.name, self._say, self._incompatible, self._meanwhile = name, say, incompatible, meanwhile
         self.source: Stream | None = None
         self.obstacle = ""
 
@@ -229,7 +229,7 @@ class Follower:
             return "is not there"
         except IncompatibleStreamError as error:
             return str(error)
-        obstacle = self._unfit(source.shape, source.dtype)
+        obstacle = self._incompatible(source.shape, source.dtype)
         if obstacle:
             source.close()
             return f"holds {source.shape} {source.dtype}, expected {obstacle}"

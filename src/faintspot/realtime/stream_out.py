@@ -48,7 +48,7 @@ class StreamOut:
         self._kind, self._target = split_name(target)
         if not self._kind:
             raise InputError(f"{target}: expected isio:NAME or dao:FILE; pyshmem's stream is {stream}")
-        self._follower = Follower(stream, say or (lambda _: None), _unfit, lambda: "waiting")
+        self._follower = Follower(stream, say or (lambda _: None), _incompatible, lambda: "waiting")
         self._writer: ImageStreamWriter | None = None
         self._seen = self.published = self.missed = 0
 
@@ -111,6 +111,6 @@ class StreamOut:
         self._follower.say(f"{shape[0]} values to {self._kind}:{self._writer.path}")
 
 
-def _unfit(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
     """Return what is expected where this is not a vector of the engine's."""
     return "" if len(shape) == 1 and dtype == np.float32 else "a vector of float32"

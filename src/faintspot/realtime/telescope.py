@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintspot.ao_loop.camera import make_detector
 from faintspot.ao_loop.configuration import LoopConfiguration
-from faintspot.ao_loop.observatory import TelescopeModel
+from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.realtime.camera import CameraReport, Readout, StopEvent, readout_type
@@ -87,7 +87,7 @@ class SimulatedTelescope(Readout, Closing):
 
     Attributes
     ----------
-    observatory : TelescopeModel
+    telescope_model : TelescopeModel
     commands : CommandStream
 
     Raises
@@ -113,9 +113,9 @@ class SimulatedTelescope(Readout, Closing):
         self.configuration, self.name, self._say = configuration, name, say or (lambda _: None)
         self._conditions = Conditions.of(configuration)
         start = configuration.run.seed if seed is None else seed
-        self.observatory = observatory = TelescopeModel(configuration, start, realisation)
-        self._wind = observatory.air.velocity
-        layout, mirror = observatory.optics.sensor.layout, observatory.optics.mirror
+        self.telescope_model = telescope_model = TelescopeModel(configuration, start, realisation)
+        self._wind = telescope_model.atmosphere.velocity
+        layout, mirror = telescope_model.optics.sensor.layout, telescope_model.optics.mirror
         dtype = readout_type(make_detector(configuration))
         with ExitStack() as undo:
             ring = undo.enter_context(PixelRing.create(name, layout.frame_shape, dtype, slots=slots))
@@ -191,7 +191,7 @@ class SimulatedTelescope(Readout, Closing):
             "conditions": asdict(self._conditions),
             "commands": {
                 "stream": self.commands.stream,
-                "length": self.observatory.optics.mirror.commands,
+                "length": self.telescope_model.optics.mirror.commands,
                 "obstacle": self.commands.state,
                 **asdict(self.commands.counters),
             },
@@ -231,20 +231,20 @@ class SimulatedTelescope(Readout, Closing):
         return self._worker.submit(self._expose, number, time_s, self.commands.commands_nm, stamps)
 
     def _set(self, conditions: Conditions, time_s: float) -> None:
-        """Change light and air; the wind goes on from where it has blown the air to."""
-        air = self.observatory.air.blown(self._wind * conditions.wind_factor, time_s)
-        self.observatory.air = replace(air, r0_range_m=conditions.r0_m)
-        self.observatory.photons = conditions.photons
+        """Change flux and atmosphere; the wind goes on from where it has blown the air to."""
+        atmosphere = self.telescope_model.atmosphere.blown(self._wind * conditions.wind_factor, time_s)
+        self.telescope_model.atmosphere = replace(atmosphere, r0_range_m=conditions.r0_m)
+        self.telescope_model.photons = conditions.photons
         self._conditions = conditions
 
     def _expose(
         self, number: int, time_s: float, commands_nm: NDArray[np.float64], stamps: tuple[float, ...]
     ) -> Exposure:
         """Simulate one frame; in a thread of its own."""
-        after, seen = self.observatory.wavefronts(time_s, commands_nm)
-        truth = self.observatory.truth(time_s, after)
+        after, seen = self.telescope_model.wavefronts(time_s, commands_nm)
+        truth = self.telescope_model.truth(time_s, after)
         known = (float(number), truth.strehl, truth.rms_nm, truth.r0_m, time_s)
-        return Exposure(self.observatory.frame(number, seen), known + stamps)
+        return Exposure(self.telescope_model.frame(number, seen), known + stamps)
 
     def _complain(self) -> None:
         """Say that the pace cannot be kept, now and then."""

@@ -19,12 +19,12 @@ _LARGEST_PHOTONS = 1e9
 
 @dataclass(frozen=True)
 class Conditions:
-    """The star's light and the air.
+    """The star's flux and the air.
 
     Raises
     ------
     InputError
-        For more light than a camera can take.
+        For more flux than a camera can take.
     """
 
     photons: float
@@ -49,7 +49,7 @@ class Conditions:
         Raises
         ------
         InputError
-            For an unknown name, a value out of its range, two amounts of light or two kinds of seeing.
+            For an unknown name, a value out of its range, two amounts of flux or two kinds of seeing.
         """
         check_keys("", changes, ORDERS, what="order")
         for pair in (("photons", "magnitude"), ("r0_m", "seeing_arcsec")):

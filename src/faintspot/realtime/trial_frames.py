@@ -14,7 +14,7 @@ _SATURATED_ADU = 65535.0  # where nothing else is known
 
 
 def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
-    """Return frames (h, w) in ADU: without light, with typical spots, of noise, of saturated pixels.
+    """Return frames (h, w) in ADU: without flux, with typical spots, of noise, of saturated pixels.
 
     The same ones every time.
     """

@@ -10,7 +10,7 @@ from faintspot.base.flags import SubapertureFlag
 from faintspot.recorded.statistics import MeasuredSlopes, SlopesSummary
 
 FLAG_MEANINGS = {
-    SubapertureFlag.NO_LIGHT: "Nothing usable was left of the light: invalid, slope 0.",
+    SubapertureFlag.NO_FLUX: "Nothing usable was left of the flux: invalid, slope 0.",
     SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
     SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
@@ -47,7 +47,7 @@ _ADVICE = {
     SubapertureFlag.AT_SEARCH_LIMIT: (
         0.01,
         "ended at the limit of the search range, which the spots may have left",
-        "raise search_range_px; where there is too little light, it is noise that ends there",
+        "raise search_range_px; where there is too low flux, it is noise that ends there",
     ),
 }
 
@@ -84,7 +84,7 @@ def warnings_in_words(arms: Sequence[MeasuredSlopes], summaries: Sequence[Slopes
 
 
 def _of_arm(arm: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
-    lines = _no_light(arm)
+    lines = _no_flux(arm)
     if summary.valid_fraction == 0:
         lines.insert(0, "No measurement is valid, so there are no slopes.")
     for flag, (least, what, advice) in _ADVICE.items():
@@ -103,12 +103,12 @@ def _of_arm(arm: MeasuredSlopes, summary: SlopesSummary) -> list[str]:
     return lines
 
 
-def _no_light(arm: MeasuredSlopes) -> list[str]:
-    dark = arm.flag_count(SubapertureFlag.NO_LIGHT)
+def _no_flux(arm: MeasuredSlopes) -> list[str]:
+    dark = arm.flag_count(SubapertureFlag.NO_FLUX)
     fraction = dark / arm.x.size
     if fraction <= 0.01:
         return []
     return [
-        f"{percentage(fraction)} of the measurements had no light. Next: check that the windows lie on the "
+        f"{percentage(fraction)} of the measurements had no flux. Next: check that the windows lie on the "
         "spots (faintspot layout draws them) and that the dark is right."
     ]

@@ -13,7 +13,7 @@ from faintspot.estimators.base import Step
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.pipeline.slopes import Stages
 from faintspot.report.drawing import (
-    LIGHT_GREY,
+    FLUX_GREY,
     TRUTH_COLOUR,
     WIDTH,
     colour_bar,
@@ -182,12 +182,12 @@ def _flux(stages: Stages, index: int) -> str:
 def example_subapertures(stages: Stages) -> dict[str, int]:
     """Return the numbers of the faintest, a median and the brightest valid sub-aperture, each once.
 
-    Without any valid one it is the sub-aperture with the most light after calibration.
+    Without any valid one it is the sub-aperture with the most flux after calibration.
     """
     valid = np.flatnonzero(stages.slopes.valid)
     if valid.size == 0:
-        light = stages.calibrated.sum(axis=(-2, -1))
-        return {"none is valid": int(np.argmax(light))}
+        flux = stages.calibrated.sum(axis=(-2, -1))
+        return {"none is valid": int(np.argmax(flux))}
     order = valid[np.argsort(stages.slopes.flux[valid], kind="stable")]
     chosen = {"brightest": int(order[-1])}
     if len(order) > 1:
@@ -218,7 +218,7 @@ def _draw_steps(
     for panel, (step, image) in zip(axes, images.items(), strict=True):
         low, high = adu if step == "raw" else electrons
         shown[step] = panel.imshow(image, vmin=low, vmax=high, extent=extent, interpolation="nearest")
-        panel.set_facecolor(LIGHT_GREY)
+        panel.set_facecolor(FLUX_GREY)
         if titles:
             panel.set_title(step + (" (ADU)" if step == "raw" and not one_unit else ""))
     return shown

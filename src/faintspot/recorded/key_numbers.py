@@ -201,10 +201,10 @@ def _truth_cells(
     )
     if len(arms) > 1:
         note += (
-            f" The flux gain says how many times less light gives the same R as {last.name!r}; it is a "
+            f" The flux gain says how many times less flux gives the same R as {last.name!r}; it is a "
             "range, as R falls as 1 / flux where read noise rules (lower end when the arm is better) and as "
             "1 / √flux where photon noise does. It is worked out from R at this one flux, not measured by "
-            "dimming the light."
+            "dimming the flux."
         )
     return cells, note
 

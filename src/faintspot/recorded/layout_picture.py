@@ -34,7 +34,7 @@ def layout_picture(
 ) -> None:
     """Write a PNG picture of a frame with the sub-apertures' windows and numbers drawn on it.
 
-    The brightness follows asinh of the light above the sky, cut at the 99.5th percentile of the windows'
+    The brightness follows asinh of the flux above the sky, cut at the 99.5th percentile of the windows'
     pixels, so hot pixels neither hide the spots nor set the scale.
 
     Parameters

@@ -10,8 +10,8 @@ import numpy as np
 from faintspot.recorded.statistics import Floats, Jitter, MeasuredSlopes, SlopesSummary, median
 from faintspot.report.drawing import (
     ARM_COLOURS,
+    FLUX_GREY,
     GREY,
-    LIGHT_GREY,
     MOST_WITH_GAPS,
     WIDTH,
     limits_of,
@@ -204,7 +204,7 @@ def _panels(rows: int, columns: int, layout: Layout) -> tuple[Figure, Any]:
 def _outlines(layout: Layout) -> Any:
     from matplotlib.collections import PolyCollection
 
-    return PolyCollection(list(subaperture_shapes(layout)), facecolors="#f6f6f6", edgecolors=LIGHT_GREY)
+    return PolyCollection(list(subaperture_shapes(layout)), facecolors="#f6f6f6", edgecolors=FLUX_GREY)
 
 
 def longest_arrow(summaries: Sequence[SlopesSummary]) -> tuple[float, int]:

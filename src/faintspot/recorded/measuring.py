@@ -34,7 +34,7 @@ from faintspot.sensor.layout import Layout
 
 _BLOCK_BYTES = 1 << 25  # of float32 frames: large enough for all threads, small beside any memory
 
-_LOOKS_FOR_LIGHT, _FRAMES_FOR_LIGHT = 20, 50  # stretches of frames over the whole recording
+_LOOKS_FOR_FLUX, _FRAMES_FOR_FLUX = 20, 50  # stretches of frames over the whole recording
 
 Progress = Callable[[int, int], None]
 """Called with the number of finished frames and of all frames."""
@@ -79,7 +79,7 @@ def measure_recorded(
     changes: Mapping[str, Any] | None = None,
     device: str = "cpu",
     unit: str = "px",
-    mean_light: bool = False,
+    mean_flux: bool = False,
     reference: NDArray[Any] | str | Path | None = None,
     key: str | None = None,
     threads: int | None = None,
@@ -111,8 +111,8 @@ def measure_recorded(
         "cpu" or "cuda", see `SlopePipeline`.
     unit : {"px", "arcsec"}
         Of positions and standard errors in the output; arcsec needs the layout's `pixel_scale_arcsec`.
-    mean_light : bool
-        Tell the estimator the mean light of every sub-aperture over the recording, instead of letting it take
+    mean_flux : bool
+        Tell the estimator the mean flux of every sub-aperture over the recording, instead of letting it take
         that of each frame: better where the star is faint and steady; see `faintspot.MeanFlux`.
     reference : array or path, optional
         Reference positions, as for `SlopePipeline`, or the file that holds them, as "file" or "file:key", or
@@ -161,8 +161,8 @@ def measure_recorded(
                 f"{source.description}: frames of {source.shape[0]} x {source.shape[1]} pixels, expected "
                 f"{layout.frame_shape[0]} x {layout.frame_shape[1]} as in {configuration_file}"
             )
-        if mean_light:
-            pipeline = _told_mean_light(pipeline, source)
+        if mean_flux:
+            pipeline = _told_mean_flux(pipeline, source)
         attributes = _attributes(pipeline, source, frames, configuration_file, key, unit)
         factor = pixels_in(one_of("unit", unit, UNITS), attributes)
         if positions is not None:
@@ -184,7 +184,7 @@ def measure_recorded(
                 summary.add(slopes)
                 if progress is not None:
                     progress(start + len(block), source.n_frames)
-    prepared = pipeline.preparation.prepared
+    prepared = pipeline.plan.prepared
     summary.failed_frames, summary.failure = prepared.faults, prepared.fault
     return summary
 
@@ -242,22 +242,18 @@ def _layout_command(frames: str | Path, layout: Layout, path: str | Path) -> str
     return shlex.join(words)
 
 
-def _told_mean_light(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
-    """Return the pipeline for the mean light of frames from all over the recording."""
+def _told_mean_flux(pipeline: SlopePipeline, source: FrameSource) -> SlopePipeline:
+    """Return the pipeline for the mean flux of frames from all over the recording."""
     estimator = pipeline.settings.estimator
-    if not estimator.uses_light:
-        raise InputError(f"mean light: the estimator {estimator.name!r} does not use the light of spots")
-    starts = np.unique(
-        np.linspace(0, max(source.n_frames - _FRAMES_FOR_LIGHT, 0), _LOOKS_FOR_LIGHT, dtype=int)
-    )
-    light = [
+    if not estimator.uses_flux:
+        raise InputError(f"mean flux: the estimator {estimator.name!r} does not use the flux of spots")
+    starts = np.unique(np.linspace(0, max(source.n_frames - _FRAMES_FOR_FLUX, 0), _LOOKS_FOR_FLUX, dtype=int))
+    flux = [
         pipeline(block).flux
         for start in starts.tolist()
-        for _, block in source.blocks(
-            start, min(start + _FRAMES_FOR_LIGHT, source.n_frames), _FRAMES_FOR_LIGHT
-        )
+        for _, block in source.blocks(start, min(start + _FRAMES_FOR_FLUX, source.n_frames), _FRAMES_FOR_FLUX)
     ]
-    return pipeline.with_flux(MeanFlux(np.concatenate(light)))
+    return pipeline.with_flux(MeanFlux(np.concatenate(flux)))
 
 
 def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:

@@ -302,7 +302,7 @@ def flux_gain(ratio: float) -> tuple[float, float]:
     """Return the range of the flux gain that a ratio of slope errors stands for.
 
     R falls as 1 / flux where read noise rules and as 1 / sqrt(flux) where photon noise does, so the same R at
-    less light means a gain in flux between the ratio and its square.
+    less flux means a gain in flux between the ratio and its square.
     """
     return min(ratio, ratio**2), max(ratio, ratio**2)
 

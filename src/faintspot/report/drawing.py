@@ -29,7 +29,7 @@ COLOUR_MAP = "cividis"
 ARM_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7")
 TRUTH_COLOUR = "#56B4E9"
 GREY = "#9a9a9a"
-LIGHT_GREY = "#e4e4e4"
+FLUX_GREY = "#e4e4e4"
 DOTS_PER_INCH = 144
 MOST_WITH_GAPS = 600
 """With more sub-apertures than this, gaps between them and outlines would only make a moiré."""

@@ -48,7 +48,7 @@ def find_illuminated(
     *,
     pixels: int | tuple[int, int] | None = None,
     has_dark: bool = False,
-    lit_fraction: float | None = None,
+    illuminated_fraction: float | None = None,
     pupil: Any = None,
     roi: Any = None,
 ) -> KnownGrid:
@@ -65,7 +65,7 @@ def find_illuminated(
     has_dark : bool
         Whether the dark level is subtracted. Else the flux of the dimmest cells counts as none, where they
         stand apart from the bright ones.
-    lit_fraction : float, optional
+    illuminated_fraction : float, optional
         Smallest flux of an illuminated cell, as a part of the median of the bright ones. Default 0.3.
     pupil : (x, y, radius) or (x, y, radius, inner radius), optional
         Take the cells whose centres lie in this disk or annulus (px), whatever their flux.
@@ -81,16 +81,18 @@ def find_illuminated(
     images = grid.images(frame)
     flux = np.nan_to_num(np.nanmean(images.reshape(len(grid), -1), axis=1)) * grid.pixels
     if pupil is not None:
-        lit, doubt = Pupil.given(pupil).holds(grid.centres.view(np.complex128)[:, 0]), ""
+        illuminated, doubt = Pupil.given(pupil).holds(grid.centres.view(np.complex128)[:, 0]), ""
     else:
-        fraction = _LIT_FRACTION if lit_fraction is None else lit_fraction
-        lit, doubt = _illuminated(flux, number_between("lit_fraction", fraction, 0.0, 1.0), has_dark)
-    if not lit.any():
+        fraction = _LIT_FRACTION if illuminated_fraction is None else illuminated_fraction
+        illuminated, doubt = _illuminated(
+            flux, number_between("illuminated_fraction", fraction, 0.0, 1.0), has_dark
+        )
+    if not illuminated.any():
         raise InputError(
             f"grid of {shape[0]} x {shape[1]}: no cell is illuminated, or none is in the pupil; check "
             "frame and dark"
         )
-    return KnownGrid(grid[lit], images[~lit], doubt)
+    return KnownGrid(grid[illuminated], images[~illuminated], doubt)
 
 
 def _whole_grid(
@@ -130,16 +132,19 @@ def _illuminated(flux: NDArray[np.float64], fraction: float, has_dark: bool) -> 
     if bright <= 0:
         return np.zeros(len(flux), dtype=bool), ""
     relative = above / np.median(above[above >= fraction * bright])
-    lit = relative >= fraction
+    illuminated = relative >= fraction
     close = np.count_nonzero((relative > fraction / _CLOSE) & (relative < fraction * _CLOSE))
-    if not lit.all() and np.std(relative[~lit]) > _NOISY:
+    if not illuminated.all() and np.std(relative[~illuminated]) > _NOISY:
         return (
-            lit,
+            illuminated,
             "the flux of the dark cells scatters almost as much as that of the others; average more frames",
         )
-    if close > max(1, _DOUBTFUL * np.count_nonzero(lit)):
-        return lit, f"{close} cells have about {fraction:.2g} of the median flux, which divides lit from dark"
-    return lit, ""
+    if close > max(1, _DOUBTFUL * np.count_nonzero(illuminated)):
+        return (
+            illuminated,
+            f"{close} cells have about {fraction:.2g} of the median flux, which divides lit from dark",
+        )
+    return illuminated, ""
 
 
 def _dark_level(flux: NDArray[np.float64]) -> float:

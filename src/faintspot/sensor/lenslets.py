@@ -13,13 +13,13 @@ from scipy.spatial import cKDTree
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
 from faintspot.sensor.following import follow
+from faintspot.sensor.illumination import Illumination, find_illumination
 from faintspot.sensor.kin import best_kin
 from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std
-from faintspot.sensor.lit import Lit, find_lit
 from faintspot.sensor.nodes import (
     Drift,
-    NodeLight,
-    SpotLight,
+    NodeFlux,
+    SpotFlux,
     find_spots,
     measure_nodes,
     no_drift,
@@ -95,7 +95,7 @@ def find_lenslets(
     geometry: str = "auto",
     pitch_px: float | None = None,
     bad_pixels: Any = None,
-    lit_fraction: float | None = None,
+    illuminated_fraction: float | None = None,
     pupil: Any = None,
     roi: Any = None,
 ) -> LensletGrid:
@@ -103,9 +103,10 @@ def find_lenslets(
 
     The lattice comes from the power spectrum of a map of everything that looks like a spot (see
     faintspot.sensor.lattice), then from a robust least-squares fit to the spots at its nodes. Which lenslets
-    are lit is decided for all together (see faintspot.sensor.lit): a lit one has a spot that stands out of
+    are lit is decided for all together (see faintspot.sensor.illumination):
+    a lit one has a spot that stands out of
     the noise of its own cell, enough flux above its own background, and mostly lit neighbours. So lenslets at
-    the pupil's edge with little light and those behind the central obstruction are left out, and so is one
+    the pupil's edge with low flux and those behind the central obstruction are left out, and so is one
     whose node lies within 0.12 pitch of the frame's edge.
 
     Parameters
@@ -118,11 +119,11 @@ def find_lenslets(
         The pitch, known within 20 %.
     bad_pixels : bool array (ny, nx), optional
         Pixels to ignore; they may hold NaN. Hot pixels and cosmic rays are found without it.
-    lit_fraction : float, optional
+    illuminated_fraction : float, optional
         The smallest flux of a lit lenslet, as a part of the median of the lit ones. Default: the part between
         0.18 and 0.5 that the fewest lenslets have.
     pupil : (x, y, radius) or (x, y, radius, inner radius), optional
-        In pixels: the lenslets whose nodes lie in this disk or annulus are taken, whatever their light.
+        In pixels: the lenslets whose nodes lie in this disk or annulus are taken, whatever their flux.
     roi : (x0, y0, x1, y1), optional
         Only columns x0 to x1 - 1 and rows y0 to y1 - 1 are looked at.
 
@@ -144,8 +145,8 @@ def find_lenslets(
     with 40, and in 12 of 16 at 8 with 16 lenslets. At a ratio of 5 a sixth of the lit lenslets is missed.
     """
     one_of("geometry", geometry, ("auto", *RATIOS))
-    if lit_fraction is not None:
-        lit_fraction = number_between("lit_fraction", lit_fraction, 0.0, 1.0)
+    if illuminated_fraction is not None:
+        illuminated_fraction = number_between("illuminated_fraction", illuminated_fraction, 0.0, 1.0)
     frames, bad = _checked(frame, bad_pixels)
     part = Rectangle.given(roi, frames.shape[-2:])
     corner = complex(part.x0, part.y0)
@@ -157,9 +158,9 @@ def find_lenslets(
     if found is None:
         raise InputError(_nothing_found(image, pitch_range_px, geometry))
     lattice, map_of_spots = found
-    fit = _fitted(image, best_kin(map_of_spots, lattice, pitch_range_px), lit_fraction, circle)
-    lattice, spots, lit = fit.lattice, fit.spots, fit.lit
-    cells = spots.cells[lit.nodes]
+    fit = _fitted(image, best_kin(map_of_spots, lattice, pitch_range_px), illuminated_fraction, circle)
+    lattice, spots, illuminated = fit.lattice, fit.spots, fit.illuminated
+    cells = spots.cells[illuminated.nodes]
     if len(cells) < 4 or np.any(np.ptp(cells, axis=0) < 1):
         raise InputError(_too_few(len(cells), lattice, circle))
     at = lattice.positions(cells) + corner
@@ -169,12 +170,12 @@ def find_lenslets(
         angle_deg=lattice.angle_deg,
         cells=cells - cells.min(axis=0),
         centres=_rows(at),
-        flux=spots.flux[lit.nodes],
-        drifts=_rows(spots.drifts[lit.nodes]),
-        spots=_rows(spots.positions[lit.nodes] + corner),
+        flux=spots.flux[illuminated.nodes],
+        drifts=_rows(spots.drifts[illuminated.nodes]),
+        spots=_rows(spots.positions[illuminated.nodes] + corner),
         spot_px=fit.width_px,
         elsewhere=_rows(fit.elsewhere + corner),
-        doubt=lit.doubt,
+        doubt=illuminated.doubt,
     )
 
 
@@ -268,7 +269,7 @@ def _robust_mean(frames: NDArray[Any]) -> NDArray[np.float64]:
 def _hot_pixels(image: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return the pixels of hot pixels and cosmic rays.
 
-    The light of a spot reaches at least three of a pixel's eight neighbours; a hot pixel reaches none and the
+    The flux of a spot reaches at least three of a pixel's eight neighbours; a hot pixel reaches none and the
     track of a cosmic ray two.
     """
     padded = np.pad(image, 1, mode="edge")
@@ -308,22 +309,26 @@ class _Fit:
 
     lattice: Lattice
     width_px: float
-    spots: NodeLight
-    lit: Lit
+    spots: NodeFlux
+    illuminated: Illumination
     bright: NDArray[np.complex128]
     elsewhere: NDArray[np.complex128]
 
 
 def _fitted(
-    image: NDArray[np.float64], lattice: Lattice, lit_fraction: float | None, pupil: Pupil | None
+    image: NDArray[np.float64], lattice: Lattice, illuminated_fraction: float | None, pupil: Pupil | None
 ) -> _Fit:
     """Fit the lattice to the spots; where spots are left over, follow them from neighbour to neighbour."""
     image = image - np.median(image)
     width_px = spot_width(image, lattice)
     for _ in range(_FIT_PASSES):
         spots = measure_nodes(image, lattice, width_px)
-        lit = find_lit(spots, lattice, lit_fraction)
-        used = lit.nodes if pupil is None else lit.nodes & pupil.holds(lattice.positions(spots.cells))
+        illuminated = find_illumination(spots, lattice, illuminated_fraction)
+        used = (
+            illuminated.nodes
+            if pupil is None
+            else illuminated.nodes & pupil.holds(lattice.positions(spots.cells))
+        )
         if np.count_nonzero(used) < 4:
             break
         before = lattice
@@ -331,57 +336,57 @@ def _fitted(
         if abs(lattice.step - before.step) * max(image.shape) < 0.02 * abs(lattice.step) ** 2:
             break
     everywhere = find_spots(image, lattice, width_px)
-    fit = _lit_of(image, lattice, width_px, lit_fraction, everywhere)
+    fit = _illuminated_of(image, lattice, width_px, illuminated_fraction, everywhere)
     for _ in range(_FIT_PASSES):
-        if not 0 < len(fit.elsewhere) <= np.count_nonzero(fit.lit.nodes):
+        if not 0 < len(fit.elsewhere) <= np.count_nonzero(fit.illuminated.nodes):
             break
         followed = follow(fit.bright, fit.lattice, image.shape)
         if followed is None:
             break
-        better = _lit_of(image, followed[0], width_px, lit_fraction, everywhere, followed[1])
+        better = _illuminated_of(image, followed[0], width_px, illuminated_fraction, everywhere, followed[1])
         reached = len(fit.elsewhere) - len(better.elsewhere)
-        near = np.median(np.abs(better.spots.shifts[better.lit.nodes])) < _FOLLOWED
+        near = np.median(np.abs(better.spots.shifts[better.illuminated.nodes])) < _FOLLOWED
         if not near or reached < max(1.0, min(_REACHED, 0.5 * len(fit.elsewhere))):
             break
         fit = better
     if pupil is not None:
         held = pupil.holds(fit.lattice.positions(fit.spots.cells))
-        return replace(fit, lit=replace(fit.lit, nodes=held, doubt=""))
-    return replace(fit, lit=replace(fit.lit, doubt=_too_many(fit) or fit.lit.doubt))
+        return replace(fit, illuminated=replace(fit.illuminated, nodes=held, doubt=""))
+    return replace(fit, illuminated=replace(fit.illuminated, doubt=_too_many(fit) or fit.illuminated.doubt))
 
 
 def _too_many(fit: _Fit) -> str:
     """Say in one line when the lattice explains only a part of the flux."""
-    count, lit = len(fit.elsewhere), int(np.count_nonzero(fit.lit.nodes))
-    if count <= _PART_ELSEWHERE * lit:
+    count, illuminated = len(fit.elsewhere), int(np.count_nonzero(fit.illuminated.nodes))
+    if count <= _PART_ELSEWHERE * illuminated:
         return ""
     return (
-        f"{count} spots as bright as those of the {lit} lit lenslets belong to none of them, so the lattice "
+        f"{count} spots as bright as those of the {illuminated} lit lenslets belong to none of them, so the "
         "explains only a part of the flux; its pitch or geometry may be wrong, give pitch_px or geometry"
     )
 
 
-def _lit_of(
+def _illuminated_of(
     image: NDArray[np.float64],
     lattice: Lattice,
     width_px: float,
-    lit_fraction: float | None,
-    everywhere: SpotLight,
+    illuminated_fraction: float | None,
+    everywhere: SpotFlux,
     drift: Drift = no_drift,
 ) -> _Fit:
     """Decide which lenslets of a lattice are lit, and which bright spots belong to none of them."""
     spots = measure_nodes(image, lattice, width_px, drift)
-    lit = find_lit(spots, lattice, lit_fraction)
+    illuminated = find_illumination(spots, lattice, illuminated_fraction)
     elsewhere = bright = np.empty(0, dtype=np.complex128)
-    if lit.nodes.any():
-        likeness = float(np.median(spots.likeness[lit.nodes]))
-        bright = everywhere.positions[_bright(everywhere, lit, likeness)]
-        distance = cKDTree(_rows(spots.positions[lit.nodes])).query(_rows(bright))[0]
+    if illuminated.nodes.any():
+        likeness = float(np.median(spots.likeness[illuminated.nodes]))
+        bright = everywhere.positions[_bright(everywhere, illuminated, likeness)]
+        distance = cKDTree(_rows(spots.positions[illuminated.nodes])).query(_rows(bright))[0]
         elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
-    return _Fit(lattice, width_px, spots, lit, bright, elsewhere)
+    return _Fit(lattice, width_px, spots, illuminated, bright, elsewhere)
 
 
-def _bright(spots: SpotLight, lit: Lit, likeness: float) -> NDArray[np.bool_]:
+def _bright(spots: SpotFlux, illuminated: Illumination, likeness: float) -> NDArray[np.bool_]:
     """Return which spots are as bright as those of lit lenslets, and about of their shape."""
     clear = (spots.signal_to_noise > _CLEAR) & (spots.likeness > _LIKE * likeness)
-    return np.asarray(clear & (spots.flux >= lit.least_flux))
+    return np.asarray(clear & (spots.flux >= illuminated.least_flux))

@@ -1,6 +1,6 @@
 """What light is at each node of a lattice: a spot's position, its flux, and how it stands out of the noise.
 
-A spot is a bump on a local background, so its light is measured against a plane that is fitted with it to the
+A spot is a bump on a local background, so its flux is measured against a plane that is fitted with it to the
 pixels of its cell, and its noise is that of the same pixels: haze, gradients, and the spots around it make no
 spot, and noise in one part of the frame hides none in another.
 """
@@ -46,7 +46,7 @@ def no_drift(nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 @dataclass(frozen=True)
-class SpotLight:
+class SpotFlux:
     """Positions, fluxes and significance of spots, each array (n,).
 
     Parameters
@@ -70,7 +70,7 @@ class SpotLight:
 
 
 @dataclass(frozen=True)
-class NodeLight(SpotLight):
+class NodeFlux(SpotFlux):
     """The brightest spot near each node of a lattice, each array (n,).
 
     Parameters
@@ -89,7 +89,7 @@ class NodeLight(SpotLight):
 
 def measure_nodes(
     image: NDArray[np.float64], lattice: Lattice, width_px: float, drift: Drift = no_drift
-) -> NodeLight:
+) -> NodeFlux:
     """Measure the spot of every node whose spot is expected inside the frame.
 
     Parameters
@@ -110,10 +110,10 @@ def measure_nodes(
     cells, drifts, at = cells[inside], drifts[inside], at[inside]
     peaks, _ = _peaks(band, lattice, at)
     spots = _measured(image, band, lattice, width_px, peaks)
-    return NodeLight(**vars(spots), cells=cells, drifts=drifts, shifts=(peaks - at) / lattice.pitch_px)
+    return NodeFlux(**vars(spots), cells=cells, drifts=drifts, shifts=(peaks - at) / lattice.pitch_px)
 
 
-def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> SpotLight:
+def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> SpotFlux:
     """Measure all peaks of a frame that are clearly spots, wherever they lie."""
     band = _band(image, _haze(image, lattice), width_px)
     side = 2 * max(1, int(_APART * lattice.pitch_px)) + 1
@@ -135,7 +135,7 @@ def _measured(
     lattice: Lattice,
     width_px: float,
     peaks: NDArray[np.complex128],
-) -> SpotLight:
+) -> SpotFlux:
     """Fit a spot on a plane to the pixels around each peak."""
     offsets = _cell_offsets(lattice)
     values = _around(image, peaks, offsets)
@@ -154,7 +154,7 @@ def _measured(
     fitted = (numbers[:, 3:] * spot)[:, near]
     flux = (residual[:, near] + fitted).sum(axis=1)
     explained = (fitted**2).sum(axis=1)
-    return SpotLight(
+    return SpotFlux(
         peaks + _subpixel(band, peaks),
         flux,
         np.sqrt(variance * np.count_nonzero(near)),

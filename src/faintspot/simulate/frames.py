@@ -45,8 +45,8 @@ def subapertures(
     shape : (int, int)
         Rows and columns (ny, nx) of each image, px.
     flux_e : float or array_like, shape (n,)
-        Electrons that a spot in the middle of its image leaves within it. Farther out more light is lost,
-        as behind a field stop; turbulence, which spreads the light, loses more too.
+        Electrons that a spot in the middle of its image leaves within it. Farther out more flux is lost,
+        as behind a field stop; turbulence, which spreads the flux, loses more too.
     profile, size, elongation, angle_deg
         The spot's shape, see `faintspot.spots.shapes`.
     position_range_px : float
@@ -140,7 +140,7 @@ def sensor_frames(
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames of a whole Shack-Hartmann sensor in ADU and the true positions of their spots.
 
-    The light of each spot stays within its own window, as behind a field stop. For more frames than fit
+    The flux of each spot stays within its own window, as behind a field stop. For more frames than fit
     into memory, call it again with the same generator: the noise and positions go on.
 
     Parameters
@@ -277,9 +277,9 @@ def _window_pixels(corners: Any, window: tuple[int, int], frame: tuple[int, int]
 def _place_windows(
     images: NDArray[np.float64], pixels: NDArray[np.int64], frame: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Add up the windows' light in each frame; windows may overlap."""
+    """Add up the windows' flux in each frame; windows may overlap."""
     n_pixels = frame[0] * frame[1]
     where = pixels.ravel() + n_pixels * np.arange(len(images))[:, None]
-    light = np.zeros(len(images) * n_pixels)
-    np.add.at(light, where, images)
-    return light.reshape(len(images), *frame)
+    flux = np.zeros(len(images) * n_pixels)
+    np.add.at(flux, where, images)
+    return flux.reshape(len(images), *frame)

@@ -95,8 +95,8 @@ class Photometry:
     def electrons_at_zero(self) -> float:
         """Electrons per sub-aperture and frame of a star of magnitude 0."""
         assert self.zero_point is not None
-        light = self.zero_point * self.area_m2 * self.frame_time_s
-        return light * self.throughput * self.quantum_efficiency
+        flux = self.zero_point * self.area_m2 * self.frame_time_s
+        return flux * self.throughput * self.quantum_efficiency
 
     def electrons(self, magnitude: ArrayLike) -> NDArray[np.float64]:
         """Return the electrons per sub-aperture and frame of stars of these magnitudes.
@@ -117,5 +117,5 @@ class Photometry:
         InputError
             For electrons that are not above 0.
         """
-        light = numbers_between("electrons", electrons, 0.0, math.inf, low_open=True)
-        return np.asarray(-2.5 * np.log10(light / self.electrons_at_zero))
+        flux = numbers_between("electrons", electrons, 0.0, math.inf, low_open=True)
+        return np.asarray(-2.5 * np.log10(flux / self.electrons_at_zero))

@@ -1,7 +1,7 @@
 """How well a spot's position can be measured at all: the Cramer-Rao bound, and photon efficiency.
 
 The bound holds for estimators without bias. An estimator that knows that positions lie within some range
-can do better where the light says little; see `prior_std_px`.
+can do better where the flux says little; see `prior_std_px`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
 """Mean absolute value of a normal distribution of standard deviation 1: R of an estimator at the bound."""
 
 _NOISES = ("exact", "gaussian")
-_SMALLEST_MEAN_E = 1e-6  # pixels with less light say nothing about the position
+_SMALLEST_MEAN_E = 1e-6  # pixels with less flux say nothing about the position
 _LARGEST_TABLED_VARIANCE = 40.0  # above, the expansion of the information is good to 5e-4
 _SMALLEST_TABLED_NOISE_E = 0.05  # below, electrons are counted without error
 _BRACKET = 1e12  # largest and, inverted, smallest flux that photon_efficiency looks at, e-
@@ -47,7 +47,7 @@ class _Spot(NamedTuple):
 
 
 class _Noise(NamedTuple):
-    """What blurs the light of each pixel, in photo-electrons; maps are flattened: (pixels,)."""
+    """What blurs the flux of each pixel, in photo-electrons; maps are flattened: (pixels,)."""
 
     read_noise_e: Floats
     background_e: Floats
@@ -104,17 +104,17 @@ def cramer_rao(
         Standard deviation of a normal distribution around the true position that the estimator knows from
         elsewhere: 1 / prior_std_px^2 is added to the information of x and y (van Trees 1968), so the result
         never exceeds it. Positions uniform within +-a have a standard deviation a / sqrt(3); the bound is
-        then only a guide, since that distribution has edges (R without light is a / 2, not 0.46 a).
+        then only a guide, since that distribution has edges (R without flux is a / 2, not 0.46 a).
     noise : {"exact", "gaussian"}
         "exact": information of Poisson electrons plus Gaussian read noise, summed over the number of
-        electrons. "gaussian": the sum over pixels of (dm/dx)^2 / variance; lower information at low light,
-        the same with much light. Behind a multiplication register both are the latter, with twice the photon
+        electrons. "gaussian": the sum over pixels of (dm/dx)^2 / variance; lower information at low flux,
+        the same with high flux. Behind a multiplication register both are the latter, with twice the photon
         noise: not a strict bound where it sees single electrons, which could be counted.
 
     Returns
     -------
     ndarray, float64, shape of flux_e + (2,)
-        Standard error along x and along y, px; infinite where the image holds no light.
+        Standard error along x and along y, px; infinite where the image holds no flux.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def cramer_rao(
 
 
 def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any) -> NDArray[np.float64]:
-    """Return the share of its light that an estimator would need if it reached the Cramer-Rao bound.
+    """Return the share of its flux that an estimator would need if it reached the Cramer-Rao bound.
 
     (flux at which the bound's slope error R equals the estimator's) / (flux that the estimator used). 1 is
     the limit; more means a bias towards the truth, by a prior for example.
@@ -249,9 +249,9 @@ def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
         for axis in np.eye(2) * step
     )
     image = flat(np.zeros(2))
-    # The wings of a learnt spot scatter around zero: where no light is left its slope tells nothing.
-    lit = image > 0
-    return _Spot(np.where(lit, image, 0.0), along_x * lit, along_y * lit)
+    # The wings of a learnt spot scatter around zero: where no flux is left its slope tells nothing.
+    illuminated = image > 0
+    return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)
 
 
 def _noise(detector: Any, shape: tuple[int, int], exact: bool) -> _Noise:
@@ -285,12 +285,12 @@ def _standard_errors(
     information[:, [0, 1], [0, 1]] += 1 / prior**2
     # In units of each unknown's own error the matrix is well conditioned at any flux.
     scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
-    lit = np.all(scale > 0, axis=1)
+    illuminated = np.all(scale > 0, axis=1)
     errors = np.full((len(scale), 2), prior)
-    if lit.any():
-        scale = scale[lit]
-        inverse = np.linalg.inv(information[lit] / (scale[:, :, None] * scale[:, None, :]))
-        errors[lit] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)[:, :2]) / scale[:, :2]
+    if illuminated.any():
+        scale = scale[illuminated]
+        inverse = np.linalg.inv(information[illuminated] / (scale[:, :, None] * scale[:, None, :]))
+        errors[illuminated] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2)[:, :2]) / scale[:, :2]
     return errors
 
 

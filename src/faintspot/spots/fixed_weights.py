@@ -15,8 +15,8 @@ from faintspot.base.npz import load_fields, save_fields
 
 Floats = NDArray[np.float64]
 
-_FIELDS = ("x", "y", "mean_spot", "light", "index")
-_LARGEST = 1e6  # px, or fractions of the light, for one pixel: beyond, float32 sums say nothing
+_FIELDS = ("x", "y", "mean_spot", "flux", "index")
+_LARGEST = 1e6  # px, or fractions of the flux, for one pixel: beyond, float32 sums say nothing
 _SMALLEST_GAIN = 0.02
 _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
 _SAME = 1e-6  # of the largest weight: what sums in float32 do not tell apart
@@ -38,18 +38,18 @@ class WeightedCentre(NamedTuple):
 class FixedWeights:
     """Weights of the pixels of a sub-aperture whose sums are its slopes; immutable.
 
-    A spot whose image is g, in fractions of its light, is at ``sum x (g - mean_spot)`` px from its reference
+    A spot whose image is g, in fractions of its flux, is at ``sum x (g - mean_spot)`` px from its reference
     position, and the same in y. Hand-made weights, quad cells and the best linear estimate for a known
     distribution of spots are all of this form.
 
     Parameters
     ----------
     x, y : (n_kinds, ny, nx) array, or (ny, nx)
-        px, for all of the light in one pixel.
+        px, for all of the flux in one pixel.
     mean_spot : (n_kinds, ny, nx) array
-        Fraction of the light that is in each pixel of a spot at the reference.
-    light : (n_kinds, ny, nx) array, optional
-        Weights whose sum is the light. Default: 1 in every pixel where x or y count, over what of the mean
+        Fraction of the flux that is in each pixel of a spot at the reference.
+    flux : (n_kinds, ny, nx) array, optional
+        Weights whose sum is the flux. Default: 1 in every pixel where x or y count, over what of the mean
         spot is there.
     index : (n_subapertures,) array of int, optional
         Kind of each sub-aperture. Default: one kind for all.
@@ -69,7 +69,7 @@ class FixedWeights:
     x: Any
     y: Any
     mean_spot: Any
-    light: Any = None
+    flux: Any = None
     index: Any = None
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ class FixedWeights:
         for name in ("y", "mean_spot"):
             if values[name].shape != shape:
                 raise InputError(f"weights.{name}: expected shape {shape} as x, got {values[name].shape}")
-        values["light"] = _light_weights(values) if self.light is None else self._checked_light(shape)
+        values["flux"] = _flux_weights(values) if self.flux is None else self._checked_flux(shape)
         if self.index is not None:
             kinds = numbers_between("weights.index", self.index, 0, shape[0] - 1, integer=True)
             if kinds.ndim != 1:
@@ -93,11 +93,11 @@ class FixedWeights:
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
-    def _checked_light(self, shape: tuple[int, ...]) -> Floats:
-        maps = numbers_between("weights.light", self.light, -_LARGEST, _LARGEST).astype(np.float64)
+    def _checked_flux(self, shape: tuple[int, ...]) -> Floats:
+        maps = numbers_between("weights.flux", self.flux, -_LARGEST, _LARGEST).astype(np.float64)
         maps = maps[None] if maps.ndim == 2 else maps
         if maps.shape != shape:
-            raise InputError(f"weights.light: expected shape {shape} as x, got {maps.shape}")
+            raise InputError(f"weights.flux: expected shape {shape} as x, got {maps.shape}")
         return maps
 
     @property
@@ -124,7 +124,7 @@ class FixedWeights:
         return kinds
 
     def weighted_centre(self) -> WeightedCentre:
-        """Return the same as a weighted centre of gravity, divided by the light of the frame.
+        """Return the same as a weighted centre of gravity, divided by the flux of the frame.
 
         Raises
         ------
@@ -132,19 +132,19 @@ class FixedWeights:
             When x and y do not follow from one map of weights: those of a Gaussian window do.
         """
         rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in self.window)
-        counted = (self.x != 0) | (self.y != 0) | (self.light != 0)
-        largest = np.abs(self.light).max(axis=(1, 2), keepdims=True)
+        counted = (self.x != 0) | (self.y != 0) | (self.flux != 0)
+        largest = np.abs(self.flux).max(axis=(1, 2), keepdims=True)
         gains, references = [], []
         for maps, along in ((self.x, columns), (self.y, rows[:, None])):
-            moved = self.light * along
+            moved = self.flux * along
             # The best gain and offset of each kind, by least squares.
-            parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.light)]
-            seen = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.light)]
+            parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.flux)]
+            seen = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.flux)]
             determinant = parts[0] * parts[2] - parts[1] ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
                 gain = (parts[2] * seen[0] - parts[1] * seen[1]) / determinant
                 offset = (parts[0] * seen[1] - parts[1] * seen[0]) / determinant
-                rest = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.light)
+                rest = np.abs(maps - gain[:, None, None] * moved - offset[:, None, None] * self.flux)
                 spot = (maps * self.mean_spot).sum(axis=(1, 2))
                 reference = (spot - offset) / gain
             if not (np.isfinite(gain) & np.isfinite(reference)).all() or not np.all(
@@ -156,7 +156,7 @@ class FixedWeights:
                 )
             gains.append(gain)
             references.append(reference)
-        weights = np.where(counted, self.light / largest, 0.0)
+        weights = np.where(counted, self.flux / largest, 0.0)
         return WeightedCentre(weights, np.stack(gains, axis=1), np.stack(references, axis=1))
 
     @classmethod
@@ -180,11 +180,11 @@ class FixedWeights:
         ----------
         images : (n_spots, ny, nx) array
             Images without noise, or nearly so, in any unit: of simulated residual wavefronts, or recorded in
-            bright light.
+            high flux.
         positions : (n_spots, 2) array
             Of these spots, px from the reference: what a slope should be.
         flux_e, read_noise_e : float
-            Light of a spot and read noise to be prepared for, photo-electrons.
+            Flux of a spot and read noise to be prepared for, photo-electrons.
         excess_noise : float
             Factor on the photon noise's variance.
         background_e : float
@@ -193,7 +193,7 @@ class FixedWeights:
         Raises
         ------
         InputError
-            For fewer than two spots, images without light, arrays that do not fit together, or positions
+            For fewer than two spots, images without flux, arrays that do not fit together, or positions
             that do not vary.
         """
         spots = finite_array("images", images).astype(np.float64)
@@ -203,28 +203,28 @@ class FixedWeights:
                 "images, positions: expected shapes (n, ny, nx) and (n, 2), "
                 f"got {spots.shape} and {truth.shape}"
             )
-        flux = number_between("flux_e", flux_e, 0.0, low_open=True)
+        expected = number_between("flux_e", flux_e, 0.0, low_open=True)
         noise = number_between("read_noise_e", read_noise_e, 0.0)
         dark = noise**2 + excess_noise * number_between("background_e", background_e, 0.0)
-        light = spots.sum(axis=(1, 2)).mean()
-        if light <= 0:
-            raise InputError(f"images: expected light, got a mean sum of {light:g}")
-        flat = spots.reshape(len(spots), -1) / light
+        total = spots.sum(axis=(1, 2)).mean()
+        if total <= 0:
+            raise InputError(f"images: expected flux, got a mean sum of {total:g}")
+        flat = spots.reshape(len(spots), -1) / total
         mean = flat.mean(axis=0)
         away, moved = flat - mean, truth - truth.mean(axis=0)
         if not np.all(moved.std(axis=0) > 0):
             raise InputError("positions: expected spots that move in x and y, got the same position always")
-        variance = dark + excess_noise * flux * np.maximum(mean, 0.0)
-        covariance = flux**2 * (away.T @ away) / len(flat)
+        variance = dark + excess_noise * expected * np.maximum(mean, 0.0)
+        covariance = expected**2 * (away.T @ away) / len(flat)
         covariance[np.diag_indices_from(covariance)] += variance + _RIDGE * variance.mean()
-        crossed = flux * away.T @ moved / len(flat)
-        weights = flux * np.linalg.solve(covariance, crossed)
+        crossed = expected * away.T @ moved / len(flat)
+        weights = expected * np.linalg.solve(covariance, crossed)
         gain = ((away @ weights) * moved).mean(axis=0) / moved.var(axis=0)
         weights /= np.maximum(gain, _SMALLEST_GAIN)
         shape = spots.shape[1:]
         weights[np.abs(weights) < _LEAST_WEIGHT * np.abs(weights).max()] = 0.0
         along, across = weights.T.reshape(2, *shape)
-        return cls(along, across, mean.reshape(shape), _best_light(mean, variance).reshape(shape))
+        return cls(along, across, mean.reshape(shape), _best_flux(mean, variance).reshape(shape))
 
     def save(self, path: str | Path) -> None:
         """Write the weights to a file (.npz).
@@ -245,7 +245,7 @@ class FixedWeights:
         InputError
             When the file cannot be read or holds something else.
         """
-        return load_fields(cls, path, "fixed weights", _FIELDS, optional=("light", "index"))
+        return load_fields(cls, path, "fixed weights", _FIELDS, optional=("flux", "index"))
 
 
 def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
@@ -253,18 +253,18 @@ def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
     return (first, first), (first, second), (second, second)
 
 
-def _light_weights(values: dict[str, Any]) -> Floats:
+def _flux_weights(values: dict[str, Any]) -> Floats:
     """1 where x or y count, over what of the mean spot is there."""
     counted = ((values["x"] != 0) | (values["y"] != 0)).astype(np.float64)
     there = (counted * values["mean_spot"]).sum(axis=(1, 2), keepdims=True)
     if np.any(there <= 0):
-        raise InputError("weights.mean_spot: expected light in the pixels that count, got none")
-    light: Floats = counted / there
-    return light
+        raise InputError("weights.mean_spot: expected flux in the pixels that count, got none")
+    flux: Floats = counted / there
+    return flux
 
 
-def _best_light(mean: Floats, variance: Floats) -> Floats:
-    """Weights of the light with the least noise, for a spot at its mean."""
+def _best_flux(mean: Floats, variance: Floats) -> Floats:
+    """Weights of the flux with the least noise, for a spot at its mean."""
     weights = np.maximum(mean, 0.0) / variance
-    light: Floats = weights / (weights @ mean)
-    return light
+    flux: Floats = weights / (weights @ mean)
+    return flux

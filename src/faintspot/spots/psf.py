@@ -25,7 +25,7 @@ _LONGEST_SIDE = 4097  # beyond, singular values take minutes
 _HIGHEST_RANK = 8
 _RANK_TOLERANCE = 2e-3  # of the peak: what the separable terms may leave out
 _BLOCK_PIXELS = 1 << 21
-_LARGEST_FRACTION = 1e6  # of a spot's light in a pixel: beyond, samples cancel each other's light
+_LARGEST_FRACTION = 1e6  # of a spot's flux in a pixel: beyond, samples cancel each other's light
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class PSF:
     Parameters
     ----------
     samples : (n_psfs, rows, columns) or (rows, columns) array
-        Fraction of a spot's light that falls into a pixel whose centre is at offset (dx, dy) px from the
+        Fraction of a spot's flux that falls into a pixel whose centre is at offset (dx, dy) px from the
         spot's position; node (r, c) is at dx = (c - (columns - 1) / 2) / oversampling and
         dy = (r - (rows - 1) / 2) / oversampling. Odd numbers of rows and columns, at least 5. The sum must
-        be positive and is normalised: the light of all pixels together is 1 on average.
+        be positive and is normalised: the flux of all pixels together is 1 on average.
     oversampling : int
         Nodes per pixel.
     index : (n_subapertures,) array of int, optional
@@ -51,7 +51,7 @@ class PSF:
     Raises
     ------
     InputError
-        For samples that are not finite, of the wrong shape or without light, or an index out of range.
+        For samples that are not finite, of the wrong shape or without flux, or an index out of range.
 
     Examples
     --------
@@ -87,13 +87,13 @@ class PSF:
             raise InputError(
                 f"psf.samples: expected at most {_LONGEST_SIDE} rows and columns, got {samples.shape}"
             )
-        light = samples.sum(axis=(1, 2), keepdims=True)
-        if np.any(light <= 0):
-            raise InputError(f"psf.samples: expected a positive sum, got {light.min():g}")
-        samples = samples * (self.oversampling**2 / light)
+        flux = samples.sum(axis=(1, 2), keepdims=True)
+        if np.any(flux <= 0):
+            raise InputError(f"psf.samples: expected a positive sum, got {flux.min():g}")
+        samples = samples * (self.oversampling**2 / flux)
         if not np.abs(samples).max() <= _LARGEST_FRACTION:
             raise InputError(
-                f"psf.samples: expected up to {_LARGEST_FRACTION:g} times a spot's light in a pixel, "
+                f"psf.samples: expected up to {_LARGEST_FRACTION:g} times a spot's flux in a pixel, "
                 f"got {np.abs(samples).max():g}"
             )
         samples.flags.writeable = False

@@ -204,10 +204,10 @@ class TrainedScore:
         else:
             positions = home
         positions = np.clip(positions, home - half, home + half)
-        lit = np.maximum(flux, np.finfo(np.float32).tiny)
+        illuminated = np.maximum(flux, np.finfo(np.float32).tiny)
         for kind, level, members in self._groups(leading, self.flux_class(flux)):
             members = members[flux[members] > 0]
-            relative = flat[members] / lit[members, None, None]
+            relative = flat[members] / illuminated[members, None, None]
             for tables in self.tables[kind, level]:
                 rounded = np.rint(positions[members] * self.steps_per_px) / self.steps_per_px
                 moved = rounded + table_sums(relative, rounded, tables, self.steps_per_px)
@@ -303,7 +303,7 @@ def smoothed_peak(
     """Centre of the largest pixel of each smoothed image: (n, 2), px.
 
     Only pixels count whose centre is within `search_range_px` + 0.5 of the reference, on both axes. The
-    Gaussian reaches 2.5 standard deviations; beyond the image there is no light.
+    Gaussian reaches 2.5 standard deviations; beyond the image there is no flux.
     """
     n, ny, nx = images.shape
     reach = int(np.ceil(2.5 * smoothing_px))

@@ -215,7 +215,7 @@ def _axis_fractions(centre: Floats, width: Floats, n: int, kind: _Profile) -> Fl
     """Return the fraction of a one-dimensional spot that falls into each of n pixels, shape (spots, n)."""
     edges = np.arange(n + 1) - n / 2
     cumulative = kind.cumulative((edges - centre[:, None]) / width[:, None])
-    # Round-off in the far wings must not turn into negative light.
+    # Round-off in the far wings must not turn into negative flux.
     return np.maximum(np.diff(cumulative, axis=1), 0.0)
 
 

@@ -67,7 +67,7 @@ def speckled_spots(
     shape : (int, int)
         Rows and columns (ny, nx) of each image, px.
     size : float or array_like, shape (n,)
-        lambda / d = 2 px * size, at least 0.05. Images wider than 40 lambda / d get too much of the light in
+        lambda / d = 2 px * size, at least 0.05. Images wider than 40 lambda / d get too much of the flux in
         their outskirts.
     position_range_px : float
         Positions are uniform within plus and minus this, on each axis, px.
@@ -82,7 +82,7 @@ def speckled_spots(
     truth : {"gradient", "centre_of_gravity"}
         "gradient": the mean gradient of the phase over the sub-aperture, which is what a wavefront sensor
         is to measure, as the displacement it gives the spot. It is also the centre of gravity of all the
-        light, in and outside the image. "centre_of_gravity": that of the light within the image, without
+        light, in and outside the image. "centre_of_gravity": that of the flux within the image, without
         noise.
     rng : numpy.random.Generator, optional
         Where positions and phases come from, each from a generator of its own.

@@ -89,7 +89,7 @@ def fit_passes(sample: Sample, basis: SplineTables, passes: int) -> NDArray[np.f
 def best_passes(held_out: Sample, tables: NDArray[np.float32]) -> tuple[NDArray[np.float32], Floats]:
     """Leave out the passes that raise the error on a sample that they were not trained on.
 
-    At little light a further pass adds noise: it forgets what the one before it made of the start. Elsewhere
+    At low flux a further pass adds noise: it forgets what the one before it made of the start. Elsewhere
     it helps spots that are farther away than those of the training, so that only a clear loss counts. In the
     place of those left out come as many without effect, before the others.
 

@@ -78,14 +78,14 @@ def fit_psf(sums: Sums, form: Form, radius_px: float) -> Fit:
 def held_out_loss(sums: Sums, fit: Fit) -> float:
     """Return the weighted square of what a fit to other spots leaves, but for a constant."""
     b = fit.background_e
-    light = sums.square * fit.plane**2 - 2 * fit.plane * (sums.product - b * sums.cross)
-    return float(light.sum() + b * b * sums.weight - 2 * b * sums.image)
+    flux = sums.square * fit.plane**2 - 2 * fit.plane * (sums.product - b * sums.cross)
+    return float(flux.sum() + b * b * sums.weight - 2 * b * sums.image)
 
 
 def choose_form(halves: Sequence[tuple[Sums, Sums]], n_spots: float, radius_px: float) -> Form:
     """Return the form whose fit to one half of the spots predicts the other half best.
 
-    A product is preferred, as it is faster to measure spots with, unless the light that it leaves out stands
+    A product is preferred, as it is faster to measure spots with, unless the flux that it leaves out stands
     out of a single spot's noise: being point-symmetric it moves no position by itself, and on real spots the
     slope error was the same with and without it even where it stood out more than that.
     """
@@ -111,12 +111,12 @@ def core_moments(sums: Sums) -> Floats:
     """
     u = offsets(len(sums.square))
     y, x = np.meshgrid(u, u, indexing="ij")
-    light = np.divide(sums.product, sums.square, out=np.zeros_like(sums.square), where=sums.square > 0)
+    flux = np.divide(sums.product, sums.square, out=np.zeros_like(sums.square), where=sums.square > 0)
     moments = np.diag([1.5, 1.5])
     for _ in range(_MOMENT_STEPS):
         inverse = np.linalg.inv(moments)
         exponent = inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y
-        values = light * np.exp(-0.5 * exponent)
+        values = flux * np.exp(-0.5 * exponent)
         total = max(values.sum(), _TINY)
         xx, xy, yy = ((values * product).sum() / total for product in (x * x, x * y, y * y))
         # The weight halved the covariance. Stay within what the grid can show.

@@ -53,7 +53,7 @@ class LearntPSF:
 
     psf: PSF
     background_e: NDArray[np.float64]
-    """Constant light left in the images, electrons per pixel, for each PSF."""
+    """Constant flux left in the images, electrons per pixel, for each PSF."""
     positions: NDArray[np.float64]
     """Of every spot, (n, 2): x and y, px from the image's centre."""
     flux_e: NDArray[np.float64]
@@ -354,7 +354,7 @@ def _learn(
             raise InputError(f"index: expected spots for each PSF, got none for {batch[0]} to {batch[-1]}")
         part = _batch(state, batch, spots)
         learnt.append((spots, learn(stack.part(spots), index[spots] - batch[0], part, options, rng, advance)))
-    return _gathered(learnt, index, options)
+    return _page_state(learnt, index, options)
 
 
 def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> State:
@@ -365,7 +365,7 @@ def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> 
     return State(psf, state.background_e[which], state.form, found)
 
 
-def _gathered(
+def _page_state(
     learnt: list[tuple[NDArray[np.int64], State]], index: NDArray[np.int64], options: Options
 ) -> LearntPSF:
     """Put the batches together."""

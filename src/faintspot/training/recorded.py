@@ -46,7 +46,7 @@ class _Splitter:
         self,
         images: Floats,
         flux: Floats,
-        light: Floats,
+        subaperture_flux: Floats,
         reference: Floats,
         rng: np.random.Generator,
     ) -> tuple[Sample, Floats]:
@@ -63,7 +63,7 @@ class _Splitter:
         part_a = p * images + z
         lever = self.levers(images.shape[1:], reference)
         weights = (
-            lever / light[:, None, None, None]
+            lever / subaperture_flux[:, None, None, None]
         )  # of the pixels, in the centre of gravity: (n, 2, ny, nx)
         moments = np.einsum("naij,nij->na", weights, images * (1 - p) - z) / (1 - p)
         target_variance = (1 - p) ** 2 * variance + p * (1 - p) * usable
@@ -71,14 +71,14 @@ class _Splitter:
         start = reference
         if self.start == "peak":
             start = smoothed_peak(part_a, self.smoothing_px, reference, self.search_range_px)
-        lit = flux[:, None, None]
+        illuminated = flux[:, None, None]
         sample = Sample(
-            (part_a / (p * lit)).astype(np.float32),
+            (part_a / (p * illuminated)).astype(np.float32),
             reference + moments,
             start,
             reference - self.search_range_px,
             reference + self.search_range_px,
-            (weights * ((variance - usable) / lit)[:, None]).astype(np.float32),
+            (weights * ((variance - usable) / illuminated)[:, None]).astype(np.float32),
         )
         return sample, noise
 
@@ -131,7 +131,7 @@ def train_from_frames(
 
     Each image is split into two parts whose noises are not correlated. The regression's features come from
     one, its target is the centre of gravity of the other: that is noisy, but right on average, and the
-    regression needs no more. The features' part has less light; its photon and read noise keep their
+    regression needs no more. The features' part has less flux; its photon and read noise keep their
     proportion, and the score is meant for the whole images' flux, for which it is a little too cautious. The
     standard errors are those of the part, which has more noise than whole images. Where images are few and
     the read noise high they are rough, and have come out a third too small.
@@ -168,13 +168,13 @@ def train_from_frames(
     passes : int
         1 to 8.
     fraction : float
-        Part of the light that the features are made of.
+        Part of the flux that the features are made of.
     draws : int
         Times that each image is split, at most: more help as long as images are few, so that there are fewer
         draws of more than 10,000 images or so.
     target_radius_px : float, optional
         Pixels farther from the reference are left out of the centre of gravity: much less read noise, and a
-        gain that is smaller by the light that moves across the border. 5 px suits spots that are not
+        gain that is smaller by the flux that moves across the border. 5 px suits spots that are not
         speckled; speckled ones want all pixels. Default: no limit.
     rng : numpy.random.Generator, optional
         Where the splits come from.
@@ -189,7 +189,7 @@ def train_from_frames(
     Raises
     ------
     InputError
-        For frames that are not finite or without light, too few images, or a value out of range.
+        For frames that are not finite or without flux, too few images, or a value out of range.
 
     Examples
     --------
@@ -243,29 +243,29 @@ def train_from_frames(
 
 @dataclass(frozen=True)
 class _Recorded:
-    """Recorded images with their light."""
+    """Recorded images with their flux."""
 
     images: Floats
     """(n_frames, n_subapertures, ny, nx)."""
     flux: Floats
     """(n_frames,): mean of the windows' sums."""
-    relative_light: Floats
+    relative_flux: Floats
     """(n_subapertures,): light within the target's radius, in units of the frame's flux."""
     reference: Floats
     """(n_subapertures, 2)."""
 
     @classmethod
     def of(cls, images: Floats, splitter: _Splitter, reference: Floats) -> _Recorded:
-        """Measure the light."""
+        """Measure the flux."""
         flux = images.sum(axis=(2, 3)).mean(axis=1)
         near = splitter.near(images.shape[2:], reference)
-        light = np.sum(images.mean(axis=0) * near, axis=(1, 2))
-        if flux.min() <= 0 or light.min() <= 0:
+        relative = np.sum(images.mean(axis=0) * near, axis=(1, 2))
+        if flux.min() <= 0 or relative.min() <= 0:
             raise InputError(
-                f"frames: expected light in every frame and sub-aperture, got {flux.min():.3g} e- a spot "
-                f"in the faintest frame and {light.min():.3g} e- in the faintest sub-aperture"
+                f"frames: expected flux in every frame and sub-aperture, got {flux.min():.3g} e- a spot "
+                f"in the faintest frame and {relative.min():.3g} e- in the faintest sub-aperture"
             )
-        return cls(images, flux, light / flux.mean(), reference)
+        return cls(images, flux, relative / flux.mean(), reference)
 
     def classes(self) -> tuple[NDArray[np.int64], Floats]:
         """Class of each frame, and the classes' mean fluxes; none without frames."""
@@ -316,7 +316,7 @@ class _Recorded:
         sample, target_noise = self.split(frames, subapertures, splitter, rng)
         final, errors = sample.rms_errors(tables)
         squares = errors[-1] ** 2 - target_noise.mean(axis=0)
-        images, flux = self.light_of(frames, subapertures)[:2]
+        images, flux = self.flux_of(frames, subapertures)[:2]
         variance = np.maximum(splitter.variance(images), 0.0) / (splitter.fraction * flux**2)[:, None, None]
         least = table_sums(variance, final, tables[-1] ** 2, STEPS_PER_PX).mean(axis=0)
         if basis.symmetry == "round":
@@ -324,13 +324,13 @@ class _Recorded:
         standard_error: Floats = np.sqrt(np.maximum(squares, least))
         return standard_error
 
-    def light_of(
+    def flux_of(
         self, frames: NDArray[np.int64], subapertures: NDArray[np.int64]
     ) -> tuple[Floats, Floats, Floats]:
-        """Images of some frames and sub-apertures, their expected flux, and their light within the radius."""
+        """Images of some frames and sub-apertures, their expected flux, and their flux within the radius."""
         images = self.images[np.ix_(frames, subapertures)].reshape(-1, *self.images.shape[2:])
         flux = np.repeat(self.flux[frames], len(subapertures))
-        return images, flux, flux * np.tile(self.relative_light[subapertures], len(frames))
+        return images, flux, flux * np.tile(self.relative_flux[subapertures], len(frames))
 
     def split(
         self,
@@ -341,7 +341,7 @@ class _Recorded:
     ) -> tuple[Sample, Floats]:
         """Split the images of some frames and sub-apertures once."""
         reference = np.tile(self.reference[subapertures], (len(frames), 1))
-        return splitter.sample(*self.light_of(frames, subapertures), reference, rng)
+        return splitter.sample(*self.flux_of(frames, subapertures), reference, rng)
 
 
 def _images_and_reference(

@@ -32,9 +32,9 @@ class Stack:
     usable: NDArray[np.bool_] | None
     """(n, ny, nx), None where all pixels are usable."""
     variance_e2: float
-    """Variance of a pixel without light."""
+    """Variance of a pixel without flux."""
     excess_noise: float
-    """Variance for each electron of light: 1, or 2 behind a multiplication register."""
+    """Variance for each electron of flux: 1, or 2 behind a multiplication register."""
 
     def without(self, background_e: Floats) -> Stack:
         """Return the images less a background (n,), whose noise stays."""
@@ -169,7 +169,7 @@ def register(
 
 
 def weights(stack: Stack, model: NDArray[Any], flux: Floats) -> NDArray[np.float32]:
-    """Return one over the variance of every pixel under a model of the light; 0 in bad pixels."""
+    """Return one over the variance of every pixel under a model of the flux; 0 in bad pixels."""
     floor = (stack.variance_e2 + _WEIGHT_FLOOR * flux).astype(np.float32)
     result = 1 / (floor[:, None, None] + np.float32(stack.excess_noise) * np.maximum(model, 0))
     return result if stack.usable is None else result * stack.usable  # type: ignore[no-any-return]

@@ -88,7 +88,7 @@ class RunningPSF:
 
     @property
     def background_e(self) -> NDArray[np.float64]:
-        """Constant light left in the images, electrons per pixel, for each PSF."""
+        """Constant flux left in the images, electrons per pixel, for each PSF."""
         return self._state.background_e.copy()
 
     def update(

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 _BEYOND = 0.01  # share of the spots that may be farther out
 _SMALLEST_STEP_PX, _STEPS_PER_SIDE = 0.25, 64
-_LIGHT_CLASS = 1.25  # ratio of the fluxes of sub-apertures that share a table
+_FLUX_CLASS = 1.25  # ratio of the fluxes of sub-apertures that share a table
 _FAINTEST = 0.05  # of the mean flux
 _WEIGHT_FLOOR = 1e-3  # of the flux, in electrons squared: faint wings are not known exactly
 _ITERATIONS = 200
@@ -164,9 +164,9 @@ class _Squares:
         the likelihood is linear in them.
         """
         flux = np.maximum(images.flux_e, max(_FAINTEST * images.flux_e.mean(), 1e-3))
-        light = np.rint(np.log(flux) / math.log(_LIGHT_CLASS))
+        level = np.rint(np.log(flux) / math.log(_FLUX_CLASS))
         middle = np.rint(images.references / self.step_px)
-        groups, which = np.unique(np.column_stack([light, middle]), axis=0, return_inverse=True)
+        groups, which = np.unique(np.column_stack([level, middle]), axis=0, return_inverse=True)
         pixels = images.pixels_e.reshape(len(flux), -1) / images.excess_noise
         evidence, offset = np.empty((len(flux), len(self.radii_px))), 0.0
         for number, (_, *reference) in enumerate(groups):

@@ -173,7 +173,7 @@ def train_estimator(
 
     Each pass is a ridge regression of the remaining position error on projections of the image on cubic
     B-splines around the position so far, with the symmetry of the spots built in. The estimate is close to
-    the mean of the positions that the image allows: at little light it tends to the start, and its gain falls
+    the mean of the positions that the image allows: at low flux it tends to the start, and its gain falls
     below 1 (see `position_range_px`).
 
     Parameters
@@ -198,7 +198,7 @@ def train_estimator(
     position_range_px : float
         Training positions are uniform within plus and minus this around the reference on each axis: the
         prior. Spots twice as far away as that may be lost; a range of 3 px costs nothing near the
-        diffraction limit with light enough to see the spot. References fall anywhere within 0.5 px of the
+        diffraction limit with flux enough to see the spot. References fall anywhere within 0.5 px of the
         window's centre.
     search_range_px : float, optional
         Estimates stay within plus and minus this around the reference. Default: half the longer side.
@@ -206,7 +206,7 @@ def train_estimator(
         Where the first pass starts. Default: the reference, where positions are within lambda / d of it,
         else the peak of the smoothed image.
     passes : int
-        Most passes, 1 to 8. At little light fewer are better; those left out are tables of zeros.
+        Most passes, 1 to 8. At low flux fewer are better; those left out are tables of zeros.
     realisations : int
         Spots to train on for each kind and class; a quarter as many again measure the error.
     rng : numpy.random.Generator, optional

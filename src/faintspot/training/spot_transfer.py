@@ -20,7 +20,7 @@ _ITERATIONS = 10
 _GROUPS = 16  # of images, for standard errors
 _STEP_PX = 0.05  # of the PSF's derivatives
 _LARGEST_EXCESS = 100.0  # times the expected variance: pixels above that are left out as flickering
-_FAINTEST = 8.0  # median light of a spot in standard errors: below, its own noise spoils the line
+_FAINTEST = 8.0  # median flux of a spot in standard errors: below, its own noise spoils the line
 _LARGEST_LIKENESS = 0.04  # correlation of neighbouring pixels where there is light
 _LIT = 0.1  # of the peak
 
@@ -32,7 +32,7 @@ class SpotTransfer:
     gain_e_per_adu: float
     gain_e_per_adu_error: float
     read_noise_adu: float
-    """0 where the noise of dark pixels is not above that of their light."""
+    """0 where the noise of dark pixels is not above that of their flux."""
     background_adu: float
     """Constant level left in the images."""
     problem: str | None
@@ -41,13 +41,13 @@ class SpotTransfer:
 
 @dataclass(frozen=True)
 class _Noise:
-    """Variance of a pixel in ADU^2: `dark` + `slope` * its light in ADU."""
+    """Variance of a pixel in ADU^2: `dark` + `slope` * its flux in ADU."""
 
     dark: float
     slope: float
 
-    def of(self, light: Floats) -> Floats:
-        return self.dark + self.slope * np.maximum(light, 0.0)
+    def of(self, flux: Floats) -> Floats:
+        return self.dark + self.slope * np.maximum(flux, 0.0)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class _Residuals:
     """What is left, divided by the root of `share`."""
     share: Floats
     """Of a pixel's variance that the fit leaves."""
-    light: Floats
+    flux: Floats
     neighbours: Floats
     """(n, ny, nx - 1) product of neighbouring pixels of `left`, less what the fit makes of white noise."""
     significance: Floats
@@ -73,9 +73,9 @@ def measure_on_spots(
 ) -> SpotTransfer:
     """Measure gain and read noise on images of single spots, wherever each of them is.
 
-    A PSF is learnt from all images and fitted to each, with position, light and background of its own. What
+    A PSF is learnt from all images and fitted to each, with position, flux and background of its own. What
     is left has, pixel by pixel, the variance read noise^2 + light / gain, less what the fit takes away, so
-    that movements from image to image do not count, however large. Pixels without light tell the read noise.
+    that movements from image to image do not count, however large. Pixels without flux tell the read noise.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def measure_on_spots(
         As `faintspot.training.learn_psf_from_images`: for fewer than 20 spots that tell their position.
     """
     stack = image_stack("images", images).astype(np.float64)
-    # Variance in ADU^2 for each ADU of light, times the gain.
+    # Variance in ADU^2 for each ADU of flux, times the gain.
     excess = (2.0 if em_gain > 1 else 1.0) * number_between("em_gain", em_gain, 1.0)
     first_row = stack[:, 0]
     noise = _Noise(float(np.median(np.square(first_row - np.median(first_row)))) + 1e-9, excess)
@@ -130,41 +130,41 @@ def _fitted_psf(
 
 
 def _residuals(images: Floats, psf: PSF, positions: Floats, flux: Floats, noise: _Noise) -> _Residuals:
-    """Fit position, light and background of every image by weighted least squares; return what is left."""
+    """Fit position, flux and background of every image by weighted least squares; return what is left."""
     n, shape = len(images), images.shape[1:]
 
     def spots(*step: float) -> Floats:
         return psf.images(positions + step, shape, flux).reshape(n, -1)
 
-    light = spots(0.0, 0.0)
+    model = spots(0.0, 0.0)
     slopes = [
         (spots(dx, dy) - spots(-dx, -dy)) / (2 * _STEP_PX) for dx, dy in ((_STEP_PX, 0.0), (0.0, _STEP_PX))
     ]
-    terms = np.stack([*slopes, light, np.ones_like(light)], axis=-1)
+    terms = np.stack([*slopes, model, np.ones_like(model)], axis=-1)
     size = np.linalg.norm(terms, axis=1, keepdims=True) + 1e-300
     terms /= size
-    weighted = terms / noise.of(light)[..., None]
+    weighted = terms / noise.of(model)[..., None]
     inverse = np.linalg.pinv(np.einsum("npa,npb->nab", weighted, terms), hermitian=True)
-    left = images.reshape(n, -1) - light
+    left = images.reshape(n, -1) - model
     left -= np.einsum("npa,nab,nqb,nq->np", terms, inverse, weighted, left, optimize=True)
     share = 1 - np.einsum("npa,nab,npb->np", terms, inverse, weighted, optimize=True)
     share = np.maximum(share, 1e-3)
     significance = size[:, 0, 2] / np.sqrt(np.maximum(inverse[:, 2, 2], 1e-300))
-    left, share, light = (part.reshape(n, *shape) for part in (left / np.sqrt(share), share, light))
+    left, share, model = (part.reshape(n, *shape) for part in (left / np.sqrt(share), share, model))
     terms = (terms / np.sqrt(share).reshape(n, -1, 1)).reshape(n, *shape, -1)
     expected = -np.einsum("nyxa,nab,nyxb->nyx", terms[:, :, 1:], inverse, terms[:, :, :-1], optimize=True)
     neighbours = left[:, :, 1:] * left[:, :, :-1] - expected
-    return _Residuals(left, share, light, neighbours, significance)
+    return _Residuals(left, share, model, neighbours, significance)
 
 
 def _line(residuals: _Residuals, noise: _Noise) -> _Noise:
-    """Fit variance = dark + slope * light; pixels count by what the fit has left of them."""
-    variance, light = np.square(residuals.left), residuals.light
+    """Fit variance = dark + slope * flux; pixels count by what the fit has left of them."""
+    variance, flux = np.square(residuals.left), residuals.flux
     for _ in range(_ITERATIONS):
-        expected = noise.of(light)
+        expected = noise.of(flux)
         weight = residuals.share * (variance < _LARGEST_EXCESS * expected) / np.square(expected)
-        ones, first, second = (float(np.sum(weight * light**power)) for power in range(3))
-        zeroth, moment = float(np.sum(weight * variance)), float(np.sum(weight * variance * light))
+        ones, first, second = (float(np.sum(weight * flux**power)) for power in range(3))
+        zeroth, moment = float(np.sum(weight * variance)), float(np.sum(weight * variance * flux))
         spread = ones * second - first**2
         if spread <= 0:
             break
@@ -180,18 +180,20 @@ def _problem(residuals: _Residuals, noise: _Noise, error: float) -> str | None:
     Noise differs from pixel to pixel; what is left of a spot of another shape is alike in neighbours.
     """
     if noise.slope <= 3 * error or np.median(residuals.significance) < _FAINTEST:
-        return "the spots are too faint: more light or more frames are needed"
-    scale = np.sqrt(noise.of(residuals.light))
-    lit = _lit(residuals.light)
-    alike = float(np.mean((residuals.neighbours / (scale[:, :, 1:] * scale[:, :, :-1]))[lit[:, :, 1:]]))
+        return "the spots are too faint: more flux or more frames are needed"
+    scale = np.sqrt(noise.of(residuals.flux))
+    illuminated = _illuminated(residuals.flux)
+    alike = float(
+        np.mean((residuals.neighbours / (scale[:, :, 1:] * scale[:, :, :-1]))[illuminated[:, :, 1:]])
+    )
     if alike > _LARGEST_LIKENESS:
         return "the spots' shape changes from frame to frame or from one to the next, or pixels are saturated"
     return None
 
 
-def _lit(light: Floats) -> NDArray[np.bool_]:
-    """Which pixels have a good part of the peak's light."""
-    return light >= _LIT * light.max(axis=(1, 2), keepdims=True)  # type: ignore[no-any-return]
+def _illuminated(flux: Floats) -> NDArray[np.bool_]:
+    """Which pixels have a good part of the peak's flux."""
+    return flux >= _LIT * flux.max(axis=(1, 2), keepdims=True)  # type: ignore[no-any-return]
 
 
 def variance_over_expected(
@@ -206,11 +208,11 @@ def variance_over_expected(
     fitted : LearntPSF
         The spots in them.
     dark_variance_e2, excess_noise : float
-        A pixel's variance is expected to be `dark_variance_e2` + `excess_noise` * light, electrons squared.
+        A pixel's variance is expected to be `dark_variance_e2` + `excess_noise` * flux, electrons squared.
     """
     noise = _Noise(max(dark_variance_e2, 1e-6), excess_noise)
     images = np.asarray(images_e, np.float64) - fitted.background_e[0]
     residuals = _residuals(images, fitted.psf, fitted.positions, fitted.flux_e, noise)
-    ratio = np.square(residuals.left) / noise.of(residuals.light)
-    usual = (ratio < _LARGEST_EXCESS) & _lit(residuals.light)
+    ratio = np.square(residuals.left) / noise.of(residuals.flux)
+    usual = (ratio < _LARGEST_EXCESS) & _illuminated(residuals.flux)
     return float(np.sum((ratio * residuals.share)[usual]) / np.sum(residuals.share[usual]))

@@ -80,8 +80,8 @@ def stack_spots(
             model = tables.value.take(index[block][:, None, None] * side**2 + cell) * flux[:, None, None]
             weight = weights(part, model + level[block], flux) / draws
             cell += group[:, None, None] * side**2
-            light = weight * flux[:, None, None]
-            for row, values in enumerate((light * flux[:, None, None], light, light * part.images)):
+            weighted = weight * flux[:, None, None]
+            for row, values in enumerate((weighted * flux[:, None, None], weighted, weighted * part.images)):
                 sums[row] += np.bincount(cell.ravel(), values.ravel(), sums.shape[1])
             for row, values in enumerate((weight, weight * part.images)):
                 scalars[row] += np.bincount(group, values.sum(axis=(1, 2)), 2 * n_psfs)

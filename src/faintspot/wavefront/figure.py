@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.report.drawing import ARM_COLOURS, LIGHT_GREY, WIDTH, colour_bar, new_figure, styled
+from faintspot.report.drawing import ARM_COLOURS, FLUX_GREY, WIDTH, colour_bar, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.pupil import lenslet_outlines
@@ -90,7 +90,7 @@ def _map(axes: Axes, wavefront: Wavefront, layout: Layout, *, tilt: bool) -> Non
 def _bars(axes: Axes, wavefront: Wavefront, part: slice, several: bool) -> None:
     modes = wavefront.modes[part]
     if several:
-        axes.bar(modes, wavefront.rms_of_frames[part], 0.85, color=LIGHT_GREY, label="rms over the frames")
+        axes.bar(modes, wavefront.rms_of_frames[part], 0.85, color=FLUX_GREY, label="rms over the frames")
     axes.bar(
         modes,
         wavefront.mean[part],

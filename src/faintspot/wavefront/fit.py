@@ -169,10 +169,10 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
         raise InputError(f"slopes: expected {len(layout)} sub-apertures, as in the layout, got {x.shape[-1]}")
     pupil = pupil_of(layout)
     valid = valid & inside_pupil(layout, pupil)
-    lit = np.asarray(valid.any(axis=0))
-    if not lit.any():
+    illuminated = np.asarray(valid.any(axis=0))
+    if not illuminated.any():
         raise InputError("slopes: expected some to fit a wavefront to, found none that is valid")
-    gradients, condition = _chosen_gradients(modes, layout, pupil, lit)
+    gradients, condition = _chosen_gradients(modes, layout, pupil, illuminated)
     unit, scale = _unit(layout, pupil)
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
@@ -194,10 +194,10 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
 
 
 def _chosen_gradients(
-    modes: int | None, layout: Layout, pupil: Pupil, lit: NDArray[np.bool_]
+    modes: int | None, layout: Layout, pupil: Pupil, illuminated: NDArray[np.bool_]
 ) -> tuple[Floats, float]:
     """Return the mean gradients (2 n, k) of the modes to fit, all x, then all y, and their condition."""
-    n = int(np.count_nonzero(lit))
+    n = int(np.count_nonzero(illuminated))
     if modes is None:
         counts = [order * (order + 3) // 2 for order in range(_HIGHEST_ORDER, 0, -1)]
         counts, limit = [count for count in counts if count <= 0.75 * n] or [_TILTS], _USUAL_CONDITION
@@ -207,7 +207,7 @@ def _chosen_gradients(
     outlines = (lenslet_outlines(layout) - pupil.centre_px) / pupil.radius_px
     gradients = np.concatenate(mean_gradients(np.arange(2, 2 + counts[0]), outlines))
     for count in counts:
-        condition = _condition(gradients[np.tile(lit, 2), :count])
+        condition = _condition(gradients[np.tile(illuminated, 2), :count])
         if condition <= limit:
             return gradients[:, :count], condition
     raise InputError(

@@ -47,7 +47,7 @@ def assert_near(case: Case, found: fs.Slopes, expected: fs.Slopes) -> None:
             continue
         error_e = ROUNDING * scale * case.layout.pixels
         assert found.iterations[s] == expected.iterations[s]
-        assert (found.flags[s] ^ expected.flags[s]) & ~Flag.NO_LIGHT == 0
+        assert (found.flags[s] ^ expected.flags[s]) & ~Flag.NO_FLUX == 0
         assert abs(found.flux[s] - expected.flux[s]) <= error_e
         if error_e * side < 0.02 * abs(expected.flux[s]):
             assert found.flags[s] == expected.flags[s]

@@ -144,7 +144,7 @@ def test_hostile_images(strength: float) -> None:
     assert np.any(found.flags & Flag.INFEASIBLE_STRENGTH) == (strength > 0)
 
 
-def test_automatic_settings_follow_the_light_of_each_frame() -> None:
+def test_automatic_settings_follow_the_flux_of_each_frame() -> None:
     layout = fs.Layout.grid((1, 2), pixels=6)
     rng = np.random.default_rng(2)
     y, x = np.mgrid[:6, :12]
@@ -155,7 +155,7 @@ def test_automatic_settings_follow_the_light_of_each_frame() -> None:
     expected = fs.SlopePipeline(layout, settings, calibration)(frames)
     pipeline = fs.SlopePipeline(layout, settings, calibration, device="cuda")
     found = pipeline(frames)
-    assert pipeline.needs_light
+    assert pipeline.needs_flux
     assert found.x.shape == (2, 2)
     assert np.array_equal(found.iterations, expected.iterations)
     assert np.allclose(found.vector, expected.vector, atol=1e-5)

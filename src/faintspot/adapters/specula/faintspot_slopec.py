@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import CALIBRATION_LIGHT_E, LIGHT_FRAMES, Options, ToolSlopes, parts_of
+from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, Options, ToolSlopes, parts_of
 from faintspot.adapters.checks import check_matrix, check_version
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.sensor.layout import Layout
@@ -40,11 +40,11 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
     calibrating : bool
         True in parameter files that calibrate (slope null, interaction matrix), whose detector has no noise:
-        frames are then measured at `calibration_light_e`, see `ToolSlopes.calibrating`.
-    calibration_light_e : float
-        Mean light of a sub-aperture, electrons.
-    light_frames : float
-        Time constant of the running mean of the light, frames; 0: none.
+        frames are then measured at `calibration_flux_e`, see `ToolSlopes.calibrating`.
+    calibration_flux_e : float
+        Mean flux of a sub-aperture, electrons.
+    flux_frames : float
+        Time constant of the running mean of the flux, frames; 0: none.
     sn, filtmat, interleave, target_device_idx, precision
         As for `ShSlopec`; slopes are measured on the processor.
 
@@ -60,8 +60,8 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         faintspot: Any = None,
         sn: Slopes = None,
         calibrating: bool = False,
-        calibration_light_e: float = CALIBRATION_LIGHT_E,
-        light_frames: float = LIGHT_FRAMES,
+        calibration_flux_e: float = CALIBRATION_FLUX_E,
+        flux_frames: float = FLUX_FRAMES,
         filtmat: Any = None,
         interleave: bool = False,
         target_device_idx: int | None = None,
@@ -82,8 +82,8 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         self._options: Options = {
             "psf": psf,
             "score": score,
-            "calibration_light_e": calibration_light_e,
-            "light_frames": light_frames if light_frames > 0 else None,
+            "calibration_flux_e": calibration_flux_e,
+            "flux_frames": flux_frames if flux_frames > 0 else None,
         }
         self._noise_free = bool(calibrating)
         self._tool: ToolSlopes | None = None
@@ -115,7 +115,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
 
     @property
     def measured(self) -> ToolSlopes:
-        """What measures: `last` slopes (px), flags, `standard_errors`, `light`.
+        """What measures: `last` slopes (px), flags, `standard_errors`, `flux`.
 
         Raises
         ------

@@ -85,11 +85,11 @@ def _measure(
             done += 1
         t = np.float64(image[order[k]]) if rule == SUBTRACT_NEXT else 0.0
         left = total - k * t
-        lit = left > floor * largest and left > 0.0
-        inverse = 1.0 / left if lit else 0.0
+        illuminated = left > floor * largest and left > 0.0
+        inverse = 1.0 / left if illuminated else 0.0
         x[k - 1] = min(max((moment_x - t * sum_x) * inverse, -reach), reach)
         y[k - 1] = min(max((moment_y - t * sum_y) * inverse, -reach), reach)
-        valid[k - 1] = lit
+        valid[k - 1] = illuminated
 
 
 @allocating

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.advice.centroid_gain import calibration_of_electrons
-from faintspot.advice.seen import Seen
+from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.algorithms.noise import pixel_noise
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.base.errors import InputError
@@ -36,7 +36,7 @@ _FIRST_BIN = 10  # below, the turbulence's own spectrum is too steep
 
 
 @dataclass(frozen=True)
-class Known:
+class Measured:
     """A quantity that telemetry tells."""
 
     name: str
@@ -57,7 +57,7 @@ class Known:
         return f"{self.name}: {self.value:.3g}{error} {self.unit}".rstrip() + remark
 
 
-def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibration) -> list[Known]:
+def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibration) -> list[Measured]:
     """Return flux, read noise and spot width from frames in electrons.
 
     Parameters
@@ -67,11 +67,11 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
     calibration : Calibration
         Of the camera; where its dark is rough, the background is taken from the windows' edges.
     """
-    light = "light", "e- per sub-aperture and frame"
+    flux = "flux", "e- per sub-aperture and frame"
     noise, width = ("read noise", "e-"), ("width of the spots", "px, with the pixel and the mean speckles")
     if len(frames_e) < _FEWEST_IMAGES:
         why = f"{len(frames_e)} images in telemetry, expected {_FEWEST_IMAGES}: images-every"
-        return [Known(*each, remark=why) for each in (light, noise, width)]
+        return [Measured(*each, remark=why) for each in (flux, noise, width)]
     images = layout.images(frames_e)
     pixels = images.shape[-2] * images.shape[-1]
     background = calibration.background_e * pixels
@@ -82,76 +82,78 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
     sums = images.sum(axis=(-2, -1)).mean(axis=-1) - background
     halves = [pixel_noise(half) for half in np.array_split(images, 2)]
     found = [
-        Known(*light, float(sums.mean()), float(sums.std(ddof=1) / math.sqrt(len(sums))), remark),
-        Known(*noise, float(np.mean(halves)), abs(halves[0] - halves[1]) / 2),
+        Measured(*flux, float(sums.mean()), float(sums.std(ddof=1) / math.sqrt(len(sums))), remark),
+        Measured(*noise, float(np.mean(halves)), abs(halves[0] - halves[1]) / 2),
     ]
     plain = calibration_of_electrons(calibration)
     try:
         spots = images.reshape(-1, *images.shape[-2:])
         psf = learn_psf_from_images(spots, calibration=plain, rng=np.random.default_rng(1)).psf
     except InputError as error:
-        return [*found, Known(*width, remark=str(error))]
-    return [*found, Known(*width, float(psf.fwhm_px.mean()))]
+        return [*found, Measured(*width, remark=str(error))]
+    return [*found, Measured(*width, float(psf.fwhm_px.mean()))]
 
 
-def of_air(seen: Seen, layout: Layout, gains: Sequence[float] | None = None) -> list[Known]:
+def of_atmosphere(
+    seen: LoopTelemetry, layout: Layout, gains: Sequence[float] | None = None
+) -> list[Measured]:
     """Return r0, the wind and vibrations, from the slopes without what the mirror added."""
-    _, air = seen.weighted(gains)
+    _, atmosphere = seen.weighted(gains)
     r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
     side = layout.subaperture_m
     if side is None and layout.diameter_m is not None:
         side = layout.diameter_m / (int(np.ptp(layout.cells, axis=0).max()) + 1)
     if side is None or layout.pixel_scale_arcsec is None:
         why = "the layout does not say subaperture_m and pixel_scale_arcsec"
-        found = [Known(*r0, remark=why), Known(*wind, remark=why)]
+        found = [Measured(*r0, remark=why), Measured(*wind, remark=why)]
     else:
         found = [
-            _r0(Known(*r0), seen, air, layout, side),
-            _wind(Known(*wind), seen, air, layout, side),
+            _r0(Measured(*r0), seen, atmosphere, layout, side),
+            _wind(Measured(*wind), seen, atmosphere, layout, side),
         ]
-    return [*found, *_vibrations(seen, air)]
+    return [*found, *_vibrations(seen, atmosphere)]
 
 
-def _stretches(seen: Seen) -> list[NDArray[np.int64]]:
+def _stretches(seen: LoopTelemetry) -> list[NDArray[np.int64]]:
     return list(np.array_split(np.arange(len(seen)), _STRETCHES))
 
 
-def _of_stretches(kind: Known, whole: float, parts: list[float], remark: str) -> Known:
+def _of_stretches(kind: Measured, whole: float, parts: list[float], remark: str) -> Measured:
     """Return a value with the error that its scatter between stretches tells."""
     known = [part for part in parts if math.isfinite(part)]
     error = float(np.std(known, ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
     if not math.isfinite(whole):
-        return Known(kind.name, kind.unit, remark="the slopes vary no more than their noise")
-    return Known(kind.name, kind.unit, whole, error, remark)
+        return Measured(kind.name, kind.unit, remark="the slopes vary no more than their noise")
+    return Measured(kind.name, kind.unit, whole, error, remark)
 
 
-def _r0(kind: Known, seen: Seen, air: Floats, layout: Layout, side: float) -> Known:
+def _r0(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout, side: float) -> Measured:
     def estimated(rows: NDArray[np.int64]) -> float:
         return estimate_r0(
-            air[rows],
+            atmosphere[rows],
             cells=layout.cells,
             subaperture_m=side,
             pixel_scale_rad=(layout.pixel_scale_arcsec or 1.0) * ARCSEC,
             outer_scale_m=OUTER_SCALE_M,
             segment=seen.turn[rows],
-            static_px=air.mean(axis=0),
+            static_px=atmosphere.mean(axis=0),
         ).r0_m
 
     parts = _stretches(seen)
     if min(len(part) for part in parts) < _FEWEST_OF_STRETCH:
-        return Known(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
+        return Measured(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
     whole = estimated(np.arange(len(seen)))
     return _of_stretches(
         kind, whole, [estimated(part) for part in parts], f"outer scale {OUTER_SCALE_M:g} m assumed"
     )
 
 
-def _wind(kind: Known, seen: Seen, air: Floats, layout: Layout, side: float) -> Known:
+def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout, side: float) -> Measured:
     """Return the speed of one layer, from anywhere, that changes the slopes as fast as they do."""
     positions = layout.cells[:, ::-1].astype(np.float64) * side
     far = _WIND_LAG
     if seen.rate_hz <= 0 or len(seen) < 10 * far:
-        return Known(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
+        return Measured(kind.name, kind.unit, remark=f"{len(seen)} frames are too few")
     alone = SlopeTurbulence(positions, side, 1.0, 0.15, OUTER_SCALE_M, np.ones(1), np.array([[1.0, 0.0]]))
     anywhere = alone.from_anywhere()
     still = _without_tilt(anywhere.covariance_px2(0.0))
@@ -159,7 +161,7 @@ def _wind(kind: Known, seen: Seen, air: Floats, layout: Layout, side: float) -> 
     theory = np.array([_without_tilt(anywhere.covariance_px2(each)) for each in metres]) / still
 
     def speed(rows: NDArray[np.int64]) -> float:
-        slopes, turn = _without_mean(air[rows] - air.mean(axis=0)), seen.turn[rows]
+        slopes, turn = _without_mean(atmosphere[rows] - atmosphere.mean(axis=0)), seen.turn[rows]
 
         def lagged(lag: int) -> float:
             together = turn[lag:] == turn[:-lag]
@@ -175,7 +177,7 @@ def _wind(kind: Known, seen: Seen, air: Floats, layout: Layout, side: float) -> 
     remark = "of a single layer that would change the slopes as fast"
     found = _of_stretches(kind, whole, [speed(part) for part in _stretches(seen)], remark)
     if not math.isfinite(whole):
-        return Known(kind.name, kind.unit, remark=f"beyond {_WINDS_M_PER_S[-1]:g} m/s, or hidden by noise")
+        return Measured(kind.name, kind.unit, remark=f"beyond {_WINDS_M_PER_S[-1]:g} m/s, or hidden by noise")
     return found
 
 
@@ -193,7 +195,7 @@ def _without_tilt(covariance: Floats) -> float:
     return total
 
 
-def _vibrations(seen: Seen, air: Floats) -> list[Known]:
+def _vibrations(seen: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
     """Return lines in the spectra of tip and tilt that the turbulence beside them does not explain."""
     from scipy.signal import welch
     from scipy.stats import chi2
@@ -204,10 +206,10 @@ def _vibrations(seen: Seen, air: Floats) -> list[Known]:
     rows = slice(starts[longest], starts[longest + 1])
     length = rows.stop - rows.start
     if length < 4 * _BINS:
-        return [Known(name, unit, remark=f"{length} frames without a gap, expected {4 * _BINS}")]
+        return [Measured(name, unit, remark=f"{length} frames without a gap, expected {4 * _BINS}")]
     found, hidden = [], 0.0
     for axis, letter in enumerate("xy"):
-        mean = air[rows].reshape(length, 2, -1)[:, axis].mean(axis=1)
+        mean = atmosphere[rows].reshape(length, 2, -1)[:, axis].mean(axis=1)
         frequency, power = welch(mean, seen.rate_hz, nperseg=2 * _BINS, detrend="linear")
         beside = np.array([_median_beside(power, place) for place in range(len(power))])
         freedom = 2 * length / (2 * _BINS)
@@ -219,8 +221,10 @@ def _vibrations(seen: Seen, air: Floats) -> list[Known]:
             near = slice(max(place - 2, 0), place + 3)
             square = float((power[near] - beside[near]).sum() * frequency[1])
             remark = f"along {letter}, rms {math.sqrt(max(square, 0.0)):.2g} px"
-            found.append(Known("vibration", unit, float(frequency[place]), float(frequency[1] / 2), remark))
-    return found or [Known(name, "px", 0.0, remark=f"none with an rms above {math.sqrt(hidden):.2g} px")]
+            found.append(
+                Measured("vibration", unit, float(frequency[place]), float(frequency[1] / 2), remark)
+            )
+    return found or [Measured(name, "px", 0.0, remark=f"none with an rms above {math.sqrt(hidden):.2g} px")]
 
 
 def _median_beside(power: Floats, place: int) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.estimators.base import Estimator
-from faintspot.estimators.python import PythonPrepared
+from faintspot.estimators.python import PythonPlan
 from faintspot.estimators.registry import estimator_named
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -25,7 +25,7 @@ from faintspot.realtime.workers import Workers
 TRIAL_LIMIT_S = 60.0  # an estimator may compile
 
 
-class PreparedSettings:
+class EnginePlan:
     """Settings with all that is made from them: for every arm a pipeline, and a path for a ring's frames.
 
     Parameters
@@ -53,7 +53,7 @@ class PreparedSettings:
         workers: Workers | None,
         budget_s: float,
         prior: Prior | None = None,
-        fallback: PreparedSettings | None = None,
+        fallback: EnginePlan | None = None,
     ) -> None:
         self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
         self.pipelines, self.fallback = tuple(pipelines), fallback
@@ -92,7 +92,7 @@ class PreparedSettings:
         made_for = pipeline, pixels, progress
         path = (
             PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
-            if isinstance(pipeline.preparation.prepared, PythonPrepared)
+            if isinstance(pipeline.plan.prepared, PythonPlan)
             else FramePath(*made_for, workers=self._workers, prior=self._prior)
         )
         path.warm_up()
@@ -130,7 +130,7 @@ class SettingsPreparer:
         """Whose frames are being measured, if any."""
         self._built_in: Estimator = estimator_named("brightest")()
 
-    def prepare(self, settings: Settings) -> PreparedSettings:
+    def prepare(self, settings: Settings) -> EnginePlan:
         """Prepare settings: for a ring's frames or, where there is no ring yet, for frames of any type.
 
         Raises
@@ -159,7 +159,7 @@ class SettingsPreparer:
         own = is_built_in(settings.estimator)
         return settings if own else settings.replace(estimator=self._built_in)
 
-    def _fallback(self, settings: Settings) -> PreparedSettings:
+    def _fallback(self, settings: Settings) -> EnginePlan:
         """Prepare the same settings with a built-in estimator, and no arms that take turns."""
         settings, arms = self.built_in(settings), self.interleaving
         alone = arms if len(arms.arms) == 1 else Interleaving(first=arms.first + len(arms.arms))
@@ -170,10 +170,10 @@ class SettingsPreparer:
         pipelines: Sequence[SlopePipeline],
         settings: Settings,
         arms: Interleaving,
-        fallback: PreparedSettings | None,
-    ) -> PreparedSettings:
+        fallback: EnginePlan | None,
+    ) -> EnginePlan:
         made_for = self._workers, self._budget_s, self._prior
-        return PreparedSettings(pipelines, settings, arms, *made_for, fallback)
+        return EnginePlan(pipelines, settings, arms, *made_for, fallback)
 
     def _pipeline(self, settings: Settings) -> SlopePipeline:
         if is_built_in(settings.estimator):

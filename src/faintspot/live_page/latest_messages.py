@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 
-class Board:
+class LatestMessages:
     """Holds one message of each kind; a newer one replaces it, whoever has read it or not.
 
     So a client that is slow misses messages, and nothing is kept for it. For one event loop.

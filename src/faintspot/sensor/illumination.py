@@ -1,7 +1,7 @@
 """Which lenslets are lit: decided over the lattice as a whole, not spot by spot.
 
 Every node gives evidence, in standard deviations: does a spot stand out of the noise at the place where it
-should be, and does it have enough light? Neighbours mostly agree, as a pupil is connected (a disk, an
+should be, and does it have enough flux? Neighbours mostly agree, as a pupil is connected (a disk, an
 annulus, with spiders), so that disagreement costs something, and the lit set is the one of least cost
 altogether: a minimum cut of the lattice's graph, found exactly (Greig, Porteous & Seheult 1989, J. R. Stat.
 Soc. B 51, 271). A clear node is never outvoted; a column of doubtful ones is taken or left whole.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from faintspot.sensor.lattice import Lattice
-from faintspot.sensor.nodes import SEARCH, NodeLight
+from faintspot.sensor.nodes import SEARCH, NodeFlux
 
 # Signal-to-noise ratio at which a spot is as likely as not: the highest of the 10 to 20 independent noise
 # values within the search area exceeds 3.5 in one unlit cell of 200.
@@ -58,7 +58,7 @@ _PASSES = 4
 
 
 @dataclass(frozen=True)
-class Lit:
+class Illumination:
     """Which nodes are lit (n,), and why that may be wrong: one line, empty when it is clear.
 
     `least_flux` is the flux that divides lit from dark.
@@ -69,42 +69,44 @@ class Lit:
     least_flux: float
 
 
-def find_lit(spots: NodeLight, lattice: Lattice, lit_fraction: float | None) -> Lit:
+def find_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: float | None) -> Illumination:
     """Decide which nodes are lit.
 
     Parameters
     ----------
     spots : NodeLight
     lattice : Lattice
-    lit_fraction : float, optional
+    illuminated_fraction : float, optional
         The smallest flux of a lit lenslet, strictly, as a part of the median of those that are lit without
         it. Default: the part between 0.18 and 0.5 that the fewest have, for most to be clear of it.
     """
     detected = _detection(spots)
     certain = detected > 1
     if not certain.any():
-        return Lit(certain, "", np.inf)
+        return Illumination(certain, "", np.inf)
     choose = _Chooser(spots, detected, lattice)
     # Dim spots outside the pupil may be as many as those in it: the start is among the bright ones.
     bright = float(np.quantile(spots.flux[certain], 0.8))
     fraction = _emptiest(spots.flux[detected > 0] / bright)
-    lit, reference, scatter = choose.settled(bright, fraction)
-    if not _spans(spots.cells[lit]):
+    illuminated, reference, scatter = choose.settled(bright, fraction)
+    if not _spans(spots.cells[illuminated]):
         # A row or two at the pupil's edge: the dimmer row must be lit, as one row makes no sensor.
         fraction = _FRACTIONS[0]
-        lit, reference, scatter = choose.settled(bright, fraction)
-    if lit_fraction is not None:
-        lit = choose.lit(reference, max(min(lit_fraction, fraction), 1e-6), scatter)
-        lit &= spots.flux >= lit_fraction * reference
-        fraction = lit_fraction
-    return Lit(lit, _doubt(spots, lit, detected, fraction * reference), fraction * reference)
+        illuminated, reference, scatter = choose.settled(bright, fraction)
+    if illuminated_fraction is not None:
+        illuminated = choose.illuminated(reference, max(min(illuminated_fraction, fraction), 1e-6), scatter)
+        illuminated &= spots.flux >= illuminated_fraction * reference
+        fraction = illuminated_fraction
+    return Illumination(
+        illuminated, _doubt(spots, illuminated, detected, fraction * reference), fraction * reference
+    )
 
 
 @dataclass(frozen=True)
 class _Chooser:
     """Chooses the lit nodes of these spots, with this evidence that they are there."""
 
-    spots: NodeLight
+    spots: NodeFlux
     detected: NDArray[np.float64]
     lattice: Lattice
 
@@ -112,16 +114,16 @@ class _Chooser:
         """Return the lit nodes, the median of their flux, and the scatter of its logarithm."""
         scatter = _SCATTER[1]
         for _ in range(_PASSES):
-            lit = self.lit(reference, fraction, scatter)
-            if not lit.any():
+            illuminated = self.illuminated(reference, fraction, scatter)
+            if not illuminated.any():
                 break
-            before, reference = reference, float(np.median(self.spots.flux[lit]))
-            scatter = _log_scatter(self.spots.flux[lit])
+            before, reference = reference, float(np.median(self.spots.flux[illuminated]))
+            scatter = _log_scatter(self.spots.flux[illuminated])
             if abs(reference / before - 1) < 0.01:
                 break
-        return lit, reference, scatter
+        return illuminated, reference, scatter
 
-    def lit(self, reference: float, fraction: float, scatter: float) -> NDArray[np.bool_]:
+    def illuminated(self, reference: float, fraction: float, scatter: float) -> NDArray[np.bool_]:
         """Return the lit nodes, for a dividing flux of a part of the reference."""
         neighbours = self.lattice.neighbours(self.spots.cells)
         links = _links(neighbours)
@@ -132,7 +134,7 @@ class _Chooser:
         return _connected(least, links, relative >= _TIP)
 
 
-def _detection(spots: NodeLight) -> NDArray[np.float64]:
+def _detection(spots: NodeFlux) -> NDArray[np.float64]:
     """Return the evidence that a spot is at each node: that something is there, and that it is in its place.
 
     Spots scatter about their nodes as the certain ones do; peaks of noise lie anywhere in the search area,
@@ -192,10 +194,10 @@ def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: f
     source, sink = count, count + 1
     strength = np.rint(100 * np.clip(evidence, -_CLEAR, _CLEAR)).astype(np.int32)
     link = np.full(len(links), round(100 * cost), dtype=np.int32)
-    lit, dark = np.flatnonzero(strength > 0), np.flatnonzero(strength < 0)
-    rows = [np.full(len(lit), source), dark, links[:, 0], links[:, 1]]
-    columns = [lit, np.full(len(dark), sink), links[:, 1], links[:, 0]]
-    weights = [strength[lit], -strength[dark], link, link]
+    illuminated, dark = np.flatnonzero(strength > 0), np.flatnonzero(strength < 0)
+    rows = [np.full(len(illuminated), source), dark, links[:, 0], links[:, 1]]
+    columns = [illuminated, np.full(len(dark), sink), links[:, 1], links[:, 0]]
+    weights = [strength[illuminated], -strength[dark], link, link]
     graph = scipy.sparse.csr_matrix(
         (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(count + 2,) * 2
     )
@@ -209,32 +211,32 @@ def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: f
 
 
 def _connected(
-    lit: NDArray[np.bool_], links: NDArray[np.int64], bright: NDArray[np.bool_]
+    illuminated: NDArray[np.bool_], links: NDArray[np.int64], bright: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """Return the lit nodes of the largest connected parts; a tip that hangs on one other must be bright."""
-    degree = np.bincount(links[lit[links].all(axis=1)].ravel(), minlength=len(lit))
-    lit = lit & ((degree >= 2) | ((degree == 1) & bright))
-    joined = links[lit[links].all(axis=1)]
+    degree = np.bincount(links[illuminated[links].all(axis=1)].ravel(), minlength=len(illuminated))
+    illuminated = illuminated & ((degree >= 2) | ((degree == 1) & bright))
+    joined = links[illuminated[links].all(axis=1)]
     graph = scipy.sparse.coo_matrix(
-        (np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(len(lit),) * 2
+        (np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=(len(illuminated),) * 2
     )
     _, part = connected_components(graph, directed=False)
-    sizes = np.bincount(part[lit], minlength=part.max() + 1)
-    return np.asarray(lit & (sizes >= max(2, _SHARE * sizes.max()))[part])
+    sizes = np.bincount(part[illuminated], minlength=part.max() + 1)
+    return np.asarray(illuminated & (sizes >= max(2, _SHARE * sizes.max()))[part])
 
 
 def _doubt(
-    spots: NodeLight, lit: NDArray[np.bool_], detected: NDArray[np.float64], dividing_flux: float
+    spots: NodeFlux, illuminated: NDArray[np.bool_], detected: NDArray[np.float64], dividing_flux: float
 ) -> str:
     """Say in one line when the answer may be wrong."""
-    count = int(np.count_nonzero(lit))
+    count = int(np.count_nonzero(illuminated))
     if count == 0:
         return ""
-    flux = spots.flux[lit]
-    ratio = float(np.median(spots.signal_to_noise[lit]))
+    flux = spots.flux[illuminated]
+    ratio = float(np.median(spots.signal_to_noise[illuminated]))
     if ratio < _FAINT:
         return f"the spots stand only {ratio:.1f} standard deviations out of the noise; average more frames"
-    scattered = float(np.median(np.abs(spots.shifts[lit] - np.median(spots.shifts[lit]))))
+    scattered = float(np.median(np.abs(spots.shifts[illuminated] - np.median(spots.shifts[illuminated]))))
     if scattered > _SCATTERED:
         return (
             f"the spots lie {scattered:.2f} of the pitch from the lattice (median), as peaks anywhere would: "

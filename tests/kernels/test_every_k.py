@@ -11,21 +11,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import faintspot as fs
-from faintspot.kernels import scoring
+from faintspot.kernels import every_k
 
 pytestmark = pytest.mark.portable
 
 FLOOR = 1e-4
-RULES = {"subtract_next": scoring.SUBTRACT_NEXT, "threshold": scoring.THRESHOLD}
+RULES = {"subtract_next": every_k.SUBTRACT_NEXT, "threshold": every_k.THRESHOLD}
 
 
-def every_k(
+def positions_of_all(
     images: NDArray[np.float32], rule: str, reach: float = math.inf
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     n, side, _ = images.shape
     positions, valid = np.full((n, side**2 - 1, 2), np.nan), np.zeros((n, side**2 - 1), bool)
     flat = images.reshape(n, -1)
-    scoring.positions_of_every_k(flat, side, RULES[rule], FLOOR, reach, 0, n, positions, valid)
+    every_k.positions_of_every_k(flat, side, RULES[rule], FLOOR, reach, 0, n, positions, valid)
     return positions, valid
 
 
@@ -34,9 +34,9 @@ def one_by_one(images: NDArray[np.floating], rule: str) -> tuple[NDArray[np.floa
     positions, valid = [], []
     for k in range(1, images.shape[1] ** 2):
         left = fs.brightest_pixels(images, keep=k, rule=rule)
-        lit = left.sum(axis=(1, 2), dtype=np.float64) > FLOOR * np.abs(images).max(axis=(1, 2))
-        positions.append(np.where(lit[:, None], fs.centre_of_gravity(left), 0.0))
-        valid.append(lit)
+        illuminated = left.sum(axis=(1, 2), dtype=np.float64) > FLOOR * np.abs(images).max(axis=(1, 2))
+        positions.append(np.where(illuminated[:, None], fs.centre_of_gravity(left), 0.0))
+        valid.append(illuminated)
     return np.stack(positions, axis=1), np.stack(valid, axis=1)
 
 
@@ -53,10 +53,10 @@ def test_every_k_is_the_definition(rule: str, seed: int, side: int, levels: int,
     if levels:  # ties
         images = np.rint(images / np.abs(images).max() * levels)
     single = (images + offset).astype(np.float32)
-    positions, valid = every_k(single, rule)
-    expected, lit = one_by_one(single.astype(np.float64), rule)
+    positions, valid = positions_of_all(single, rule)
+    expected, illuminated = one_by_one(single.astype(np.float64), rule)
     # Round-off of double precision, magnified where little light is left above the floor.
-    clear = valid == lit
+    clear = valid == illuminated
     assert np.mean(~clear) < 0.01  # only where the sum is at the floor itself
     np.testing.assert_allclose(positions[clear], expected[clear], rtol=0, atol=1e-8)
 
@@ -64,7 +64,7 @@ def test_every_k_is_the_definition(rule: str, seed: int, side: int, levels: int,
 @pytest.mark.parametrize("rule", RULES)
 def test_equal_to_float32_rounding_on_spots(rule: str) -> None:
     images, _ = fs.simulate.subapertures(40, flux_e=300.0, rng=np.random.default_rng(5))
-    positions, valid = every_k(images, rule)
+    positions, valid = positions_of_all(images, rule)
     expected, _ = one_by_one(images, rule)
     assert valid.all()
     # Sums of up to 255 terms in single precision: 255 * 6e-8 of a window's half, 8 px, is 1e-4.
@@ -76,8 +76,8 @@ def test_errors_are_those_of_the_positions(reach: float) -> None:
     images, truth = fs.simulate.subapertures(50, shape=(8, 8), flux_e=50.0, rng=np.random.default_rng(6))
     flat = images.reshape(50, -1)
     errors, valid = np.empty((50, 63), np.float32), np.empty((50, 63), bool)
-    scoring.errors_of_every_k(flat, 8, scoring.SUBTRACT_NEXT, FLOOR, reach, truth, 0, 50, errors, valid)
-    positions, also_valid = every_k(images, "subtract_next", reach)
+    every_k.errors_of_every_k(flat, 8, every_k.SUBTRACT_NEXT, FLOOR, reach, truth, 0, 50, errors, valid)
+    positions, also_valid = positions_of_all(images, "subtract_next", reach)
     np.testing.assert_array_equal(valid, also_valid)
     np.testing.assert_allclose(errors, np.abs(positions - truth[:, None]).mean(axis=2), rtol=1e-6)
 
@@ -85,8 +85,8 @@ def test_errors_are_those_of_the_positions(reach: float) -> None:
 @pytest.mark.parametrize("rule", RULES)
 def test_positions_stay_within_reach(rule: str) -> None:
     images, _ = fs.simulate.subapertures(50, shape=(8, 8), flux_e=10.0, rng=np.random.default_rng(7))
-    free, valid = every_k(images, rule)
-    held, also_valid = every_k(images, rule, 0.4)
+    free, valid = positions_of_all(images, rule)
+    held, also_valid = positions_of_all(images, rule, 0.4)
     assert np.abs(free).max() > 1.0
     np.testing.assert_array_equal(held, np.clip(free, -0.4, 0.4))
     np.testing.assert_array_equal(valid, also_valid)
@@ -96,9 +96,9 @@ def test_flat_and_extreme_images() -> None:
     tiny = np.zeros((1, 4, 4), np.float32)
     tiny[0, 1, 2] = 1e-30
     for image in (np.zeros((1, 4, 4), np.float32), np.full((1, 4, 4), 7.1, np.float32)):
-        positions, valid = every_k(image, "subtract_next")
+        positions, valid = positions_of_all(image, "subtract_next")
         assert not valid.any()
         assert not positions.any()
-    positions, valid = every_k(tiny, "subtract_next")
+    positions, valid = positions_of_all(tiny, "subtract_next")
     assert valid.all()
     np.testing.assert_allclose(positions[0], np.broadcast_to([0.5, -0.5], (15, 2)))

@@ -9,16 +9,16 @@ from tests.advice.advice_cases import LAYOUT, seen_with_truth
 from tests.advice.test_centroid_gain import frames
 
 import faintspot as fs
-from faintspot.advice.known import Known, of_air, of_images
+from faintspot.advice.measured import Measured, of_atmosphere, of_images
 from faintspot.ao_loop.configuration import ARCSEC
 
 
-def test_images_tell_light_noise_and_width() -> None:
+def test_images_tell_flux_noise_and_width() -> None:
     """20 frames of 36 spots: the light to its stated error, the noise to some per cent."""
-    light, noise, width = of_images(frames(300.0), LAYOUT, fs.Calibration(dark=0.0, read_noise_e=1.0))
+    flux, noise, width = of_images(frames(300.0), LAYOUT, fs.Calibration(dark=0.0, read_noise_e=1.0))
     # What diffraction throws out of windows of 8 pixels is not seen: some per cent.
-    assert 300.0 * 0.9 < light.value < 300.0 + 3 * light.error
-    assert 0 < light.error < 3.0
+    assert 300.0 * 0.9 < flux.value < 300.0 + 3 * flux.error
+    assert 0 < flux.error < 3.0
     assert noise.value == pytest.approx(1.0, abs=0.2)
     assert 1.5 < width.value < 2.5
 
@@ -38,7 +38,7 @@ def test_slopes_tell_r0_and_wind() -> None:
 
     from faintspot.advice.simulated import seen_in_record
     from faintspot.ao_loop import simulate_loop
-    from faintspot.ao_loop.observatory import prepare
+    from faintspot.ao_loop.telescope_model import prepare
 
     run = faint().replace("run", frames=450, settle_frames=50)
     winds = run.atmosphere.wind_speed_m_per_s
@@ -51,14 +51,14 @@ def test_slopes_tell_r0_and_wind() -> None:
             subaperture_m=run.subaperture_m,
             pixel_scale_arcsec=run.pixel_scale_rad / ARCSEC,
         )
-        found = {each.name: each for each in of_air(seen, layout)}
+        found = {each.name: each for each in of_atmosphere(seen, layout)}
         speeds.append(found["wind"].value)
     r0 = found["r0 at 500 nm"]
     assert r0.value == pytest.approx(0.15, rel=0.25)
     assert 0 < r0.error < 0.03
     assert 6.0 < speeds[1] < 22.0
     assert 1.7 < speeds[1] / speeds[0] < 5.0
-    unknown = {each.name: each for each in of_air(seen, prepare(run).sensor.layout)}
+    unknown = {each.name: each for each in of_atmosphere(seen, prepare(run).sensor.layout)}
     assert "subaperture_m" in unknown["wind"].in_words()
     assert "not known" in unknown["r0 at 500 nm"].in_words()
 
@@ -66,18 +66,18 @@ def test_slopes_tell_r0_and_wind() -> None:
 def test_vibrations_stand_out_or_do_not() -> None:
     """Along x, 0.1 px at 40 Hz: rms 0.071; the resolution is 0.4 Hz."""
     calm, _ = seen_with_truth(frames=2400, turn=2400)
-    none = [each for each in of_air(calm, LAYOUT) if each.name.startswith("vibration")]
+    none = [each for each in of_atmosphere(calm, LAYOUT) if each.name.startswith("vibration")]
     assert [each.value for each in none] == [0.0]
     assert "none with an rms above" in none[0].in_words()
     shaken, _ = seen_with_truth(frames=2400, turn=2400, vibration=(0.1, 40.0))
-    found = [each for each in of_air(shaken, LAYOUT) if each.name == "vibration"]
+    found = [each for each in of_atmosphere(shaken, LAYOUT) if each.name == "vibration"]
     assert len(found) == 1
     assert found[0].value == pytest.approx(40.0, abs=0.4)
     assert "along x, rms 0.07" in found[0].in_words()
     short, _ = seen_with_truth(frames=400)
-    assert "60 frames without a gap" in of_air(short, LAYOUT)[-1].in_words()
+    assert "60 frames without a gap" in of_atmosphere(short, LAYOUT)[-1].in_words()
 
 
 def test_in_words() -> None:
-    assert Known("r0", "m", 0.1534, 0.0123, "so").in_words() == "r0: 0.153 +- 0.012 m (so)"
-    assert Known("gain", "", 0.9, 0.1).in_words() == "gain: 0.9 +- 0.1"
+    assert Measured("r0", "m", 0.1534, 0.0123, "so").in_words() == "r0: 0.153 +- 0.012 m (so)"
+    assert Measured("gain", "", 0.9, 0.1).in_words() == "gain: 0.9 +- 0.1"

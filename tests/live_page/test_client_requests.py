@@ -14,7 +14,7 @@ from tests.realtime.telemetry_cases import LAYOUT, Engine
 
 from faintspot.base.errors import InputError
 from faintspot.io.telemetry import read_telemetry
-from faintspot.live_page.wishes import EngineWishes, answered
+from faintspot.live_page.client_requests import EngineRequests, answered
 from faintspot.realtime.control import ControlServer
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.telemetry import TelemetryRing
@@ -43,18 +43,18 @@ def asked() -> Iterator[list[tuple[str, dict[str, Any]]]]:
         yield heard
 
 
-def ask(wishes: EngineWishes, **asked: Any) -> dict[str, Any]:
-    return answered(wishes, asked)
+def ask(client_requests: EngineRequests, **asked: Any) -> dict[str, Any]:
+    return answered(client_requests, asked)
 
 
-def test_wishes_reach_the_control_channel_as_the_command_line_sends_them(
+def test_client_requests_reach_the_control_channel_as_the_command_line_sends_them(
     asked: list[tuple[str, dict[str, Any]]], tmp_path: Path
 ) -> None:
-    wishes = EngineWishes(NAME, tmp_path)
-    answer = ask(wishes, do="set", changes=["noise_std=2.5", "rule=threshold"], subapertures="1,3-5")
+    client_requests = EngineRequests(NAME, tmp_path)
+    answer = ask(client_requests, do="set", changes=["noise_std=2.5", "rule=threshold"], subapertures="1,3-5")
     assert answer == {"ok": True, "text": "in effect from frame 12"}
-    assert ask(wishes, do="interleave", arms="none,tv", every=20)["ok"]
-    assert ask(wishes, do="loop", action="gain", gain=0.3)["ok"]
+    assert ask(client_requests, do="interleave", arms="none,tv", every=20)["ok"]
+    assert ask(client_requests, do="loop", action="gain", gain=0.3)["ok"]
     assert asked == [
         ("set", {"changes": {"noise_std": 2.5, "rule": "threshold"}, "where": [1, 3, 4, 5]}),
         ("interleave", {"arms": "none,tv", "every": 20}),
@@ -85,32 +85,35 @@ def test_wishes_reach_the_control_channel_as_the_command_line_sends_them(
 def test_what_is_wrong_is_said_in_one_line(
     asked: list[tuple[str, dict[str, Any]]], tmp_path: Path, wish: dict[str, Any], error: str
 ) -> None:
-    answer = answered(EngineWishes(NAME, tmp_path), wish)
+    answer = answered(EngineRequests(NAME, tmp_path), wish)
     assert not answer["ok"]
     assert error in answer["error"]
     assert "\n" not in answer["error"]
 
 
-def test_without_an_engine_wishes_are_refused(tmp_path: Path) -> None:
-    answer = ask(EngineWishes(NAME, tmp_path), do="set", changes=["noise_std=1"])
+def test_without_an_engine_client_requests_are_refused(tmp_path: Path) -> None:
+    answer = ask(EngineRequests(NAME, tmp_path), do="set", changes=["noise_std=1"])
     assert answer["error"].startswith(f"no engine runs under the name {NAME}")
 
 
 def test_recording_from_the_page(tmp_path: Path) -> None:
     engine = Engine(TelemetryRing.create(NAME, LAYOUT))
     engine.start()
-    wishes = EngineWishes(NAME, tmp_path)
+    client_requests = EngineRequests(NAME, tmp_path)
     try:
-        assert ask(wishes, do="stop_recording")["text"] == "nothing is being recorded"
-        assert ask(wishes, do="record", file="night.zarr") == {"ok": True, "text": "recording to night.zarr"}
-        assert "a recording runs already" in ask(wishes, do="record", file="other.zarr")["error"]
-        while wishes.recording.status()["frames"] < 50:
+        assert ask(client_requests, do="stop_recording")["text"] == "nothing is being recorded"
+        assert ask(client_requests, do="record", file="night.zarr") == {
+            "ok": True,
+            "text": "recording to night.zarr",
+        }
+        assert "a recording runs already" in ask(client_requests, do="record", file="other.zarr")["error"]
+        while client_requests.recording.status()["frames"] < 50:
             time.sleep(0.01)
-        answer = ask(wishes, do="stop_recording")
+        answer = ask(client_requests, do="stop_recording")
         assert answer["text"].startswith("night.zarr: ")
-        assert not wishes.recording.status()["running"]
+        assert not client_requests.recording.status()["running"]
         assert len(read_telemetry(tmp_path / "night.zarr").frame) >= 50
-        assert "exists already" in ask(wishes, do="record", file="night.zarr")["error"]
+        assert "exists already" in ask(client_requests, do="record", file="night.zarr")["error"]
     finally:
         engine.stop()
-        wishes.close()
+        client_requests.close()

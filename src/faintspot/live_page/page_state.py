@@ -37,7 +37,7 @@ _COMPARED = {
 }
 
 
-class Gathered:
+class PageState:
     """Numbers of the frames of one engine or recording.
 
     Parameters

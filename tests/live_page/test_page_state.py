@@ -8,20 +8,20 @@ pytest.importorskip("zarr")
 from tests.live_page.cases import records
 
 from faintspot.base.flags import SubapertureFlag
-from faintspot.live_page import gathered as gathered_module
+from faintspot.live_page import page_state as page_state_module
 from faintspot.live_page.batch import Batch
-from faintspot.live_page.gathered import Gathered, flag_names
+from faintspot.live_page.page_state import PageState, flag_names
 
 
 def test_newest_frame_and_strip_charts() -> None:
-    gathered = Gathered([])
-    gathered.add(Batch(records(0, 10)))
+    page_state = PageState([])
+    page_state.add(Batch(records(0, 10)))
     late = records(10, 10)
     late["published_time_ns"][3] += 9_950_000
-    late["flags"][:, 0] = SubapertureFlag.NO_LIGHT
+    late["flags"][:, 0] = SubapertureFlag.NO_FLUX
     late["flux"][:, 0] = 1e6  # of what is not valid nothing counts
-    gathered.add(Batch(late, truth=(19, 0.5, 120.0)))
-    values, arrays = gathered.now()
+    page_state.add(Batch(late, truth=(19, 0.5, 120.0)))
+    values, arrays = page_state.now()
     strip = {name: arrays["strip"][:, place] for place, name in enumerate(values["strip"])}
     assert values["frame"] == 19
     assert values["seen"] == 20
@@ -36,48 +36,48 @@ def test_newest_frame_and_strip_charts() -> None:
 
 
 def test_truth_that_comes_before_its_frame_counts_for_it() -> None:
-    gathered = Gathered(["none", "tv"])
+    page_state = PageState(["none", "tv"])
     for turn in range(40):
         first = 10 * turn
         truth = (first + 10, 0.2 + 0.4 * ((turn + 1) % 2), 100.0)  # of the next turn's first frame
-        gathered.add(Batch(records(first, 10, arm=turn % 2), truth=truth))
-    none, tv = gathered.arms_compared()
+        page_state.add(Batch(records(first, 10, arm=turn % 2), truth=truth))
+    none, tv = page_state.arms_compared()
     assert none["figures"]["Strehl ratio"]["mean"] == pytest.approx(0.2)
     assert tv["figures"]["Strehl ratio"]["mean"] == pytest.approx(0.6)
 
 
 def test_lost_frames_are_counted_once_and_a_camera_that_begins_anew_loses_none() -> None:
-    gathered = Gathered([])
-    gathered.add(Batch(records(0, 5)))
-    gathered.add(Batch(records(8, 5), missed=2))
-    gathered.add(Batch(records(0, 5)))
-    assert gathered.lost == 3
-    assert gathered.missed == 2
+    page_state = PageState([])
+    page_state.add(Batch(records(0, 5)))
+    page_state.add(Batch(records(8, 5), missed=2))
+    page_state.add(Batch(records(0, 5)))
+    assert page_state.lost == 3
+    assert page_state.missed == 2
 
 
 def test_figures_are_those_of_numpy() -> None:
-    gathered = Gathered([])
+    page_state = PageState([])
     made = records(0, 1000)
     latency_us = np.random.default_rng(1).lognormal(4.0, 0.5, 1000).round(3)
     made["published_time_ns"] = made["last_row_time_ns"] + np.round(1e3 * latency_us)
-    gathered.add(Batch(made))
-    figures = gathered.figures()
+    page_state.add(Batch(made))
+    figures = page_state.figures()
     expected = np.percentile(latency_us, (50, 99, 99.9))
     np.testing.assert_allclose(list(figures["percentiles_us"].values()), expected, rtol=1e-6)
     assert figures["rate_hz"] == pytest.approx(100.0)
     assert figures["longest_us"] == pytest.approx(latency_us.max())
     assert figures["histogram"]["counts"].sum() == 1000
-    assert gathered.arms_compared() == []
+    assert page_state.arms_compared() == []
 
 
 def test_arms_in_turn_are_compared_with_the_first() -> None:
     """The second arm has 10 e- more, without noise: the difference is known exactly."""
-    gathered = Gathered(["none", "tv"])
+    page_state = PageState(["none", "tv"])
     for turn in range(40):
         made = records(50 * turn, 50, arm=turn % 2)
         made["flux"] += 10.0 * (turn % 2)
-        gathered.add(Batch(made))
-    none, tv = gathered.arms_compared()
+        page_state.add(Batch(made))
+    none, tv = page_state.arms_compared()
     assert (none["arm"], tv["arm"], none["frames"]) == ("none", "tv", 1000)
     flux = tv["figures"]["flux (e-)"]
     assert flux["mean"] == pytest.approx(110.0)
@@ -88,36 +88,36 @@ def test_arms_in_turn_are_compared_with_the_first() -> None:
 
 
 def test_arms_of_an_earlier_interleaving_are_not_compared() -> None:
-    gathered = Gathered(["none", "tv"])
+    page_state = PageState(["none", "tv"])
     for turn in range(6):
-        gathered.add(Batch(records(50 * turn, 50, arm=turn % 2)))
+        page_state.add(Batch(records(50 * turn, 50, arm=turn % 2)))
     change = {"frame": 300, "number": 1, "changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 50}}
     for turn in range(6, 12):
         made = records(50 * turn, 50, arm=2 + turn % 2)
-        gathered.add(Batch(made, changes=[change] if turn == 6 else []))
-    assert [row["arm"] for row in gathered.arms_compared()] == ["ml", "set"]
+        page_state.add(Batch(made, changes=[change] if turn == 6 else []))
+    assert [row["arm"] for row in page_state.arms_compared()] == ["ml", "set"]
 
 
 def test_only_the_last_minute_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gathered_module, "FRAMES_S", 2.0)
-    monkeypatch.setattr(gathered_module, "STRIP_S", 1.0)
-    gathered = Gathered([])
+    monkeypatch.setattr(page_state_module, "FRAMES_S", 2.0)
+    monkeypatch.setattr(page_state_module, "STRIP_S", 1.0)
+    page_state = PageState([])
     for second in range(10):
-        gathered.add(Batch(records(100 * second, 100)))
-    assert gathered.figures()["frames"] <= 300
-    assert len(gathered.now()[1]["strip"]) <= 2
+        page_state.add(Batch(records(100 * second, 100)))
+    assert page_state.figures()["frames"] <= 300
+    assert len(page_state.now()[1]["strip"]) <= 2
 
 
 def test_sensor_without_a_valid_slope_has_no_figures_that_are_wrong() -> None:
-    gathered = Gathered([])
+    page_state = PageState([])
     made = records(0, 10)
-    made["flags"] = SubapertureFlag.NO_LIGHT
-    gathered.add(Batch(made))
-    values, arrays = gathered.now()
+    made["flags"] = SubapertureFlag.NO_FLUX
+    page_state.add(Batch(made))
+    values, arrays = page_state.now()
     strip = dict(zip(values["strip"], arrays["strip"][0], strict=True))
     assert np.isnan(strip["flux_e"])
     assert np.isnan(strip["rms_px"])
-    assert gathered.figures()["frames"] == 10
+    assert page_state.figures()["frames"] == 10
 
 
 def test_legend_names_every_flag() -> None:

@@ -23,7 +23,7 @@ FEWEST_FRAMES = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class LoopTelemetry:
     """Consecutive frames of a closed loop, with m slopes; arms may have taken turns."""
 
     arm: NDArray[np.int64]
@@ -50,11 +50,11 @@ class Seen:
         starts = np.flatnonzero(np.concatenate([[True], np.diff(self.turn) != 0]))
         return np.arange(len(self)) - np.repeat(starts, np.diff(np.append(starts, len(self))))
 
-    def chosen(self, rows: NDArray[np.bool_]) -> Seen:
+    def chosen(self, rows: NDArray[np.bool_]) -> LoopTelemetry:
         """Return some of the frames; what was apart or comes apart is not one turn."""
         gaps = np.flatnonzero(rows[1:] & ~rows[:-1]) + 1
         turn = self.turn + np.searchsorted(gaps, np.arange(len(self)), "right") * (self.turn.max() + 1)
-        return Seen(
+        return LoopTelemetry(
             self.arm[rows],
             turn[rows],
             self.slopes_px[rows],
@@ -86,7 +86,7 @@ class Seen:
 
 def seen_in_telemetry(
     telemetry: Telemetry, control: Control, priors_px: Sequence[Floats | None] = (None,)
-) -> Seen:
+) -> LoopTelemetry:
     """Return what an engine's closed loop has seen.
 
     Parameters
@@ -119,7 +119,7 @@ def seen_in_telemetry(
     times = telemetry.last_row_time_ns[rows]
     rate = (frame[-1] - frame[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
     apart = (np.diff(arm) != 0) | (np.diff(frame) != 1)
-    return Seen(arm, np.concatenate([[0], np.cumsum(apart)]), *alone, held, float(rate))
+    return LoopTelemetry(arm, np.concatenate([[0], np.cumsum(apart)]), *alone, held, float(rate))
 
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:

@@ -47,10 +47,10 @@ class Sensor:
         seen = (np.minimum(nodes.real, nodes.imag) > 2) & (np.maximum(nodes.real, nodes.imag) < size - 3)
         offset, self.nodes = offset[seen], nodes[seen]
         radius = np.abs(offset) / (pitch_px * lenslets / 2)
-        self.lit = (radius < 1) & (radius > inner)
-        self.lit &= np.minimum(np.abs(offset.real), np.abs(offset.imag)) >= spider * pitch_px
+        self.illuminated = (radius < 1) & (radius > inner)
+        self.illuminated &= np.minimum(np.abs(offset.real), np.abs(offset.imag)) >= spider * pitch_px
         self.flux_e = flux_e * np.exp(scatter * rng.standard_normal(len(radius)))
-        self.flux_e[~self.lit] *= outside
+        self.flux_e[~self.illuminated] *= outside
         self.width_px = max(width * pitch_px, 0.8)
         margin = 2 * int(np.ceil(4 * self.width_px)) + 2
         y, x = np.mgrid[-margin : size + margin, -margin : size + margin] - size / 2
@@ -77,7 +77,7 @@ class Sensor:
     def wrong(self, grid: LensletGrid) -> tuple[int, int]:
         """Return how many lit lenslets are missing, and how many found ones are not lit."""
         found = grid.centres[:, 0] + 1j * grid.centres[:, 1]
-        near = np.abs(found[:, None] - self.nodes[self.lit]) < 0.3 * self.pitch_px
+        near = np.abs(found[:, None] - self.nodes[self.illuminated]) < 0.3 * self.pitch_px
         return int(np.count_nonzero(~near.any(axis=0))), int(np.count_nonzero(~near.any(axis=1)))
 
 
@@ -108,8 +108,8 @@ def test_pupil_is_found_whole(sensor: dict[str, Any], seed: int) -> None:
     """One lenslet in fifty may fall either way: a dim or displaced one at the pupil's edge."""
     truth = Sensor(seed, **sensor)
     missing, false = truth.wrong(find_lenslets(truth.frame()))
-    assert missing <= max(1, 0.02 * np.count_nonzero(truth.lit))
-    assert false <= max(1, 0.02 * np.count_nonzero(truth.lit))
+    assert missing <= max(1, 0.02 * np.count_nonzero(truth.illuminated))
+    assert false <= max(1, 0.02 * np.count_nonzero(truth.illuminated))
 
 
 @pytest.mark.parametrize("part", [0.2, 0.25, 0.3, 0.4])
@@ -118,7 +118,7 @@ def test_a_dim_edge_is_taken_or_left_whole(part: float, seed: int) -> None:
     """Its lenslets scatter by 15 %, and the dividing flux lies where few are."""
     truth = Sensor(seed, lenslets=14)
     offset = truth.nodes.real + 0.3 * truth.nodes.imag
-    dim = truth.lit & (offset > np.quantile(offset[truth.lit], 0.88))
+    dim = truth.illuminated & (offset > np.quantile(offset[truth.illuminated], 0.88))
     truth.flux_e[dim] *= part
     grid = find_lenslets(truth.frame())
     found = grid.centres[:, 0] + 1j * grid.centres[:, 1]
@@ -133,9 +133,9 @@ def test_ghosts_are_left_out(seed: int) -> None:
     """Four as bright as spots far from the pupil, off the lattice or on it, and four dim ones anywhere."""
     truth = Sensor(seed, lenslets=12)
     rng = np.random.default_rng(100 + seed)
-    edge = np.abs(truth.nodes[:, None] - truth.nodes[truth.lit]).min(axis=1) / truth.pitch_px
+    edge = np.abs(truth.nodes[:, None] - truth.nodes[truth.illuminated]).min(axis=1) / truth.pitch_px
     far = rng.choice(np.flatnonzero(edge > 1.6), 4, replace=False)
-    dim = rng.choice(np.flatnonzero(~truth.lit), 4, replace=False)
+    dim = rng.choice(np.flatnonzero(~truth.illuminated), 4, replace=False)
     truth.flux_e[far] = 2000.0
     truth.flux_e[dim] += 200.0
     truth.nodes[far[:2]] += 5.0
@@ -152,8 +152,8 @@ def test_faint_spots_are_doubtful_and_bright_ones_are_not() -> None:
     assert "out of the noise" in grid.doubt
     # 100 e- in a spot of 1.4 px over 5.4 e- of noise: 3.7 standard deviations.
     missing, false = faint.wrong(grid)
-    assert missing < 0.2 * np.count_nonzero(faint.lit)
-    assert false < 0.05 * np.count_nonzero(faint.lit)
+    assert missing < 0.2 * np.count_nonzero(faint.illuminated)
+    assert false < 0.05 * np.count_nonzero(faint.illuminated)
 
 
 def test_two_brightnesses_are_doubtful() -> None:
@@ -162,16 +162,16 @@ def test_two_brightnesses_are_doubtful() -> None:
     assert "\n" not in grid.doubt
 
 
-def test_lit_fraction_is_strict_and_of_the_median() -> None:
+def test_illuminated_fraction_is_strict_and_of_the_median() -> None:
     truth = Sensor(3, lenslets=14, scatter=0.4)
     frame = truth.frame()
     flux = find_lenslets(frame).flux
     for part in (0.5, 1.0):
-        chosen = find_lenslets(frame, lit_fraction=part).flux
+        chosen = find_lenslets(frame, illuminated_fraction=part).flux
         # The lattice is fitted to the lenslets that are lit, so that the flux differs a little.
         np.testing.assert_allclose(np.sort(chosen), np.sort(flux[flux >= part * np.median(flux)]), rtol=0.01)
     dim = Sensor(3, lenslets=14, outside=0.1)
-    assert len(find_lenslets(dim.frame(), lit_fraction=0.03).flux) > 0.95 * len(dim.nodes)
+    assert len(find_lenslets(dim.frame(), illuminated_fraction=0.03).flux) > 0.95 * len(dim.nodes)
 
 
 def test_pupil_is_taken_as_given() -> None:
@@ -205,7 +205,7 @@ def test_region_of_interest() -> None:
 @pytest.mark.parametrize(
     ("words", "options"),
     [
-        ("lit_fraction = 2", {"lit_fraction": 2}),
+        ("illuminated_fraction = 2", {"illuminated_fraction": 2}),
         ("pupil: expected x, y, radius", {"pupil": (1, 2)}),
         ("pupil: expected radius > inner radius", {"pupil": (50, 50, 10, 20)}),
         ("pupil", {"pupil": "round"}),

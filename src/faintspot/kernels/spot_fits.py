@@ -14,7 +14,7 @@ from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     COMMON_ROWS,
     EXCESS,
-    NO_LIGHT,
+    NO_FLUX,
     RANGE,
     TOO_MANY_BAD_PIXELS,
     VARIANCE,
@@ -26,29 +26,29 @@ from faintspot.kernels.likelihood import fit_group
 from faintspot.kernels.posterior import posterior_of_group
 from faintspot.kernels.simd import Lanes, load, rounded, splat, store, width_of
 from faintspot.kernels.smoothing import gather_taps
-from faintspot.kernels.start import LEAST_LIGHT_E, find_start
+from faintspot.kernels.start import LEAST_FLUX_E, find_start
 from faintspot.kernels.trained import apply_score
 from faintspot.kernels.weighted import weigh_group
 
-# Rows of the settings' table that follow the common ones: light that is expected; weights of a fit; prior.
+# Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.
 FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)
-# Which model and which table of the light's; see `spot_rows`; errors of a score; light of likely outliers.
-MODEL, KIND, START_LIGHT, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_LIGHT = range(
+# Which model and which table of the flux's; see `spot_rows`; errors of a score; light of likely outliers.
+MODEL, KIND, START_FLUX, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_FLUX = range(
     COMMON_ROWS + 5, COMMON_ROWS + 13
 )
 SETTING_ROWS = COMMON_ROWS + 13
 
 OUTLIER_LIKELY = int(SubapertureFlag.OUTLIER_LIKELY)
 LEAST_SIGNIFICANCE = 1.0
-"""A spot less significant than this many standard deviations counts as no light."""
+"""A spot less significant than this many standard deviations counts as no flux."""
 SMALLEST_VARIANCE = 1e-4
 """Electrons squared: keeps the weights finite where there is no noise."""
 MOST_MODEL_ERROR_E = 300.0
-"""Electrons: the square of a model error counts no more than this over the light, so that in bright light
+"""Electrons: the square of a model error counts no more than this over the flux, so that in high flux
 dark wings, where a PSF is least known, do not get all the weight."""
 BRIGHT = 2.0
-"""Times the expected light from which on that of the window is believed instead, if it is significant."""
-_LIT_FRACTION = 0.2  # of the expected light: what is surely less is no light
+"""Times the expected flux from which on that of the window is believed instead, if it is significant."""
+_LIT_FRACTION = 0.2  # of the expected flux: what is surely less is no flux
 _SURELY = 3.0  # standard deviations
 _BROAD = 0.5  # standard deviation, in units of the grid's spacing, above which sums over the grid are good
 
@@ -145,7 +145,7 @@ def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 @compiled
 def locate_fitted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
-    """Fit position and light of the spots of a group."""
+    """Fit position and flux of the spots of a group."""
     _round(group, tables.round_electrons, scratch.image)
     _begin(group, scratch)
     if tables.background:
@@ -173,10 +173,10 @@ def locate_posterior(group: Any, tables: Any, scratch: Any, stages: Any) -> None
         (spot_rows.PEAK_FLUX, spot_rows.FLUX),
     ):
         store(own.lane_values, peak * width, load(lanes, own.lane_values, found * width))
-    _expect_light(group, own.lane_values)
+    _expect_flux(group, own.lane_values)
     if tables.fit.background:
-        light = load(lanes, own.lane_values, spot_rows.FLUX * width)
-        subtract_background(lanes, scratch.image, pixels, light)
+        flux = load(lanes, own.lane_values, spot_rows.FLUX * width)
+        subtract_background(lanes, scratch.image, pixels, flux)
     posterior_of_group(
         group.lanes,
         scratch.image,
@@ -205,8 +205,8 @@ def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     _begin(group, scratch)
     if tables.from_peak:
         _begin_at_peak(group, tables.taps, scratch)
-    _expect_light(group, own.lane_values)
-    _believe_bright_light(group, scratch.image, own.lane_values)
+    _expect_flux(group, own.lane_values)
+    _believe_bright_flux(group, scratch.image, own.lane_values)
     apply_score(
         group.lanes,
         scratch.image,
@@ -220,7 +220,7 @@ def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         own.starts,
         own.rows,
     )
-    _sum_light(group, scratch.image, own.lane_values)
+    _sum_flux(group, scratch.image, own.lane_values)
     _finish(group, tables.passes, True, scratch)
 
 
@@ -256,7 +256,7 @@ def _begin(group: Any, scratch: Any) -> None:
         lane_values[spot_rows.VARIANCE * width + lane] = max(settings[VARIANCE, s], 0.0)
         lane_values[spot_rows.EXCESS * width + lane] = settings[EXCESS, s]
         lane_values[spot_rows.PRIOR_WEIGHT * width + lane] = settings[PRIOR_WEIGHT, s]
-        lane_values[spot_rows.START_LIGHT * width + lane] = settings[START_LIGHT, s]
+        lane_values[spot_rows.START_FLUX * width + lane] = settings[START_FLUX, s]
         lane_values[spot_rows.GAIN_X * width + lane] = settings[GAIN_X, s]
         lane_values[spot_rows.GAIN_Y * width + lane] = settings[GAIN_Y, s]
 
@@ -272,7 +272,7 @@ def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
 
 @compiled
 def _fit(group: Any, tables: Any, scratch: Any) -> None:
-    """Fit from where the lanes are; the floor on the weights is a fraction of the light found so far."""
+    """Fit from where the lanes are; the floor on the weights is a fraction of the flux found so far."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
     lane_values = own.lane_values
     for lane in range(width):
@@ -299,17 +299,17 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
 
 
 @compiled
-def _expect_light(group: Any, lane_values: Any) -> None:
-    """Take the light that is expected for the light."""
+def _expect_flux(group: Any, lane_values: Any) -> None:
+    """Take the flux that is expected for the flux."""
     width, first, settings = width_of(group.lanes), group.first, group.settings
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
-        lane_values[spot_rows.FLUX * width + lane] = max(settings[FLUX, s], LEAST_LIGHT_E)
+        lane_values[spot_rows.FLUX * width + lane] = max(settings[FLUX, s], LEAST_FLUX_E)
 
 
 @compiled
-def _believe_bright_light(group: Any, image: Any, lane_values: Any) -> None:
-    """Take the light above the window's edges where that is far more: moves would be too long by as much."""
+def _believe_bright_flux(group: Any, image: Any, lane_values: Any) -> None:
+    """Take the flux above the window's edges where that is far more: moves would be too long by as much."""
     lanes, ny, nx = group.lanes, group.ny, group.nx
     width = width_of(lanes)
     edge, inner = splat(lanes, 0.0), splat(lanes, 0.0)
@@ -327,18 +327,18 @@ def _believe_bright_light(group: Any, image: Any, lane_values: Any) -> None:
     store(lane_values, spot_rows.SEEN * width, inner - splat(lanes, ratio) * edge)
     store(lane_values, spot_rows.SEEN_ERROR * width, inner)
     for lane in range(width):
-        light = lane_values[spot_rows.SEEN * width + lane]
+        flux = lane_values[spot_rows.SEEN * width + lane]
         noise = n_inner * lane_values[spot_rows.VARIANCE * width + lane]
         counts = max(lane_values[spot_rows.SEEN_ERROR * width + lane], 0.0)
         noise += lane_values[spot_rows.EXCESS * width + lane] * counts
         expected = lane_values[spot_rows.FLUX * width + lane]
-        if light > BRIGHT * expected + _SURELY * math.sqrt((1.0 + ratio) * noise):
-            lane_values[spot_rows.FLUX * width + lane] = light
+        if flux > BRIGHT * expected + _SURELY * math.sqrt((1.0 + ratio) * noise):
+            lane_values[spot_rows.FLUX * width + lane] = flux
 
 
 @compiled
-def _sum_light(group: Any, image: Any, lane_values: Any) -> None:
-    """Standard errors from the training, and the light that is seen in the whole window."""
+def _sum_flux(group: Any, image: Any, lane_values: Any) -> None:
+    """Standard errors from the training, and the flux that is seen in the whole window."""
     lanes, ny, nx, first, settings = group.lanes, group.ny, group.nx, group.first, group.settings
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
@@ -366,7 +366,7 @@ def _sum_light(group: Any, image: Any, lane_values: Any) -> None:
 def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
     """Begin at the posterior's mean, or at the peak where the grid is too coarse for a narrow posterior.
 
-    The likelihood of a PSF that is slightly wrong has several maxima in bright light. The peak beside the
+    The likelihood of a PSF that is slightly wrong has several maxima in high flux. The peak beside the
     mean leads to the one that a fit without a prior finds.
     """
     for lane in range(width):
@@ -381,8 +381,8 @@ def _begin_at_mean_or_peak(width: Any, lane_values: Any) -> None:
             row = spot_rows.PEAK_X if at_peak else spot_rows.MEAN_X
             lane_values[(spot_rows.X + axis) * width + lane] = lane_values[(row + axis) * width + lane]
         if at_peak:
-            light = lane_values[spot_rows.PEAK_FLUX * width + lane]
-            lane_values[spot_rows.FLUX * width + lane] = light
+            flux = lane_values[spot_rows.PEAK_FLUX * width + lane]
+            lane_values[spot_rows.FLUX * width + lane] = flux
 
 
 @compiled
@@ -400,17 +400,17 @@ def _keep_broad_posteriors(width: Any, lane_values: Any) -> None:
 
 
 @compiled
-def _is_lit(width: Any, lane: Any, expected: Any, lane_values: Any) -> Any:
-    """Whether there is a spot: where its light is expected, not surely much less; else a significant one."""
+def _is_illuminated(width: Any, lane: Any, expected: Any, lane_values: Any) -> Any:
+    """Whether there is a spot: where its flux is expected, not surely much less; else a significant one."""
     seen = lane_values[spot_rows.SEEN * width + lane]
     error = lane_values[spot_rows.SEEN_ERROR * width + lane]
     if expected >= 0.0:
-        return expected >= LEAST_LIGHT_E and seen + _SURELY * error > _LIT_FRACTION * expected
+        return expected >= LEAST_FLUX_E and seen + _SURELY * error > _LIT_FRACTION * expected
     return seen >= LEAST_SIGNIFICANCE * error
 
 
 @compiled
-def _finish(group: Any, steps: Any, expects_light: Any, scratch: Any) -> None:
+def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
     """Write the lanes' results, and the bits of their flags."""
     width, settings, lane_values, found = (
         width_of(group.lanes),
@@ -423,18 +423,18 @@ def _finish(group: Any, steps: Any, expects_light: Any, scratch: Any) -> None:
         bits = scratch.flags[lane]
         error_x = lane_values[spot_rows.ERROR_X * width + lane]
         error_y = lane_values[spot_rows.ERROR_Y * width + lane]
-        light = lane_values[spot_rows.FLUX * width + lane]
+        flux = lane_values[spot_rows.FLUX * width + lane]
         if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
-            expected = settings[FLUX, s] if expects_light else np.float32(-1.0)
-            lit = _is_lit(width, lane, expected, lane_values)
-            if not (error_x + error_y < math.inf and lit and abs(light) < math.inf):
-                bits |= NO_LIGHT
-            elif light < settings[LEAST_LIGHT, s]:
+            expected = settings[FLUX, s] if expects_flux else np.float32(-1.0)
+            illuminated = _is_illuminated(width, lane, expected, lane_values)
+            if not (error_x + error_y < math.inf and illuminated and abs(flux) < math.inf):
+                bits |= NO_FLUX
+            elif flux < settings[LEAST_FLUX, s]:
                 bits |= OUTLIER_LIKELY
         scratch.flags[lane], scratch.iterations[lane] = bits, steps
         found[groups.X * width + lane] = lane_values[spot_rows.X * width + lane]
         found[groups.Y * width + lane] = lane_values[spot_rows.Y * width + lane]
-        found[groups.FLUX * width + lane] = light if abs(light) < math.inf else np.float32(0.0)
+        found[groups.FLUX * width + lane] = flux if abs(flux) < math.inf else np.float32(0.0)
         found[groups.ERROR_X * width + lane], found[groups.ERROR_Y * width + lane] = error_x, error_y
 
 

@@ -14,7 +14,7 @@ from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.recorder import Recorder
 
-Wish = Callable[[dict[str, Any]], Mapping[str, Any]]
+ClientRequest = Callable[[dict[str, Any]], Mapping[str, Any]]
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,90}\.zarr")
 _MOST_CHANGES = 100
 
@@ -22,14 +22,14 @@ _MOST_CHANGES = 100
 class ClientRequests(Protocol):
     """What a page may ask for, by name; each raises InputError where it is refused."""
 
-    def known(self) -> Mapping[str, Wish]:
+    def known(self) -> Mapping[str, ClientRequest]:
         """Return the functions."""
         ...
 
 
-def answered(wishes: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
+def answered(client_requests: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
     """Carry out a wish; whatever happens, there is an answer."""
-    known = wishes.known()
+    known = client_requests.known()
     try:
         wish = known.get(asked["do"])
         if wish is None:
@@ -41,7 +41,7 @@ def answered(wishes: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
         return {"ok": False, "error": " ".join(f"{type(error).__name__}: {error}".split())[:500]}
 
 
-class EngineWishes:
+class EngineRequests:
     """Passes wishes on to an engine's control channel, which checks them, and records its telemetry.
 
     Parameters
@@ -56,7 +56,7 @@ class EngineWishes:
         self._name, self._path = name, socket_path(name)
         self.recording = Recording(name, Path(folder))
 
-    def known(self) -> Mapping[str, Wish]:
+    def known(self) -> Mapping[str, ClientRequest]:
         """Return the functions."""
         return {
             "set": self._set,

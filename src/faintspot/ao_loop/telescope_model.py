@@ -62,12 +62,12 @@ class TelescopeModel:
     correctable : bool
         Whether the air is only what the mirror can make.
     noiseless : bool
-        Whether every pixel holds its mean light.
+        Whether every pixel holds its mean flux.
 
     Attributes
     ----------
     optics : LoopOptics
-    air : MovingLayers
+    atmosphere : MovingLayers
         May be changed between two frames, as may
     photons : float
         photo-electrons of a fully lit sub-aperture in a frame.
@@ -84,7 +84,7 @@ class TelescopeModel:
         noiseless: bool = False,
     ) -> None:
         self.optics = optics = prepare(configuration)
-        self.air = air_of(without_light(configuration), seed, realisation)
+        self.atmosphere = atmosphere_of(without_flux(configuration), seed, realisation)
         self.photons = configuration.photons
         camera = make_detector(configuration)
         self.detector: Exposing = NoiselessDetector(camera) if noiseless else camera
@@ -97,24 +97,24 @@ class TelescopeModel:
         self, time_s: float, commands: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the wavefront after the mirror, and the one that the sensor sees, nm, (points, points)."""
-        air = self.air.wavefront_nm(time_s)
+        atmosphere = self.atmosphere.wavefront_nm(time_s)
         if self._best_fit is not None:
-            air = self._best_fit.fitted(air)
-        after = air + self.optics.mirror.wavefront_nm(commands)
-        return after, after if self._sees_mirror else air
+            atmosphere = self._best_fit.fitted(atmosphere)
+        after = atmosphere + self.optics.mirror.wavefront_nm(commands)
+        return after, after if self._sees_mirror else atmosphere
 
     def truth(self, time_s: float, wavefront_nm: NDArray[np.float32]) -> Truth:
         """Return what a wavefront after the mirror does to the science image."""
         pupil = self.optics.pupil
         field = pupil.field(wavefront_nm, self._science_wavelength_m)
-        return Truth(field, pupil.strehl(field), pupil.rms(wavefront_nm), self.air.r0_m(time_s))
+        return Truth(field, pupil.strehl(field), pupil.rms(wavefront_nm), self.atmosphere.r0_m(time_s))
 
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
         """Return the camera's frame of that number (its noise's) of a wavefront that the sensor sees, ADU."""
         sensor = self.optics.sensor
-        light = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
+        flux = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
         rng = np.random.default_rng([self._seed, self._realisation, number, 2])
-        return self.detector.expose(light, rng)
+        return self.detector.expose(flux, rng)
 
 
 def prepare(configuration: LoopConfiguration) -> LoopOptics:
@@ -134,7 +134,7 @@ def prepare(configuration: LoopConfiguration) -> LoopOptics:
     )
 
 
-def without_light(configuration: LoopConfiguration) -> LoopConfiguration:
+def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
     control = Control(**{name: getattr(configuration.control, name) for name in _OF_AIR})
     camera = Camera(photons_per_subaperture=1.0)
@@ -142,8 +142,8 @@ def without_light(configuration: LoopConfiguration) -> LoopConfiguration:
 
 
 @lru_cache(maxsize=2)
-def air_of(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
-    """Return the air of a configuration `without_light`; the last ones made are kept."""
+def atmosphere_of(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
+    """Return the air of a configuration `without_flux`; the last ones made are kept."""
     return make_atmosphere(configuration, seed, realisation)
 
 

@@ -1,4 +1,4 @@
-"""The light of every sub-aperture as a running mean over an engine's frames, for estimators that use it."""
+"""The flux of every sub-aperture as a running mean over an engine's frames, for estimators that use it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.kernels.compiling import Direct, compiled_with
 from faintspot.pipeline.mean_flux import MeanFlux
+from faintspot.realtime.engine_plan import EnginePlan
 from faintspot.realtime.live import LiveSettings
-from faintspot.realtime.prepared_settings import PreparedSettings
 
 TIME_CONSTANT_FRAMES = 1000.0
 _FEWEST_FRAMES = 100  # before the first change
@@ -21,18 +21,18 @@ _BETWEEN_S = 0.1
 
 
 @partial(compiled_with, source=__file__)
-def add_light(flux: NDArray[np.float32], mean: NDArray[np.float64], frames: float) -> None:
-    """Take one frame's light (n,) into the mean over so many frames; what is not finite counts nothing."""
+def add_flux(flux: NDArray[np.float32], mean: NDArray[np.float64], frames: float) -> None:
+    """Take one frame's flux (n,) into the mean over so many frames; what is not finite counts nothing."""
     for s in range(flux.shape[0]):
         if np.isfinite(flux[s]):
             mean[s] += (flux[s] - mean[s]) / frames
 
 
-class LightFollower:
-    """Measures the mean light, as `MeanFlux` does, and sets `flux_e` when it has changed.
+class FluxFollower:
+    """Measures the mean flux, as `MeanFlux` does, and sets `flux_e` when it has changed.
 
     New tables are made in a thread of its own, as for any change of settings. Where the estimator that runs
-    does not use the light, nothing is changed.
+    does not use the flux, nothing is changed.
 
     Parameters
     ----------
@@ -46,20 +46,20 @@ class LightFollower:
     """
 
     def __init__(
-        self, live: LiveSettings[PreparedSettings], time_constant_frames: float = TIME_CONSTANT_FRAMES
+        self, live: LiveSettings[EnginePlan], time_constant_frames: float = TIME_CONSTANT_FRAMES
     ) -> None:
         self._live = live
-        self._longest = number_between("mean_light", time_constant_frames, 1)
+        self._longest = number_between("mean_flux", time_constant_frames, 1)
         self._mean = np.zeros(len(live.running.layout))
         self._frames = 0.0
-        self._add = Direct(add_light)
+        self._add = Direct(add_flux)
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="faintspot-light", daemon=True)
+        self._thread = threading.Thread(target=self._follow, name="faintspot-flux", daemon=True)
         self.take(np.zeros(len(self._mean), np.float32))  # compiled now
         self._frames = 0.0
 
     def start(self) -> None:
-        """Follow the light from now on."""
+        """Follow the flux from now on."""
         self._thread.start()
 
     def close(self) -> None:
@@ -69,21 +69,21 @@ class LightFollower:
             self._thread.join()
 
     def take(self, flux_e: NDArray[np.float32]) -> None:
-        """Take one frame's light; by the engine's thread."""
+        """Take one frame's flux; by the engine's thread."""
         self._frames = min(self._frames + 1.0, self._longest)
         self._add(flux_e, self._mean, self._frames)
 
     def step(self) -> bool:
-        """Set the light where it has changed by more than tables distinguish; return whether it has."""
+        """Set the flux where it has changed by more than tables distinguish; return whether it has."""
         if self._frames < min(_FEWEST_FRAMES, self._longest):
             return False
         pipeline = self._live.running.pipelines[0]
-        if not pipeline.settings.estimator.uses_light:
+        if not pipeline.settings.estimator.uses_flux:
             return False
-        lit = pipeline.with_flux(MeanFlux(self._mean.copy(), self._longest))
-        if lit is pipeline:
+        illuminated = pipeline.with_flux(MeanFlux(self._mean.copy(), self._longest))
+        if illuminated is pipeline:
             return False
-        self._live.wait(self._live.propose({"flux_e": lit.settings.flux_e}))
+        self._live.wait(self._live.propose({"flux_e": illuminated.settings.flux_e}))
         return True
 
     def _follow(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.advice.advice_cases import LAYOUT, RATE_HZ, recording, seen_with_truth
 
-from faintspot.advice.seen import seen_in_telemetry
+from faintspot.advice.loop_telemetry import seen_in_telemetry
 from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, ControlOptions
 
