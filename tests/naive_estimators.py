@@ -165,7 +165,7 @@ def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
 
 
 def believed_flux(g: ArrayLike, expected: float, task: Task) -> float:
-    """The expected light, or that above the window's edges where it is far more."""
+    """The expected flux, or that above the window's edges where it is far more."""
     g = np.asarray(g, np.float64)
     inner = g[1:-1, 1:-1]
     edges = g.size - inner.size
@@ -287,7 +287,7 @@ def grid_posterior(
 def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimate:
     """Centre of gravity under a Gaussian window that follows it; error of the last step alone.
 
-    Less light under the window than LEAST_FRACTION of the start's counts as that much.
+    Less flux under the window than LEAST_FRACTION of the start's counts as that much.
     """
     g = np.asarray(g, np.float64)
     begin = start(g, task) if begin is None else begin
@@ -307,7 +307,7 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
         x = clamp(x + clamp(move_x, -1.0, 1.0), *limits[0])
         y = clamp(y + clamp(move_y, -1.0, 1.0), *limits[1])
     noise = w**2 * (task.variance + task.excess * g)
-    least = w**2 * max(task.variance, 1e-4)  # whatever noise has made of the light
+    least = w**2 * max(task.variance, 1e-4)  # whatever noise has made of the flux
     errors = [
         math.sqrt(max(np.sum(noise * away**2), np.sum(least * away**2))) / total for away in (u - x, v - y)
     ]
@@ -325,7 +325,7 @@ def fixed_window(
     divisor: float | None,
     gain: float | None,
 ) -> Estimate:
-    """Sum pixels under a Gaussian at the reference, over the expected light, or the frame's own where None.
+    """Sum pixels under a Gaussian at the reference, over the expected flux, or the frame's own where None.
 
     The gain, where not given, is the slope of the response to the spot at +-0.25 px; at the reference a spot
     is at 0. Weights below 1e-4 of the middle's, and outside the region, are 0.
@@ -380,7 +380,7 @@ def gravity_error(
 
     var_x = sum over kept pixels of ((u - x)^2 + 1/12) (v + e max(g, 0)) / (sum of the kept)^2, `g` being
     the calibrated image and the kept pixels those above zero in `image`, or every one; 1/12 px^2 as it is not
-    known where in a pixel the light fell.
+    known where in a pixel the flux fell.
     """
     image, g = np.asarray(image, np.float64), np.asarray(g, np.float64)
     x, y = naive.centre_of_gravity(image)
@@ -411,7 +411,7 @@ def trained(
 ) -> Estimate:
     """x <- q + sum psi(u - q) g / believed, pass after pass; `score` has the fields of TrainedScore.
 
-    `believed` is what the light is divided by, by default `flux`; the class is the one nearest to `flux` in
+    `believed` is what the flux is divided by, by default `flux`; the class is the one nearest to `flux` in
     logarithm.
     """
     believed = flux if believed is None else believed

@@ -79,7 +79,7 @@ class Spot:
         return np.clip(nodes, 0, count - 1), value, derivative
 
     def images(self, x: float, y: float, shape: tuple[int, int]) -> tuple[Floats, Floats, Floats]:
-        """Fraction of the light in every pixel for a spot at (x, y); its derivatives by x and by y."""
+        """Fraction of the flux in every pixel for a spot at (x, y); its derivatives by x and by y."""
         rows, value_y, slope_y = self._axis(shape[0], y, self.coefficients.shape[0])
         columns, value_x, slope_x = self._axis(shape[1], x, self.coefficients.shape[1])
         c = self.coefficients[rows[:, :, None, None], columns]

@@ -191,7 +191,7 @@ class TestLocalBackground:
             assert pipeline.for_images().plan.prepared.fits_background is fitted  # type: ignore[attr-defined]
 
     def test_flux_that_is_measured_does_not_count_the_background(self) -> None:
-        """40 spots give their mean light to 5 %; a few per cent of it fall onto the edge."""
+        """40 spots give their mean flux to 5 %; a few per cent of it fall onto the edge."""
         psf, rng = one_psf(), np.random.default_rng(3)
         images = psf.images(rng.uniform(-1, 1, (40, 2)), (12, 12), 500.0) + rng.normal(
             20.0, 1.0, (40, 12, 12)

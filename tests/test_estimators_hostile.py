@@ -1,4 +1,4 @@
-"""Images and settings that no estimator expects: nothing raises, nothing is NaN, no light is flagged."""
+"""Images and settings that no estimator expects: nothing raises, nothing is NaN, no flux is flagged."""
 
 from __future__ import annotations
 
@@ -109,14 +109,14 @@ class TestImages:
     @EVERY
     @pytest.mark.parametrize("level", [0.0, -40.0])
     def test_no_flux_is_flagged(self, estimator: str, level: float) -> None:
-        """A frame without any light in which light was expected."""
+        """A frame without any flux in which light was expected."""
         case = flat_case(estimator, np.full((5, 8, 9), level, np.float32), flux_e=400.0)
         slopes = case.measure()
         assert_sane(slopes)
         if estimator == "smoothed" and level < 0:
-            return  # the zeros beyond the window are the light that it sees
+            return  # the zeros beyond the window are the flux that it sees
         if estimator == "window":
-            return  # it divides by the light that was expected, so that a faint frame is no worse than others
+            return  # it divides by the flux that was expected, so that a faint frame is no worse than others
         assert np.all(slopes.flags & Flag.NO_FLUX)
 
     def test_map_notices_that_there_is_no_flux(self) -> None:

@@ -184,7 +184,7 @@ class TestGravity:
 
 
 def test_trained_score_in_one_dimension() -> None:
-    """psi = the pixel's offset makes one pass a centre of gravity over the light expected."""
+    """psi = the pixel's offset makes one pass a centre of gravity over the flux expected."""
     nodes = np.arange(-40, 41) / 4
     tables = np.zeros((1, 2, 3, 2, 81, 81), np.float32)
     tables[..., 0, :, :], tables[..., 1, :, :] = nodes[None, :], nodes[:, None]

@@ -38,7 +38,7 @@ def tall(stack: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_calibration_does_not_depend_on_its_flux(name: str) -> None:
-    # The frame is brought to the same light first; pixels are rounded to float32, and light that the pipeline
+    # The frame is brought to the same flux first; pixels are rounded to float32, and flux that the pipeline
     # is told counts in steps of up to 10 % ("map").
     slopes = []
     for flux in (FAINT_E, 1e3, 5e6):
@@ -62,14 +62,14 @@ def test_calibrating_is_a_block_that_ends() -> None:
         seen.append(measured.noise_free)
     assert [*seen, measured.noise_free] == [False, True, True, False]
     np.testing.assert_allclose(calibrated, measured.measure(bright, noise_free=True), atol=1e-6)
-    # Over a mean light of 40 e-, the sums of 100,000 e- are slopes beyond the window.
+    # Over a mean flux of 40 e-, the sums of 100,000 e- are slopes beyond the window.
     assert np.abs(measured.measure(bright)).max() > 100 * np.abs(calibrated).max()
 
 
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        (np.zeros((N * SIDE, SIDE)), "expected light in the sub-apertures"),
+        (np.zeros((N * SIDE, SIDE)), "expected flux in the sub-apertures"),
         (np.full((N * SIDE, SIDE), np.nan), "expected finite numbers"),
         (np.ones((4, 4)), "expected shape"),
     ],

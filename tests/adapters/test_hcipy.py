@@ -78,7 +78,7 @@ def test_noise_free_slopes_are_hcipys_own(shift_px: float) -> None:
 
 def test_lenslets_that_are_not_a_whole_number_of_pixels_wide() -> None:
     # 81 pixels for 7 lenslets: 11.57 each, so that HCIPy sums 11 or 12 pixels a side; the windows have 11.
-    # The row between, 6 px from the centre, has up to 1 % of the light: 0.06 px. A window's middle instead of
+    # The row between, 6 px from the centre, has up to 1 % of the flux: 0.06 px. A window's middle instead of
     # the lenslet's centre would be off by up to 0.5 px.
     odd, settings = sensor(pixels=81), EVERYTHING.replace(keep_brightest=121)
     image, mask = image_through(odd), inner(odd)
@@ -213,14 +213,14 @@ def test_calibration_and_prediction(optics: Any) -> None:
     image = image_through(optics)
     with estimator.calibrating():
         bright, faint = (np.asarray(estimator.estimate([image * scale])) for scale in (1.0, 1e-5))
-    # The image is brought to the same light first: rounding to float32 is what is left.
+    # The image is brought to the same flux first: rounding to float32 is what is left.
     np.testing.assert_allclose(bright, faint, atol=1e-5 * PIXEL_M)
     assert not asked
     first = estimator.estimate([image])
     estimator.estimate([image])
     assert len(asked) == 1
     assert asked[0] is first
-    # 20,000 e- over a mean light of 30: what calibrating is for.
+    # 20,000 e- over a mean flux of 30: what calibrating is for.
     assert np.abs(np.asarray(first)).max() > 10 * np.abs(bright).max()
 
 

@@ -70,7 +70,7 @@ def signal(wfs: StandIn, frame: Any, source: int = 0) -> np.ndarray:
 def test_every_estimator_has_the_tools_unit_and_order(name: str) -> None:
     wfs = StandIn()
     oopao.attach(wfs, ESTIMATORS[name], READ_NOISE, psf=PSF)
-    # Noise-free, at the light of calibrations: the unit has taken the estimator's gain out.
+    # Noise-free, at the flux of calibrations: the unit has taken the estimator's gain out.
     rows, columns = signal(wfs, images(5e5))
     assert np.polyfit(POSITIONS[:, 1], rows, 1)[0] == pytest.approx(1.0, abs=0.15)
     assert np.polyfit(POSITIONS[:, 0], columns, 1)[0] == pytest.approx(1.0, abs=0.15)
@@ -135,7 +135,7 @@ def test_detach() -> None:
         ({"is_geometric": True}, {}, "expected a diffractive sensor"),
         ({"weighting_map": 0.5}, {}, 'take the estimator "window"'),
         ({"two": True}, {"predict": [None]}, "expected one for each of 2 sources, got 1"),
-        ({"dark": True}, {}, "expected light in the sub-apertures"),
+        ({"dark": True}, {}, "expected flux in the sub-apertures"),
     ],
 )
 def test_refused_in_one_line(change: dict[str, Any], options: dict[str, Any], message: str) -> None:

@@ -116,7 +116,7 @@ def test_attach_and_detach(wfs: StandIn) -> None:
 
 def test_a_dark_sensor_keeps_its_own_centroider(wfs: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wfs, "getStatic", lambda: wfs.measure(np.zeros((N, SIDE, SIDE))))
-    with pytest.raises(InputError, match="expected light in the sub-apertures"):
+    with pytest.raises(InputError, match="expected flux in the sub-apertures"):
         soapy.attach(wfs, EVERYTHING)
     assert wfs.config.centMethod == "own"
 

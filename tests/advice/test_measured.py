@@ -1,4 +1,4 @@
-"""What telemetry tells: of images light, noise and spots, of slopes the air; and what it does not."""
+"""What telemetry tells: of images flux, noise and spots, of slopes the air; and what it does not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from faintspot.ao_loop.configuration import ARCSEC
 
 
 def test_images_tell_flux_noise_and_width() -> None:
-    """20 frames of 36 spots: the light to its stated error, the noise to some per cent."""
+    """20 frames of 36 spots: the flux to its stated error, the noise to some per cent."""
     flux, noise, width = of_images(frames(300.0), LAYOUT, fs.Calibration(dark=0.0, read_noise_e=1.0))
     # What diffraction throws out of windows of 8 pixels is not seen: some per cent.
     assert 300.0 * 0.9 < flux.value < 300.0 + 3 * flux.error

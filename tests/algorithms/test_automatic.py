@@ -1,4 +1,4 @@
-"""The automatic settings against a coarse search, and how they go with light, noise and window."""
+"""The automatic settings against a coarse search, and how they go with flux, noise and window."""
 
 from __future__ import annotations
 

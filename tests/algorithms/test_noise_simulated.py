@@ -16,7 +16,7 @@ from faintspot.simulate import Detector, sensor_frames, subapertures
 @pytest.mark.parametrize("read_noise_e", [1.0, 3.0])
 @pytest.mark.parametrize("flux_e", [0.0, 100.0, 500.0])
 def test_pixel_noise_under_spots(read_noise_e: float, flux_e: float) -> None:
-    """Within 4 % without light (30,000 differences: 0.7 % standard error; rounding to whole electrons).
+    """Within 4 % without flux (30,000 differences: 0.7 % standard error; rounding to whole electrons).
 
     With light, the wings of a Nyquist-sampled spot put up to 0.3 % of the flux into a pixel at the edge; its
     photon noise and shape may raise the estimate by up to the square root of 1 + 0.003 * flux / variance.

@@ -12,7 +12,7 @@ PLAIN = fs.Settings("brightest", keep_brightest=80)
 
 
 def quiet() -> LoopConfiguration:
-    """Plenty of light and no read noise."""
+    """Plenty of flux and no read noise."""
     return LoopConfiguration(camera=Camera(photons_per_subaperture=1e6, read_noise_e=0.0)).replace(
         "run", frames=200, settle_frames=40
     )

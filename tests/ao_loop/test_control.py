@@ -42,14 +42,14 @@ def test_the_integrator_is_the_recursion() -> None:
         np.testing.assert_array_equal(record.commands[frame + 2], latest.astype(np.float32))
 
 
-@pytest.mark.parametrize(("told", "kinds"), [(1.0, LEARNT), (3.0, ["kalman"])])
-def test_never_below_the_integrator(told: float, kinds: list[str]) -> None:
+@pytest.mark.parametrize(("assumed", "kinds"), [(1.0, LEARNT), (3.0, ["kalman"])])
+def test_never_below_the_integrator(assumed: float, kinds: list[str]) -> None:
     """The same slopes on the same air, the integrator's gain the best of three; also with wrong winds.
 
     Three runs of 250 scored frames: differences are paired, and 0.015 is three of their standard errors.
     """
     configuration = FAINT.replace(
-        "control", assumed_wind_factor=told, assumed_wind_turn_deg=90.0 * (told != 1)
+        "control", assumed_wind_factor=assumed, assumed_wind_turn_deg=90.0 * (assumed != 1)
     )
 
     def strehl(arm: Arm) -> float:

@@ -41,7 +41,7 @@ def test_flat_spots_are_the_lenslets_diffraction(sensor: ShackHartmann) -> None:
 
 
 def test_flux_is_that_of_the_illuminated_part(sensor: ShackHartmann) -> None:
-    """About 95 % of the light falls into the window; the rest is the wings, wider where partly lit."""
+    """About 95 % of the flux falls into the window; the rest is the wings, wider where partly lit."""
     np.testing.assert_allclose(sensor.spots(FLAT).sum(axis=(1, 2)), 0.95 * sensor.illumination, rtol=0.05)
 
 
@@ -61,7 +61,7 @@ def test_a_tilt_moves_the_spots(sensor: ShackHartmann) -> None:
 
 
 def test_noise_free_slopes_are_mean_gradients(sensor: ShackHartmann) -> None:
-    """Centre of gravity of all the light in the window, wavefronts of 160 nm rms.
+    """Centre of gravity of all the flux in the window, wavefronts of 160 nm rms.
 
     The window cuts the wings: a gain of 0.96; scatter about the line below 2 % of the slopes' rms.
     """

@@ -86,7 +86,7 @@ CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
         lambda _: map_of(64, 0.5, flux_e=np.linspace(10, 1000, 16)),
         ("map: tables of the posterior", "search_range_px", "one flux_e"),
     ),
-    "posterior of any light": (lambda _: map_of(64, 0.3), ("map: tables of the posterior",)),
+    "posterior of any flux": (lambda _: map_of(64, 0.3), ("map: tables of the posterior",)),
     "score": (lambda _: large_score(), ("score.tables", "smaller windows")),
     "psf's radius": (lambda _: PSF.analytic(radius_px=256), ("radius_px = 256",)),
     "psfs": (lambda _: PSF.analytic(size=np.ones(99), radius_px=128, index=range(99)), ("psf.samples",)),

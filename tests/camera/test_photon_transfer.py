@@ -120,7 +120,7 @@ def test_flux_too_faint_for_a_gain_is_said() -> None:
     frames, darks = recorded(CAMERA, 2.0, n_frames=10)
     found = measure_detector(frames, darks)
     assert not found.reliable
-    assert "more light" in found.notes[-1]
+    assert "more flux" in found.notes[-1]
 
 
 def test_saturation_is_said_and_a_range_avoids_it() -> None:

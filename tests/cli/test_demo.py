@@ -24,7 +24,7 @@ def test_demo_twice(folder: Path, run: Commands, monkeypatch: pytest.MonkeyPatch
     first = run.ok("demo", "--frames", 40, "-o", "new/demo", "--seed", 7)
     made = folder / "new" / "demo"
     assert {path.name for path in made.iterdir()} == FILES
-    for text in ("best k", "fixed k = 40", "R without", "R with TV", "480", "of light", "report.html"):
+    for text in ("best k", "fixed k = 40", "R without", "R with TV", "480", "of flux", "report.html"):
         assert text in first.out
     assert max(map(len, first.out.splitlines())) <= 100
     assert "40/40" in first.err

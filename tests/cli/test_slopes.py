@@ -190,7 +190,7 @@ def test_an_integer_frame_at_its_dtypes_limit_is_saturated(folder: Path, run: Co
 
 def test_all_slopes_bad_is_a_hundred_per_cent(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.zeros((2, 32, 32), np.uint16))
-    assert "  32 slopes without light (100 %)" in run.ok("slopes", "a.npy").out.splitlines()
+    assert "  32 slopes without flux (100 %)" in run.ok("slopes", "a.npy").out.splitlines()
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")

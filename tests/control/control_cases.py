@@ -7,7 +7,7 @@ import numpy as np
 from faintspot.control.learning import Plant
 from faintspot.control.models import SlopeModel
 from faintspot.control.reconstructor import make_reconstructor
-from faintspot.control.telemetry import Telemetry
+from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 FRAME_S = 0.004
@@ -31,7 +31,7 @@ PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
 
 def telemetry(
     frames: int = 2000, noise_px: float = 0.5, seed: int = 5, said: float = 1.0, model: SlopeModel = MODEL
-) -> Telemetry:
+) -> OpenLoopTelemetry:
     """Return slopes as a model makes them, with noise; errors are said to be so many times the true ones."""
     rng = np.random.default_rng(seed)
     driving = np.linalg.cholesky(model.driving)
@@ -48,4 +48,4 @@ def telemetry(
         now, before = np.array(new), now
         slopes.append(now.sum(axis=0))
     noisy = np.array(slopes[300:]) + noise_px * rng.standard_normal((frames, 18))
-    return Telemetry(noisy, np.full(noisy.shape, (said * noise_px) ** 2), np.ones(noisy.shape))
+    return OpenLoopTelemetry(noisy, np.full(noisy.shape, (said * noise_px) ** 2), np.ones(noisy.shape))

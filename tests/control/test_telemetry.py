@@ -22,7 +22,7 @@ from faintspot.control.modal_gains import GAINS, largest_stable_gain, modal_gain
 from faintspot.control.models import SlopeModel, joint_moments
 from faintspot.control.predictive import Predictive
 from faintspot.control.smoothing import smoothed_moments
-from faintspot.control.telemetry import Telemetry, usual_variance, without_prior
+from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance, without_prior
 
 AGAINST = TURBULENCE.turned(3.0, 180.0).lagged_px2(FRAME_S)[None]
 RIGHT = COVARIANCES[None]
@@ -63,7 +63,7 @@ def test_moments_behind_noise_are_found() -> None:
     assert np.linalg.norm(found - expected) < 0.15 * np.linalg.norm(expected)
 
 
-def _score(model: SlopeModel, frames: Telemetry) -> float:
+def _score(model: SlopeModel, frames: OpenLoopTelemetry) -> float:
     def made(line):  # type: ignore[no-untyped-def]
         predictor = SlopePredictor(model, usual_variance(frames))
         return Predictive(line, INTERACTION, predictor, PLANT.reconstructor.clean)

@@ -35,7 +35,7 @@ def gain(settings: Settings, flux_e: float, psf: Any, reach: float = 1.0, score:
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize("model_error", [0.1, 0.3, 1.0])
 def test_a_wrong_psf_costs_no_gain_in_bright_flux(wrong: str, model_error: float) -> None:
-    # A PSF that is wrong by 20 %, or without wings, has gains of 0.91 to 1.09 at any light. Loops are stable
+    # A PSF that is wrong by 20 %, or without wings, has gains of 0.91 to 1.09 at any flux. Loops are stable
     # to a factor of two; 0.85 to 1.15 leaves them room, and 1.3 to 1.6, as it was once, would fail.
     found = [gain(Settings("ml", model_error=model_error), flux, WRONG[wrong]) for flux in LIGHTS_E]
     assert min(found) > 0.85
@@ -44,7 +44,7 @@ def test_a_wrong_psf_costs_no_gain_in_bright_flux(wrong: str, model_error: float
 
 @pytest.mark.parametrize("prior_std_px", [None, 0.3])
 def test_map_in_far_more_flux_than_expected(prior_std_px: float | None) -> None:
-    # Steps of a fit that begins with too little light are too long by that factor: once up to 5.
+    # Steps of a fit that begins with too low flux are too long by that factor: once up to 5.
     settings = Settings("map", flux_e=40.0, prior_std_px=prior_std_px)
     for flux in LIGHTS_E:
         for reach in (0.3, 1.0):
@@ -58,7 +58,7 @@ def test_trained_score_in_far_more_flux_than_expected() -> None:
         flux_e=(30, 100), detector=fs.simulate.Detector(1.0), shape=(SIDE, SIDE), realisations=3000
     )
     settings = Settings("trained", flux_e=40.0)
-    # Scores for faint light draw towards the reference: a gain of 0.7 to 1; without the light it would be
+    # Scores for faint flux draw towards the reference: a gain of 0.7 to 1; without the flux it would be
     # 100,000, and all slopes at the edge of the window.
     for flux in LIGHTS_E:
         assert 0.6 < gain(settings, flux, None, score=score) < 1.1

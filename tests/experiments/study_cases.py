@@ -34,7 +34,7 @@ def cells(*, fluxes: Sequence[float] = FLUXES_E, **parameters: Any) -> list[Cell
 
 
 def power_law(gain: Callable[[Cell, str, str], float]) -> Callable[[Cell, str, str], float]:
-    """R as if an arm had `gain(cell, arm, mode)` times the light."""
+    """R as if an arm had `gain(cell, arm, mode)` times the flux."""
 
     def error(cell: Cell, arm: str, mode: str) -> float:
         flux = cell["flux_e"] * gain(cell, arm, mode)

@@ -23,7 +23,7 @@ def quick_cells() -> list[Cell]:
 
 
 def study(gain: Callable[[Cell], float], every: list[Cell] | None = None, **options: Any) -> Any:
-    """A study in which TV has `gain` times the light."""
+    """A study in which TV has `gain` times the flux."""
 
     def of_arm(cell: Cell, arm: str, mode: str) -> float:
         return gain(cell) if arm == "tv" else 1.0
@@ -153,12 +153,12 @@ def test_guidance_follows_the_numbers() -> None:
     good, bad = with_gains(1.6, 1.2), with_gains(0.9, 1.2)
     assert "Advice: use TV in the" in good
     assert "TV is the better of the two more often" in good
-    assert "It loses light" not in good
+    assert "It loses flux" not in good
     assert "tune k before anything else" in good
     assert "makes TV look better" not in good
     assert "Advice: do not use TV" in bad
     assert "Gaussian smoothing, which is simpler and faster, is the better" in bad
-    assert "It loses light in" in bad
+    assert "It loses flux in" in bad
     assert "ahead of TV more often than behind: brightest pixels" in bad
     equal = with_gains(1.3, 1.3)
     assert "Neither is the better" in equal

@@ -1,4 +1,4 @@
-"""Curves of R against the light, and what follows from them, with intervals."""
+"""Curves of R against the flux, and what follows from them, with intervals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def gain(curve: Curve, at: float, seed: int = 1) -> Gain:
 
 
 def with_scatter(method_flux: float, n: int = 2000) -> Curve:
-    """R = sqrt(10 / flux), and of a method that needs less light, with 10 % of scatter that both share."""
+    """R = sqrt(10 / flux), and of a method that needs less flux, with 10 % of scatter that both share."""
     flux = np.geomspace(10, 1000, 7)
     scatter = 1 + 0.1 * np.random.default_rng(1).standard_normal((len(flux), n))
     scatter /= scatter.mean(axis=1, keepdims=True)
@@ -126,7 +126,7 @@ def test_half_the_flux_is_three_quarters_of_a_magnitude() -> None:
     assert itself.value == 0.0
 
 
-@pytest.mark.parametrize(("light", "expected"), [(0.01, math.inf), (1e4, -math.inf)])
+@pytest.mark.parametrize(("flux", "expected"), [(0.01, math.inf), (1e4, -math.inf)])
 def test_gain_beyond_the_curve_has_a_sign(flux: float, expected: float) -> None:
     options: Any = {"method": "method", "reference": "reference"}
     found = magnitude_gain(with_scatter(flux), 100.0, np.random.default_rng(3), **options)

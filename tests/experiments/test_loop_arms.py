@@ -68,7 +68,7 @@ def peak() -> Iterator[type[Estimator]]:
         power: float = option(2.0, "Of each pixel.", low=1.0, high=9.0)
 
         name: ClassVar[str] = "peak"
-        label: ClassVar[str] = "power of the light"
+        label: ClassVar[str] = "power of the flux"
 
         def tuned(self, scene: Any) -> dict[str, list[float]]:
             return {"power": [2.0, 1.5, 3.0, 4.0, 5.0]}

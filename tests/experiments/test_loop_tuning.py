@@ -44,7 +44,7 @@ def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
     for result in answer.results:
         assert result.strehl.shape == result.centroid_gain.shape == (3, 2)
         assert (result.strehl > 0).all()
-    assert (answer["window"].strehl[-1] > answer["window"].strehl[0]).all()  # six times the light
+    assert (answer["window"].strehl[-1] > answer["window"].strehl[0]).all()  # six times the flux
     # What learns has the estimator's options that were tuned with the integrator.
     for plain, learning in zip(answer["window"].choices, answer["window+kalman"].choices, strict=True):
         assert all(learning[name] == plain[name] for name in plain if name != LOOP_GAIN)

@@ -42,7 +42,7 @@ def test_result(whole: Path) -> None:
     np.testing.assert_array_equal(result.photons, [40, 400])
     assert result.magnitudes[0] - result.magnitudes[1] == pytest.approx(2.5)
     assert result.strehl.shape == result.centroid_gain.shape == (2, 2, 2)
-    assert (result.strehl[:, 1] > result.strehl[:, 0]).all()  # ten times the light: 0.1 and more
+    assert (result.strehl[:, 1] > result.strehl[:, 0]).all()  # ten times the flux: 0.1 and more
     assert result.settings.shape == result.choices.shape == (2, 2)
     assert "keep_brightest" in result.settings[1, 0]
     assert result.psf.shape[:2] == (2, 2)

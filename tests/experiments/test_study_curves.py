@@ -53,7 +53,7 @@ def test_interval_covers_the_truth_as_often_as_it_says() -> None:
     rng = np.random.default_rng(3)
     exact = curve()
     pair = [exact.arms.index("brightest"), exact.arms.index("tv")]
-    # Twice the light, where log R is a straight line: as the interpolated curve says.
+    # Twice the flux, where log R is a straight line: as the interpolated curve says.
     known = gain_at_flux(exact, 80.0, rng, **TV_OVER_NO_TV)
     assert known is not None
     hits = 0

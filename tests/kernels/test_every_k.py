@@ -55,7 +55,7 @@ def test_every_k_is_the_definition(rule: str, seed: int, side: int, levels: int,
     single = (images + offset).astype(np.float32)
     positions, valid = positions_of_all(single, rule)
     expected, illuminated = one_by_one(single.astype(np.float64), rule)
-    # Round-off of double precision, magnified where little light is left above the floor.
+    # Round-off of double precision, magnified where low flux is left above the floor.
     clear = valid == illuminated
     assert np.mean(~clear) < 0.01  # only where the sum is at the floor itself
     np.testing.assert_allclose(positions[clear], expected[clear], rtol=0, atol=1e-8)

@@ -1,4 +1,4 @@
-"""The running mean of the light, and pipelines that are told it."""
+"""The running mean of the flux, and pipelines that are told it."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_slopes_are_divided_by_the_mean_flux() -> None:
     frame = np.random.default_rng(2).poisson(3.0, (16, 24))
     once = window_pipeline().with_flux(100.0)(frame)
     twice = window_pipeline().with_flux(200.0)(frame)
-    # Light counts in steps of 2 %.
+    # Flux counts in steps of 2 %.
     np.testing.assert_allclose(once.vector, 2 * twice.vector, rtol=0.03, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""What an estimator lacks is said in one line; measured light, configuration files and tables."""
+"""What an estimator lacks is said in one line; measured flux, configuration files and tables."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class TestWhatIsMissing:
 
 class TestMeasuredFlux:
     def test_is_each_frames_own(self) -> None:
-        """Frames measured together and one by one are the same, though their light differs."""
+        """Frames measured together and one by one are the same, though their flux differs."""
         faint, bright = frames(2, 60.0)[0], frames(2, 900.0)[0]
         both = np.concatenate([faint, bright])
         settings = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=1.9)
@@ -84,7 +84,7 @@ class TestMeasuredFlux:
 
     @pytest.mark.parametrize("estimator", ["trained", "map"])
     def test_is_close_to_the_flux_given(self, estimator: str) -> None:
-        """Of 12 spots of 400 e- the mean light is known to 3 %, which moves no slope by more than 0.03 px."""
+        """Of 12 spots of 400 e- the mean flux is known to 3 %, which moves no slope by more than 0.03 px."""
         frame, _ = frames(1, 400.0)
         parts: dict[str, Any] = {"psf": fs.PSF.analytic(), "score": score()}
         measured = fs.SlopePipeline(LAYOUT, fs.Settings(estimator=estimator), NOISE, **parts)(frame[0])

@@ -34,7 +34,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
 
 @contextmanager
 def running(files: tuple[Path, Control], *, control: bool = False) -> Iterator[Sky]:
-    """A telescope with much light and hardly any air, and an engine, both going on by themselves."""
+    """A telescope with high flux and hardly any air, and an engine, both going on by themselves."""
     sky = Sky(f"fs_test_{uuid4().hex[:12]}", STILL)
     stop = threading.Event()
     telescope = threading.Thread(target=sky.telescope.run, args=(None, stop))

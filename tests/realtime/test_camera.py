@@ -251,7 +251,7 @@ def test_command(config: Path, name: str) -> None:
 def test_the_camera_is_the_one_that_the_configuration_describes(
     config: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else the engine, which has the same file, would take a level of 0 for -100 ADU: no light."""
+    """Else the engine, which has the same file, would take a level of 0 for -100 ADU: no flux."""
     seen: list[Detector] = []
 
     def enough(*_: object, detector: Detector, **options: object) -> None:

@@ -162,7 +162,7 @@ def test_the_guard_opens_a_loop_that_has_lost_its_star(
         sky.frame()
         if not sky.loop.closed:
             break
-    assert "too little light" in sky.loop.opened_because
+    assert "too low flux" in sky.loop.opened_because
     sky.frames(2)
     sent = sky.records["commands"]
     assert sent[-1].any()  # the mirror keeps what it has

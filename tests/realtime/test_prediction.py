@@ -1,4 +1,4 @@
-"""What estimators are told: a prior, from the engine's controller or from outside, and the mean light."""
+"""What estimators are told: a prior, from the engine's controller or from outside, and the mean flux."""
 
 from __future__ import annotations
 

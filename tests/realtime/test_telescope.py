@@ -244,7 +244,7 @@ def test_orders_take_effect_with_an_exposure(watched: Watched) -> None:
     assert (order.in_effect.is_set(), order.frame, watched.truth["photons"]) == (True, 2, 200.0)
     brighter = watched.frame()
     assert watched.truth["photons"] == 20000.0
-    # 36 sub-apertures: 100 times the light within 20 %; Poisson noise is below 2 %, the rest is speckle.
+    # 36 sub-apertures: 100 times the flux within 20 %; Poisson noise is below 2 %, the rest is speckle.
     assert brighter.sum() == pytest.approx(100 * before.sum(), rel=0.2)
     watched.telescope.order({"r0_m": 0.05})
     watched.telescope.order({"wind_factor": 2.0})  # both count

@@ -167,10 +167,10 @@ def test_mean_flux_of_the_recording(files: tuple[Path, Path, Path]) -> None:
     flux = faintspot.MeanFlux(pipeline(simulated()).flux)
     expected_slopes = pipeline.with_flux(flux)(simulated())
     np.testing.assert_array_equal(read_slopes(output).variables["x"], expected_slopes.x)
-    assert np.ptp(expected_slopes.flux / flux.flux_e) > 0.01  # the light of frames differs
+    assert np.ptp(expected_slopes.flux / flux.flux_e) > 0.01  # the flux of frames differs
 
 
 def test_mean_flux_of_an_estimator_that_does_not_use_it(files: tuple[Path, Path, Path]) -> None:
     frames, configuration, output = files
-    with pytest.raises(InputError, match="'brightest' does not use the light"):
+    with pytest.raises(InputError, match="'brightest' does not use the flux"):
         measure_recorded([frames], configuration, output, changes={"estimator": "brightest"}, mean_flux=True)

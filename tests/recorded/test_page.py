@@ -137,7 +137,7 @@ def test_warnings_say_what_to_do_next() -> None:
         [arm], layout=None, stages=None, title="t", facts={}, configurations={"Configuration": ""}
     )
     text = Page(html).text
-    assert "20.0 % of the measurements had no light. Next: check that the windows lie on the spots" in text
+    assert "20.0 % of the measurements had no flux. Next: check that the windows lie on the spots" in text
     assert "20.0 % of the measurements were saturated" in text
     assert "raise max_iterations" in text
     assert "1 of 5 sub-apertures were never valid (no. 0)" in text

@@ -265,7 +265,7 @@ def test_bench_edge_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "geometry", "pitch_px", "angle_deg", "lit"),
+    ("name", "geometry", "pitch_px", "angle_deg", "illuminated"),
     [
         ("mmirs_wfs_0150", "square", 22.08, -0.5, 157),
         ("auto_wfs_0037_ave", "square", 30.41, 0.0, 148),

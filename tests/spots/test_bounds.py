@@ -77,7 +77,7 @@ def test_derivatives_equal_the_differences_at_pixel_edges() -> None:
     cross = np.sum(derivative * derivative_y / image)
     expected = math.sqrt(1 / (information - cross**2 / np.sum(derivative_y**2 / image)))
     assert along_x.sum() == pytest.approx(1)
-    # The 1001 px stand for an infinite column: 1e-3 of the light is beyond, the same in every column.
+    # The 1001 px stand for an infinite column: 1e-3 of the flux is beyond, the same in every column.
     np.testing.assert_allclose(bound[0], expected, rtol=2e-3)
 
 
@@ -100,7 +100,7 @@ def test_information_of_a_pixel_by_brute_force(read_noise: float, mean: float) -
 
 
 def test_information_of_a_pixel_in_its_limits() -> None:
-    # Without light it is exp(1 / read_noise^2) - 1, that of a shift by one electron.
+    # Without flux it is exp(1 / read_noise^2) - 1, that of a shift by one electron.
     for read_noise in (0.6, 1.0, 3.0):
         found = poisson_gaussian_information(np.array([0.0]), read_noise)[0]
         assert found == pytest.approx(math.expm1(1 / read_noise**2), rel=1e-3)

@@ -84,7 +84,7 @@ def test_without_known_flux_the_frame_says_it() -> None:
 
 def test_mean_flux_needs_the_flux() -> None:
     settings = fs.Settings(Window(normalisation="mean"), spot_fwhm_px=2.0)
-    with pytest.raises(fs.InputError, match=r"settings.flux_e: expected the light"):
+    with pytest.raises(fs.InputError, match=r"settings.flux_e: expected the flux"):
         fs.SlopePipeline(fs.Layout.grid((2, 2), pixels=8), settings)
 
 
@@ -150,8 +150,8 @@ def test_files(tmp_path: Path, learnt: fs.FixedWeights) -> None:
         ({"y": np.zeros((3, 3))}, "weights.y: expected shape"),
         ({"x": np.full((4, 4), np.nan)}, "weights.x: expected finite"),
         ({"x": np.full((4, 4), 1e30)}, "weights.x"),
-        ({"mean_spot": np.zeros((4, 4))}, "weights.mean_spot: expected light"),
-        ({"flux": np.ones((5, 4))}, "weights.light: expected shape"),
+        ({"mean_spot": np.zeros((4, 4))}, "weights.mean_spot: expected flux"),
+        ({"flux": np.ones((5, 4))}, "weights.flux: expected shape"),
         ({"index": [[0]]}, "weights.index: expected shape"),
         ({"index": [1]}, "weights.index = 1"),
     ],

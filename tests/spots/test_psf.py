@@ -35,7 +35,7 @@ def test_images_are_those_of_the_simulation(options: dict[str, Any]) -> None:
         psf.images(positions, (16, 14), 1000.0),
         1000 * spots(positions, shape=(16, 14), **options),
     )
-    # The PSF has all its light within 20 px; sinc^2 wings leave 2 to 4 % of theirs outside.
+    # The PSF has all its flux within 20 px; sinc^2 wings leave 2 to 4 % of theirs outside.
     scale = images.sum() / expected.sum()
     assert scale == pytest.approx(1.0, abs=0.05)
     # Cubic splines on eight nodes per pixel.
@@ -127,7 +127,7 @@ def test_files_that_are_no_psf(tmp_path: Path) -> None:
         (-np.ones((7, 7)), 2, None, "positive"),
         (np.full((7, 7), np.nan), 2, None, "finite"),
         (np.full((7, 7), 1e300), 2, None, "psf.samples"),
-        (np.eye(7) - np.eye(7)[::-1] + 1e-12, 2, None, "light in a pixel"),
+        (np.eye(7) - np.eye(7)[::-1] + 1e-12, 2, None, "flux in a pixel"),
         (np.ones((7, 7)), 0, None, "oversampling"),
         (np.ones((2, 7, 7)), 2, None, "psf.index"),
         (np.ones((2, 7, 7)), 2, [0, 2], "psf.index"),

@@ -109,7 +109,7 @@ def test_long_exposure_is_kolmogorovs(d_over_r0: float) -> None:
     mean: NDArray[np.float64] = images.mean(axis=0)
     expected = long_exposure(pixels, 2 * size, d_over_r0)
     # Speckle: a pixel scatters by about its mean, 2 % for 2500 images at the peak, 5 standard errors; the
-    # squares of constant phase (d / 24) send 1.5 % of the light too far out.
+    # squares of constant phase (d / 24) send 1.5 % of the flux too far out.
     np.testing.assert_allclose(mean, expected, rtol=0, atol=0.1 * expected.max())
     found, theory = half_width(mean.mean(axis=0)), half_width(expected.mean(axis=0))
     assert abs(found / theory - 1) < 0.05
@@ -232,7 +232,7 @@ def test_subapertures_see_turbulence_and_keep_their_positions() -> None:
     np.testing.assert_array_equal(truth, same)
     assert speckled.dtype == np.float32
     assert speckled.max(axis=(1, 2)).mean() < 0.8 * still.max(axis=(1, 2)).mean()
-    # Turbulence of 2 r0 spreads 3 to 5 % of the light beyond 16 pixels.
+    # Turbulence of 2 r0 spreads 3 to 5 % of the flux beyond 16 pixels.
     flux = speckled.sum(axis=(1, 2)) / still.sum(axis=(1, 2))
     assert 0.9 < flux.mean() < 1.0
 

@@ -61,7 +61,7 @@ def test_separable_spots_get_a_separable_psf_and_others_do_not() -> None:
         assert (learnt.psf.separable_terms[0].shape[1] == 1) == separable
         fresh, positions = simulated(rng, psf, 2000, 3000.0, 1.0)
         best = slope_error(psf, fresh, positions, 1.0)
-        # The light that the learnt PSF leaves out beyond 8 px weighs more the brighter the spot.
+        # The flux that the learnt PSF leaves out beyond 8 px weighs more the brighter the spot.
         assert slope_error(learnt.psf, fresh, positions, 1.0) < 1.05 * best
 
 
@@ -71,7 +71,7 @@ def test_a_background_does_not_enter_the_wings() -> None:
     images, _ = simulated(rng, psf, 1500, 300.0, 1.0)
     learnt = learn_psf_from_images(images + 5.0, Calibration(read_noise_e=1.0), rng=rng)
     assert learnt.background_e[0] == pytest.approx(5.0, abs=0.1)
-    # The wings of a Gaussian are nothing at 5 px; 5 electrons per pixel would be 1.7 % of the light there.
+    # The wings of a Gaussian are nothing at 5 px; 5 electrons per pixel would be 1.7 % of the flux there.
     assert np.abs(learnt.psf.samples[0, :12]).max() < 1e-3
     assert learnt.flux_e.mean() == pytest.approx(300.0, rel=0.03)
 

@@ -89,7 +89,7 @@ def test_parts_do_not_covary_but_for_what_is_known(read_noise: float, em_gain: f
     np.testing.assert_array_less(
         abs(found - sample.covariance[:, 0].mean(axis=0).ravel()), 4.5 * error + 1e-12
     )
-    # The light of both parts is the images', and the target's noise is known.
+    # The flux of both parts is the images', and the target's noise is known.
     np.testing.assert_allclose(
         features.mean(axis=0), images.mean(axis=0).ravel() / 12, atol=5 * error.max() + 0.005
     )
@@ -138,7 +138,7 @@ def test_classes_and_kinds() -> None:
         ({"frames": np.ones((320, 16))}, "frames: expected shape"),
         ({"frames": np.ones((5, 16, 16))}, "expected"),
         ({"frames": np.full((5, 320, 16), np.nan)}, "frames: expected"),
-        ({"frames": np.zeros((20, 320, 16))}, "frames: expected light"),
+        ({"frames": np.zeros((20, 320, 16))}, "frames: expected flux"),
         ({"frames": np.ones((4, 320, 16))}, "expected at least 100 images of each kind"),
         ({"calibration": Calibration()}, r"calibration\.read_noise_e: expected a number"),
         ({"reference": np.zeros((3, 2))}, "reference: expected shape"),

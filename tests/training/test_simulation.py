@@ -77,7 +77,7 @@ def test_starts_far_away_from_the_peak() -> None:
     assert score.start == "peak"
     near = trained(detector=detector, flux_e=200.0)
     assert near.start == "reference"
-    # A wide prior costs little when there is light enough to find the spot; measured: 4 %.
+    # A wide prior costs little when there is flux enough to find the spot; measured: 4 %.
     assert rms(score.apply(images, 200.0), truth) < 1.12 * near.standard_error_px.mean()
 
 

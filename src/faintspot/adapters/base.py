@@ -137,7 +137,7 @@ def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
     )
 
 
-class Options(TypedDict, total=False):
+class AdapterOptions(TypedDict, total=False):
     """What every adapter hands on to `ToolSlopes`."""
 
     psf: PSF | None

@@ -7,7 +7,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.adapters.base import Options, ToolSlopes, largest_window, layout_around, on_detector
+from faintspot.adapters.base import AdapterOptions, ToolSlopes, largest_window, layout_around, on_detector
 from faintspot.adapters.checks import check_version, predicted
 from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError, MissingExtraError
@@ -82,7 +82,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         detector_grid: Any = None,
         pixels: int | None = None,
         predict: Any = None,
-        **options: Unpack[Options],
+        **options: Unpack[AdapterOptions],
     ) -> None:
         check_version("HCIPy", "hcipy", *TESTED)
         self.mla_grid = mla_grid

@@ -9,7 +9,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import Options, ToolSlopes
+from faintspot.adapters.base import AdapterOptions, ToolSlopes
 from faintspot.adapters.checks import check_version
 from faintspot.adapters.spots import Spots
 from faintspot.base.errors import InputError
@@ -26,7 +26,7 @@ def attach(
     calibration: Calibration | None = None,
     *,
     predict: Any = None,
-    **options: Unpack[Options],
+    **options: Unpack[AdapterOptions],
 ) -> Attached:
     """Let an OOPAO `ShackHartmann` measure its slopes with faintspot, and calibrate it anew.
 
@@ -68,7 +68,7 @@ class Attached:
         settings: Settings,
         calibration: Calibration | None,
         predict: Any,
-        options: Options,
+        options: AdapterOptions,
     ) -> None:
         if getattr(wfs, "tag", None) != "shackHartmann":
             raise InputError(f"wfs: expected a ShackHartmann of OOPAO's, got {type(wfs).__name__}")
@@ -145,7 +145,7 @@ class _Source:
         settings: Settings,
         calibration: Calibration | None,
         predict: Any,
-        options: Options,
+        options: AdapterOptions,
     ) -> None:
         self.wfs, self.data = wfs, data
         self._n, side = int(data.nValidSubaperture), int(wfs.n_pix_subap)

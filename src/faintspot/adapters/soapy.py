@@ -8,7 +8,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import Options, ToolSlopes
+from faintspot.adapters.base import AdapterOptions, ToolSlopes
 from faintspot.adapters.checks import check_version
 from faintspot.adapters.spots import Spots
 from faintspot.base.errors import InputError
@@ -24,7 +24,7 @@ def attach(
     calibration: Calibration | None = None,
     *,
     predict: Any = None,
-    **options: Unpack[Options],
+    **options: Unpack[AdapterOptions],
 ) -> Attached:
     """Let a soapy `ShackHartmann` measure its slopes with faintspot, and make its static slopes anew.
 
@@ -65,7 +65,7 @@ class Attached:
         settings: Settings,
         calibration: Calibration | None,
         predict: Any,
-        options: Options,
+        options: AdapterOptions,
     ) -> None:
         centroiders = getattr(sys.modules.get(type(wfs).__module__), "centroiders", None)
         if centroiders is None or not hasattr(wfs, "centSubapArrays"):

@@ -7,7 +7,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import Options, ToolSlopes
+from faintspot.adapters.base import AdapterOptions, ToolSlopes
 from faintspot.adapters.checks import predicted
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
@@ -44,7 +44,7 @@ class Spots:
         predict: Any,
         *,
         rows_first: bool = False,
-        **options: Unpack[Options],
+        **options: Unpack[AdapterOptions],
     ) -> None:
         self._tool, self._shape, self._predict = tool, (n, side, side), predict
         self._order = slice(None, None, -1 if rows_first else 1)

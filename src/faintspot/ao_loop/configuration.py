@@ -40,7 +40,7 @@ class Telescope:
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorParameters:
     """The Shack-Hartmann sensor."""
 
     subapertures: int = number(7, 1, 200, whole=True)
@@ -111,7 +111,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Control:
+class ControlParameters:
     """The loop."""
 
     frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
@@ -140,7 +140,7 @@ class Science:
 
 
 @dataclass(frozen=True)
-class Run:
+class RunLength:
     """How long and how often."""
 
     frames: int = number(1500, 1, 10_000_000, whole=True)
@@ -173,13 +173,13 @@ class LoopConfiguration:
 
     name: str = "canary"
     telescope: Telescope = field(default_factory=Telescope)
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: SensorParameters = field(default_factory=SensorParameters)
     mirror: Mirror = field(default_factory=Mirror)
     atmosphere: Atmosphere = field(default_factory=Atmosphere)
     camera: Camera = field(default_factory=lambda: Camera(photons_per_subaperture=100.0))
-    control: Control = field(default_factory=Control)
+    control: ControlParameters = field(default_factory=ControlParameters)
     science: Science = field(default_factory=Science)
-    run: Run = field(default_factory=Run)
+    run: RunLength = field(default_factory=RunLength)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -327,13 +327,13 @@ class LoopConfiguration:
 
 SECTIONS: dict[str, type[Any]] = {
     "telescope": Telescope,
-    "sensor": Sensor,
+    "sensor": SensorParameters,
     "mirror": Mirror,
     "atmosphere": Atmosphere,
     "camera": Camera,
-    "control": Control,
+    "control": ControlParameters,
     "science": Science,
-    "run": Run,
+    "run": RunLength,
 }
 
 

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.arms import PRIOR, Arm
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, Run
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.integrator import Integrator
 from faintspot.control.learning import INTEGRATOR, KALMAN, Learnt, Plant, learn
-from faintspot.control.telemetry import Telemetry, make_telemetry
+from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def learnt_control(
         raise InputError(f"arm.control = {arm.control!r}: expected {INTEGRATOR!r} in open loop")
     on = configuration if learns_on is None else learns_on
     learnt = _learnt(
-        replace(on, name="-", run=Run()), _Known.of(arm), arm.control, arm.noise_scale, seed, simulate
+        replace(on, name="-", run=RunLength()), _Known.of(arm), arm.control, arm.noise_scale, seed, simulate
     )
     if learnt.expected_std_px is not None and _has_prior(arm):
         std = np.sqrt(np.square(learnt.expected_std_px).reshape(2, -1).mean(axis=0))
@@ -170,7 +170,9 @@ def _learnt(
 
 
 @lru_cache(maxsize=8)
-def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int, simulate: Simulate) -> Telemetry:
+def _telemetry(
+    configuration: LoopConfiguration, known: _Known, seed: int, simulate: Simulate
+) -> OpenLoopTelemetry:
     """Run the loop with an integrator on air that is never scored."""
     frames = configuration.control.telemetry_frames
     run = configuration.replace("run", frames=frames, settle_frames=0)
@@ -178,7 +180,7 @@ def _telemetry(configuration: LoopConfiguration, known: _Known, seed: int, simul
     return telemetry_of(record, known.arm)
 
 
-def telemetry_of(record: LoopRecord, arm: Arm) -> Telemetry:
+def telemetry_of(record: LoopRecord, arm: Arm) -> OpenLoopTelemetry:
     """Return what control learns from a run of one arm with the integrator."""
     divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import LoopConfiguration
-from faintspot.ao_loop.telescope import Pupil, pupil_grid, require_hcipy
+from faintspot.ao_loop.telescope import PupilAmplitude, pupil_grid, require_hcipy
 
 _LEAST_POWER = 0.1  # of an influence function, that must be in the pupil for the actuator to be used
 _CUTOFF = 2.5  # actuators, at which an influence function ends: below 1e-5 of its height
@@ -59,7 +59,7 @@ class BestFit:
     """Square root of the pupil's amplitude, (points^2,)."""
 
     @classmethod
-    def of(cls, mirror: DeformableMirror, pupil: Pupil, *, piston: bool = True) -> BestFit:
+    def of(cls, mirror: DeformableMirror, pupil: PupilAmplitude, *, piston: bool = True) -> BestFit:
         """Make the fit of a mirror, and of piston; it needs the full matrix, (points^2, commands)."""
         weight = np.sqrt(pupil.amplitude.ravel())
         flat = np.ones((len(weight), int(piston)), np.float32)
@@ -83,7 +83,7 @@ class BestFit:
         return left.astype(np.float32)
 
 
-def make_mirror(configuration: LoopConfiguration, pupil: Pupil) -> DeformableMirror:
+def make_mirror(configuration: LoopConfiguration, pupil: PupilAmplitude) -> DeformableMirror:
     """Return the mirror of a configuration: Gaussian influence functions of HCIPy, one for each actuator.
 
     Actuators with less than a tenth of their influence function's power in the pupil are left out.

@@ -17,7 +17,7 @@ PSF_SAMPLING = 4  # pixels for lambda / width
 
 
 @dataclass(frozen=True, eq=False)
-class Pupil:
+class PupilAmplitude:
     """Amplitude on (n, n) points that tile the square around the pupil."""
 
     amplitude: NDArray[np.float32]
@@ -64,7 +64,7 @@ class ScienceCamera:
     scale: float
 
     @classmethod
-    def of(cls, pupil: Pupil) -> ScienceCamera:
+    def of(cls, pupil: PupilAmplitude) -> ScienceCamera:
         """Make the camera of a pupil: four pixels for lambda / width, out to 8, the axis on a pixel."""
         half = _PSF_HALF_WIDTH * PSF_SAMPLING
         angle = np.arange(-half, half + 1) / PSF_SAMPLING  # lambda / width
@@ -95,7 +95,7 @@ def require_hcipy(purpose: str) -> ModuleType:
     return module
 
 
-def make_pupil(configuration: LoopConfiguration) -> Pupil:
+def make_pupil(configuration: LoopConfiguration) -> PupilAmplitude:
     """Return the pupil of a configuration, sampled for its sensor."""
     hcipy = require_hcipy("the closed loop")
     telescope, sensor = configuration.telescope, configuration.sensor
@@ -103,7 +103,7 @@ def make_pupil(configuration: LoopConfiguration) -> Pupil:
     grid = pupil_grid(configuration)
     amplitude = hcipy.evaluate_supersampled(aperture, grid, _SUPERSAMPLING).shaped
     assert len(amplitude) == sensor.subapertures * sensor.samples
-    return Pupil(np.ascontiguousarray(amplitude, np.float32), configuration.width_m)
+    return PupilAmplitude(np.ascontiguousarray(amplitude, np.float32), configuration.width_m)
 
 
 def pupil_grid(configuration: LoopConfiguration) -> object:

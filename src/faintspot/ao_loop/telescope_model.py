@@ -11,9 +11,16 @@ from numpy.typing import NDArray
 from faintspot.ao_loop.atmosphere import MovingLayers, make_atmosphere
 from faintspot.ao_loop.calibration import interaction_matrix
 from faintspot.ao_loop.camera import Exposing, NoiselessDetector, make_detector
-from faintspot.ao_loop.configuration import CLOSED, Atmosphere, Camera, Control, LoopConfiguration, Run
+from faintspot.ao_loop.configuration import (
+    CLOSED,
+    Atmosphere,
+    Camera,
+    ControlParameters,
+    LoopConfiguration,
+    RunLength,
+)
 from faintspot.ao_loop.mirror import BestFit, DeformableMirror, make_mirror
-from faintspot.ao_loop.telescope import Pupil, ScienceCamera, make_pupil
+from faintspot.ao_loop.telescope import PupilAmplitude, ScienceCamera, make_pupil
 from faintspot.ao_loop.wavefront_sensor import ShackHartmann, make_sensor
 from faintspot.control.reconstructor import Reconstructor, check_controllable, make_reconstructor
 
@@ -29,7 +36,7 @@ _OF_AIR = (
 class LoopOptics:
     """Everything that is the same in all runs of a configuration."""
 
-    pupil: Pupil
+    pupil: PupilAmplitude
     sensor: ShackHartmann
     mirror: DeformableMirror
     interaction: NDArray[np.float64]
@@ -127,18 +134,20 @@ def prepare(configuration: LoopConfiguration) -> LoopOptics:
     MissingExtraError
         When HCIPy is not installed.
     """
-    control = Control(largest_condition=configuration.control.largest_condition)
+    control = ControlParameters(largest_condition=configuration.control.largest_condition)
     camera = Camera(photons_per_subaperture=1.0)
     return _prepared(
-        replace(configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=control, run=Run())
+        replace(
+            configuration, name="-", atmosphere=Atmosphere(), camera=camera, control=control, run=RunLength()
+        )
     )
 
 
 def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
-    control = Control(**{name: getattr(configuration.control, name) for name in _OF_AIR})
+    control = ControlParameters(**{name: getattr(configuration.control, name) for name in _OF_AIR})
     camera = Camera(photons_per_subaperture=1.0)
-    return replace(configuration, name="-", camera=camera, control=control, run=Run())
+    return replace(configuration, name="-", camera=camera, control=control, run=RunLength())
 
 
 @lru_cache(maxsize=2)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import LoopConfiguration, blur_px
-from faintspot.ao_loop.telescope import Pupil
+from faintspot.ao_loop.telescope import PupilAmplitude
 from faintspot.base.errors import InputError
 from faintspot.sensor.layout import Layout
 
@@ -106,7 +106,7 @@ class ShackHartmann:
         return np.asarray(rise * (line + line[:, None]), np.float32)
 
 
-def make_sensor(configuration: LoopConfiguration, pupil: Pupil) -> ShackHartmann:
+def make_sensor(configuration: LoopConfiguration, pupil: PupilAmplitude) -> ShackHartmann:
     """Return the sensor of a configuration.
 
     Raises

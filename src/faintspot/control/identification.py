@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from faintspot.control.models import SlopeModel, joint_moments
 from faintspot.control.smoothing import smoothed_moments
-from faintspot.control.telemetry import Telemetry, lagged_covariance
+from faintspot.control.telemetry import OpenLoopTelemetry, lagged_covariance
 
 Floats = NDArray[np.float64]
-Score = Callable[[SlopeModel, Telemetry], float]
+Score = Callable[[SlopeModel, OpenLoopTelemetry], float]
 
 MEASURED_SHARES = (0.1, 0.25, 0.5, 0.75)
 _NOISE_FACTORS = (0.1, 30.0)
@@ -39,7 +39,7 @@ class Strengths:
     """Actual variance of the noise as a multiple of what the standard errors say."""
 
     @classmethod
-    def of(cls, telemetry: Telemetry) -> Self:
+    def of(cls, telemetry: OpenLoopTelemetry) -> Self:
         """Measure them: noise is what the variance has beyond its extrapolation from later lags."""
         later = np.array([lagged_covariance(telemetry, lag) for lag in (1, 2)])
         finite = np.where(np.isfinite(telemetry.variance_px2), telemetry.variance_px2, 0.0)
@@ -69,7 +69,7 @@ class Identified:
 
 
 def identify(
-    telemetry: Telemetry,
+    telemetry: OpenLoopTelemetry,
     theories_px2: Mapping[str, Floats],
     score: Score,
     shares: Sequence[float] = MEASURED_SHARES,
@@ -129,7 +129,7 @@ def mixed(measured_px2: Floats, theory_px2: Floats, share: float) -> Floats:
     return share * measured_px2 + (1 - share) * theory_px2
 
 
-def _moments(telemetry: Telemetry, strengths: Strengths, theory_px2: Floats) -> tuple[Floats, Floats]:
+def _moments(telemetry: OpenLoopTelemetry, strengths: Strengths, theory_px2: Floats) -> tuple[Floats, Floats]:
     """Return the moments (3 m, 3 m) of telemetry, smoothed with a theory, and of the theory."""
     theory = strengths.relative_to(theory_px2) * theory_px2
     model = SlopeModel.of_covariances(theory)

@@ -26,7 +26,7 @@ from faintspot.control.learnt import (
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
-from faintspot.control.telemetry import Telemetry, usual_variance
+from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance
 
 __all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "Learnt", "Plant", "learn"]
 
@@ -40,7 +40,7 @@ _LARGEST_PART = 0.85  # of the gain at which a mode would be unstable where slop
 def learn(
     kind: str,
     plant: Plant,
-    telemetry: Telemetry,
+    telemetry: OpenLoopTelemetry,
     theories_px2: Mapping[str, Floats],
     noise_scale: float = 1.0,
 ) -> Learnt:
@@ -69,7 +69,7 @@ def learn(
     def predictive(model: SlopeModel, variance_px2: Floats, line: CommandDelayLine) -> Controller:
         return Predictive(line, plant.interaction, SlopePredictor(model, variance_px2), clean)
 
-    def score(model: SlopeModel, frames: Telemetry) -> float:
+    def score(model: SlopeModel, frames: OpenLoopTelemetry) -> float:
         return plant.left(partial(predictive, model, usual_variance(frames)), frames)
 
     found = identify(telemetry, theories_px2, score)
@@ -85,7 +85,7 @@ def learn(
     return Learnt(plant, learnt.with_noise(noise_scale))
 
 
-def _modal(plant: Plant, telemetry: Telemetry, plain_gain: float, plain_left: float) -> Model:
+def _modal(plant: Plant, telemetry: OpenLoopTelemetry, plain_gain: float, plain_left: float) -> Model:
     """Return what an integrator with a gain for each mode needs."""
     trust = max(float(telemetry.trust.mean()), 1e-6)  # by which slopes are smaller than they should be
     weighted = telemetry.trust * telemetry.open_loop_px / trust
@@ -99,7 +99,7 @@ def _modal(plant: Plant, telemetry: Telemetry, plain_gain: float, plain_left: fl
 
 def _pseudo_open_loop(
     plant: Plant,
-    telemetry: Telemetry,
+    telemetry: OpenLoopTelemetry,
     theories_px2: Mapping[str, Floats],
     noise_scale: float,
     plain_gain: float,
@@ -127,7 +127,7 @@ def _pseudo_open_loop(
 
 
 def _best_gain(
-    made: Callable[[float], Make], plant: Plant, telemetry: Telemetry, gains: Sequence[float] = _GAINS
+    made: Callable[[float], Make], plant: Plant, telemetry: OpenLoopTelemetry, gains: Sequence[float] = _GAINS
 ) -> tuple[float, float]:
     """Return the gain that leaves least of telemetry, and how much."""
     left = [plant.left(made(gain), telemetry) for gain in gains]

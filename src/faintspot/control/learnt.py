@@ -23,7 +23,7 @@ from faintspot.control.kalman import SlopePredictor, steady_covariance
 from faintspot.control.models import SlopeModel
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.reconstructor import Reconstructor
-from faintspot.control.telemetry import Telemetry, replayed
+from faintspot.control.telemetry import OpenLoopTelemetry, replayed
 
 Floats = NDArray[np.float64]
 Make = Callable[[CommandDelayLine], Controller]
@@ -76,7 +76,7 @@ class Plant:
         """Return an integrator of this loop."""
         return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
 
-    def left(self, make: Make, telemetry: Telemetry) -> float:
+    def left(self, make: Make, telemetry: OpenLoopTelemetry) -> float:
         """Return how much a controller would have left, see `replayed`."""
         matrix = self.reconstructor.matrix
         return replayed(make, telemetry, self.interaction, matrix, self.delay_frames, SETTLE_FRAMES)

@@ -14,7 +14,7 @@ from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 from faintspot.control.configuration import NONE, STREAM, Control
 from faintspot.control.learnt import INTEGRATOR, KALMAN, MODAL
-from faintspot.control.telemetry import Telemetry, make_telemetry
+from faintspot.control.telemetry import OpenLoopTelemetry, make_telemetry
 from faintspot.sensor.layout import Layout
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
@@ -32,7 +32,7 @@ _CLOSED = 2
 
 def telemetry_of_recording(
     recording: Recording, control: Control, prior_std_px: Floats | None = None
-) -> tuple[Telemetry, float]:
+) -> tuple[OpenLoopTelemetry, float]:
     """Return open-loop slopes of the longest stretch of a recording without a gap, and its frame rate.
 
     The loop must have been closed with this control.

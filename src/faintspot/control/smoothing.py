@@ -8,12 +8,12 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from faintspot.control.kalman import SlopePredictor
 from faintspot.control.models import SlopeModel
-from faintspot.control.telemetry import Telemetry, usual_variance
+from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance
 
 Floats = NDArray[np.float64]
 
 
-def smoothed_moments(model: SlopeModel, telemetry: Telemetry) -> Floats:
+def smoothed_moments(model: SlopeModel, telemetry: OpenLoopTelemetry) -> Floats:
     """Return expected second moments (3 m, 3 m) of z[k + 1], z[k], z[k - 1], given all frames and a model.
 
     The model is of one layer.
@@ -39,7 +39,9 @@ def smoothed_moments(model: SlopeModel, telemetry: Telemetry) -> Floats:
     return np.asarray(0.5 * (moments + moments.T))
 
 
-def _filtered(model: SlopeModel, telemetry: Telemetry, variance: Floats) -> tuple[Floats, Floats, Floats]:
+def _filtered(
+    model: SlopeModel, telemetry: OpenLoopTelemetry, variance: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Return the state after each frame, the one predicted for it, (frames, 2 m), and its error."""
     predictor = SlopePredictor(model, variance)
     shape = len(telemetry), 2 * model.slopes

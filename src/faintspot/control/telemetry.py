@@ -20,7 +20,7 @@ LEAST_VARIANCE_PX2 = 1e-8  # of slopes that are known without an error
 
 
 @dataclass(frozen=True, eq=False)
-class Telemetry:
+class OpenLoopTelemetry:
     """Open-loop slopes of consecutive frames, with their noise, and how the loop saw them."""
 
     open_loop_px: Floats
@@ -34,13 +34,13 @@ class Telemetry:
     def __len__(self) -> int:
         return len(self.open_loop_px)
 
-    def part(self, start: int, stop: int) -> Telemetry:
+    def part(self, start: int, stop: int) -> OpenLoopTelemetry:
         """Return some of the frames."""
-        return Telemetry(*(each[start:stop] for each in vars(self).values()))
+        return OpenLoopTelemetry(*(each[start:stop] for each in vars(self).values()))
 
-    def scaled(self, noise_factor: float) -> Telemetry:
+    def scaled(self, noise_factor: float) -> OpenLoopTelemetry:
         """Return the same with another size of the noise."""
-        return Telemetry(self.open_loop_px, self.variance_px2 * noise_factor, self.trust)
+        return OpenLoopTelemetry(self.open_loop_px, self.variance_px2 * noise_factor, self.trust)
 
 
 def make_telemetry(
@@ -49,7 +49,7 @@ def make_telemetry(
     held_px: Floats,
     expected_px: Floats,
     prior_std_px: Floats | None,
-) -> Telemetry:
+) -> OpenLoopTelemetry:
     """Return telemetry of residual slopes, (frames, m).
 
     Parameters
@@ -62,7 +62,7 @@ def make_telemetry(
         Prior of an estimator whose slopes and errors are those of the posterior; None: it has none.
     """
     slopes, variance, trust = without_prior(slopes_px, standard_error_px, expected_px, prior_std_px)
-    return Telemetry(slopes - held_px, variance, trust)
+    return OpenLoopTelemetry(slopes - held_px, variance, trust)
 
 
 def without_prior(
@@ -87,13 +87,13 @@ def without_prior(
     return alone, np.where(measured, prior / share, np.inf), trust
 
 
-def usual_variance(telemetry: Telemetry) -> Floats:
+def usual_variance(telemetry: OpenLoopTelemetry) -> Floats:
     """Return (m,): the variance of noise that gives as much information as the frames do on average."""
     information = np.where(np.isfinite(telemetry.variance_px2), 1 / telemetry.variance_px2, 0.0)
     return np.asarray(1 / np.maximum(information.mean(axis=0), 1e-6))
 
 
-def lagged_covariance(telemetry: Telemetry, lag: int) -> Floats:
+def lagged_covariance(telemetry: OpenLoopTelemetry, lag: int) -> Floats:
     """Return E[slopes `lag` frames later, slopes], (m, m) px^2; slopes count as far as they are trusted."""
     weighted, stop = telemetry.trust * telemetry.open_loop_px, len(telemetry) - lag
     together = telemetry.trust[lag:].T @ telemetry.trust[:stop]
@@ -102,7 +102,7 @@ def lagged_covariance(telemetry: Telemetry, lag: int) -> Floats:
 
 def replayed(
     make: Callable[[CommandDelayLine], Controller],
-    telemetry: Telemetry,
+    telemetry: OpenLoopTelemetry,
     interaction: Floats,
     reconstruct: Floats,
     delay_frames: int,

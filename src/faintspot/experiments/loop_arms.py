@@ -12,7 +12,7 @@ import numpy as np
 
 from faintspot.ao_loop.arms import PRIOR, Arm
 from faintspot.ao_loop.camera import make_detector
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, Run
+from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.config.options import AUTO, Option
@@ -264,7 +264,7 @@ def _psf(size: float, elongation: float, radius_px: float) -> PSF:
 
 def _without_runs(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration without what no score depends on, so that one serves runs of any length."""
-    return replace(configuration, run=Run(seed=configuration.run.seed))
+    return replace(configuration, run=RunLength(seed=configuration.run.seed))
 
 
 @functools.lru_cache(maxsize=4)

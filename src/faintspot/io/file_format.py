@@ -8,7 +8,7 @@ from typing import IO
 from faintspot.base.errors import InputError
 from faintspot.io.locations import StoredArray
 from faintspot.io.slopes_folder import FolderStorage, is_partial, partial_folder
-from faintspot.io.slopes_format import Run, StoredSlopes
+from faintspot.io.slopes_format import RecordingHeader, StoredSlopes
 from faintspot.io.slopes_writer import ExistingOutput, Storage
 
 
@@ -62,6 +62,6 @@ class FileFormat:
         """Tell whether an unfinished output lies beside `path`."""
         return is_partial(partial_folder(path))
 
-    def storage(self, path: Path, run: Run) -> Storage:
+    def storage(self, path: Path, run: RecordingHeader) -> Storage:
         """Return where an unfinished output is kept."""
         return FolderStorage(path, run, self.write)

@@ -22,7 +22,7 @@ from faintspot.io.slopes_format import (
     RESERVED_ATTRIBUTES,
     UNITS,
     VARIABLES,
-    Run,
+    RecordingHeader,
     SlopeWriter,
     StoredSlopes,
     json_values,
@@ -196,7 +196,7 @@ def _read(path: Path, read: Callable[[Path], _What]) -> _What:
 
 def _checked_run(
     n_frames: int, n_subapertures: int, attributes: Mapping[str, Any], coordinates: Mapping[str, Any]
-) -> Run:
+) -> RecordingHeader:
     """Check what describes the run and bring it into the form that is stored."""
     frames = int(number_between("n_frames", n_frames, 1, integer=True))
     subapertures = int(number_between("n_subapertures", n_subapertures, 1, integer=True))
@@ -212,16 +212,16 @@ def _checked_run(
         if array.shape != (subapertures,):
             raise InputError(f"coordinates: {name}: expected shape ({subapertures},), got {array.shape}")
         values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
-    return Run(frames, subapertures, json_values("attributes", attributes), values)
+    return RecordingHeader(frames, subapertures, json_values("attributes", attributes), values)
 
 
-def _is_finished(path: Path, form: FileFormat, run: Run, *, resume: bool) -> bool:
+def _is_finished(path: Path, form: FileFormat, run: RecordingHeader, *, resume: bool) -> bool:
     """Tell whether this very run has completed the output before; refuse when another has."""
     begun = _read(path, form.finished)
     return begun is not None and begun.may_be_continued(path, run, resume=resume, overwrite=False)
 
 
-def _remove_leftovers(path: Path, form: FileFormat, run: Run) -> None:
+def _remove_leftovers(path: Path, form: FileFormat, run: RecordingHeader) -> None:
     """Remove what this run has left when it ended between making the file and tidying up."""
     if form.leftovers(path):
         lock = OutputLock(path)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular, parse_json, read_bytes, replace_file, sync_file, sync_folder
 from faintspot.base.sizes import MOST_TEXT_BYTES
-from faintspot.io.slopes_format import VARIABLES, Run, StoredSlopes, with_absent
+from faintspot.io.slopes_format import VARIABLES, RecordingHeader, StoredSlopes, with_absent
 from faintspot.io.slopes_writer import ExistingOutput
 
 _RUN = "run.json"
@@ -41,7 +41,9 @@ class FolderStorage:
 
     chunk = 1
 
-    def __init__(self, path: Path, run: Run, export: Callable[[IO[bytes], StoredSlopes], None]) -> None:
+    def __init__(
+        self, path: Path, run: RecordingHeader, export: Callable[[IO[bytes], StoredSlopes], None]
+    ) -> None:
         self.place = partial_folder(path)
         self._path = path
         self._run = run

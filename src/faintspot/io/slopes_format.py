@@ -152,7 +152,7 @@ def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> di
 
 
 @dataclass(frozen=True)
-class Run:
+class RecordingHeader:
     """What is to be written: sizes, attributes (JSON values, with a fingerprint) and coordinates."""
 
     n_frames: int
@@ -210,7 +210,9 @@ class SlopeWriter(Protocol):
     ) -> None: ...
 
 
-def checked_block(run: Run, finished: int, start: int, block: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+def checked_block(
+    run: RecordingHeader, finished: int, start: int, block: Mapping[str, Any]
+) -> dict[str, NDArray[Any]]:
     """Return the block's variables in the file's types, or say what is wrong with them."""
     if start != finished:
         raise InputError(f"slopes: expected the block that starts at frame {finished}, got frame {start}")

@@ -15,7 +15,13 @@ from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
 from faintspot.io.output_lock import OutputLock
-from faintspot.io.slopes_format import VARIABLES, Run, belongs_to_another_run, checked_block, exists_already
+from faintspot.io.slopes_format import (
+    VARIABLES,
+    RecordingHeader,
+    belongs_to_another_run,
+    checked_block,
+    exists_already,
+)
 
 # A mark waits until the data are on the disk, which takes longer than measuring small blocks.
 _MARK_SECONDS = 1.0
@@ -30,7 +36,7 @@ class ExistingOutput:
     sizes: tuple[int, int]
     complete: bool
 
-    def may_be_continued(self, place: Path, run: Run, *, resume: bool, overwrite: bool) -> bool:
+    def may_be_continued(self, place: Path, run: RecordingHeader, *, resume: bool, overwrite: bool) -> bool:
         """Say whether `run` goes on with it (True) or replaces it (False).
 
         Raises
@@ -108,7 +114,7 @@ class BlockWriter(Closing):
         Released by `close`.
     """
 
-    def __init__(self, path: Path, run: Run, storage: Storage, lock: OutputLock) -> None:
+    def __init__(self, path: Path, run: RecordingHeader, storage: Storage, lock: OutputLock) -> None:
         self._path = path
         self._run = run
         self._storage = storage

@@ -24,7 +24,7 @@ from faintspot.io.optional_packages import load_zarr
 from faintspot.io.slopes_format import (
     COORDINATE_UNITS,
     VARIABLES,
-    Run,
+    RecordingHeader,
     StoredSlopes,
     check_stated,
     unit_of,
@@ -62,7 +62,7 @@ class StoreStorage:
         What it will contain.
     """
 
-    def __init__(self, path: Path, run: Run) -> None:
+    def __init__(self, path: Path, run: RecordingHeader) -> None:
         self.place = path
         self.chunk = 1
         self._run = run
@@ -192,7 +192,7 @@ def _read(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
     return read_items(path, array, start, stop, whole=array.dtype.kind == "f")
 
 
-def _create_arrays(path: Path, run: Run) -> None:
+def _create_arrays(path: Path, run: RecordingHeader) -> None:
     attributes = {
         **run.attributes,
         "n_frames": run.n_frames,

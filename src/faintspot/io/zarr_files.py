@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.io.file_format import FileFormat
 from faintspot.io.locations import StoredArray, choose_name, one_line
 from faintspot.io.optional_packages import load_zarr
-from faintspot.io.slopes_format import Run, StoredSlopes
+from faintspot.io.slopes_format import RecordingHeader, StoredSlopes
 from faintspot.io.slopes_writer import ExistingOutput, Storage
 from faintspot.io.zarr_store import check_array, is_store, open_store
 
@@ -86,7 +86,7 @@ class Zarr(FileFormat):
         """Tell that nothing lies beside a store."""
         return False
 
-    def storage(self, path: Path, run: Run) -> Storage:
+    def storage(self, path: Path, run: RecordingHeader) -> Storage:
         """Return the store itself, which grows."""
         from faintspot.io.slopes_zarr import StoreStorage
 

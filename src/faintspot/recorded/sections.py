@@ -35,7 +35,7 @@ NO_LAYOUT = "Not drawn: the layout of the sub-apertures is not known."
 
 
 @dataclass(frozen=True)
-class Run:
+class ReportInputs:
     """Everything that the sections are made of; see `make_run`."""
 
     arms: Sequence[MeasuredSlopes]
@@ -60,11 +60,11 @@ def make_run(
     example_frame: int,
     why_no_stages: str,
     steps: Sequence[Step],
-) -> Run:
+) -> ReportInputs:
     """Compute the numbers of a run; arms with frames of their own are each taken by themselves."""
     same = all(np.array_equal(arm.number, arms[0].number) for arm in arms)
     valid = [valid_in_all(arms)] * len(arms) if same else [arm.valid for arm in arms]
-    return Run(
+    return ReportInputs(
         arms,
         layout,
         stages,
@@ -79,9 +79,9 @@ def make_run(
     )
 
 
-def all_sections(run: Run) -> list[Section]:
+def all_sections(run: ReportInputs) -> list[Section]:
     """Return the sections in the order of the page."""
-    makers: list[Callable[[Run], Section]] = [
+    makers: list[Callable[[ReportInputs], Section]] = [
         _key_numbers,
         _flux,
         _slopes,
@@ -95,12 +95,12 @@ def all_sections(run: Run) -> list[Section]:
     return [make(run) for make in makers]
 
 
-def _key_numbers(run: Run) -> Section:
+def _key_numbers(run: ReportInputs) -> Section:
     scale = None if run.layout is None else run.layout.pixel_scale_arcsec
     return key_numbers(run.comparison, run.summaries, run.jitters, run.valid[-1], run.truth, scale)
 
 
-def _frame(run: Run) -> Section:
+def _frame(run: ReportInputs) -> Section:
     title = "One frame, step by step"
     if run.layout is None:
         return Section("frame", title, missing=NO_LAYOUT)
@@ -154,7 +154,7 @@ def _scale_in_words(example: frame_pictures.Example) -> str:
     return "Raw is in ADU and has a scale of its own; the others share one scale in electrons."
 
 
-def _flux(run: Run) -> Section:
+def _flux(run: ReportInputs) -> Section:
     header = ["flag", *(arm.name for arm in run.arms), "meaning"]
     rows = []
     denoised = any(arm.is_denoised for arm in run.arms)
@@ -184,7 +184,7 @@ def _flux(run: Run) -> Section:
     return Section("flux", "Flux and validity", tables=[table], figures=[shown])
 
 
-def _slopes(run: Run) -> Section:
+def _slopes(run: ReportInputs) -> Section:
     if run.layout is None:
         return Section("slopes", "Mean slopes", missing=NO_LAYOUT)
     tilts = "; ".join(
@@ -220,7 +220,7 @@ def _slopes(run: Run) -> Section:
     return Section("slopes", "Mean slopes", figures=[shown])
 
 
-def _iterations(run: Run) -> Section:
+def _iterations(run: ReportInputs) -> Section:
     denoised = [
         (arm, summary) for arm, summary in zip(run.arms, run.summaries, strict=True) if arm.is_denoised
     ]
@@ -240,7 +240,7 @@ def _iterations(run: Run) -> Section:
     return Section("iterations", "Iterations", figures=[shown])
 
 
-def _jitter(run: Run) -> Section:
+def _jitter(run: ReportInputs) -> Section:
     title = "Slope jitter"
     if not run.jitters[0].measured.any():
         return Section("jitter", title, missing="No sub-aperture is valid in two frames, as jitter needs.")

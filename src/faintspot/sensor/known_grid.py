@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.sensor.layout import Layout
-from faintspot.sensor.region import Pupil, Rectangle
+from faintspot.sensor.region import PupilRegion, Rectangle
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW, window_size
 
 _LIT_FRACTION = 0.3
@@ -81,7 +81,7 @@ def find_illuminated(
     images = grid.images(frame)
     flux = np.nan_to_num(np.nanmean(images.reshape(len(grid), -1), axis=1)) * grid.pixels
     if pupil is not None:
-        illuminated, doubt = Pupil.given(pupil).holds(grid.centres.view(np.complex128)[:, 0]), ""
+        illuminated, doubt = PupilRegion.given(pupil).holds(grid.centres.view(np.complex128)[:, 0]), ""
     else:
         fraction = _LIT_FRACTION if illuminated_fraction is None else illuminated_fraction
         illuminated, doubt = _illuminated(

@@ -25,7 +25,7 @@ from faintspot.sensor.nodes import (
     no_drift,
     spot_width,
 )
-from faintspot.sensor.region import Pupil, Rectangle
+from faintspot.sensor.region import PupilRegion, Rectangle
 
 _FIT_PASSES = 4
 # A spot of this signal-to-noise ratio that is as bright as lit ones and this far (pitches) from all of them
@@ -150,7 +150,7 @@ def find_lenslets(
     frames, bad = _checked(frame, bad_pixels)
     part = Rectangle.given(roi, frames.shape[-2:])
     corner = complex(part.x0, part.y0)
-    circle = None if pupil is None else Pupil.given(pupil).moved(-corner)
+    circle = None if pupil is None else PupilRegion.given(pupil).moved(-corner)
     image = _clean_image(frames[part.slices], bad[part.slices])
     geometries = tuple(RATIOS) if geometry == "auto" else (geometry,)
     pitch_range_px = _pitch_range(pitch_px, image.shape)
@@ -214,7 +214,7 @@ def _nothing_found(image: NDArray[np.float64], pitch_range_px: tuple[float, floa
     )
 
 
-def _too_few(count: int, lattice: Lattice, pupil: Pupil | None) -> str:
+def _too_few(count: int, lattice: Lattice, pupil: PupilRegion | None) -> str:
     """Say in one line that a lattice has too few lit lenslets."""
     found = f"frame: a {lattice.geometry} lattice with a pitch of {lattice.pitch_px:.1f} px fits best, but "
     expected = "expected at least two rows of two"
@@ -316,7 +316,10 @@ class _Fit:
 
 
 def _fitted(
-    image: NDArray[np.float64], lattice: Lattice, illuminated_fraction: float | None, pupil: Pupil | None
+    image: NDArray[np.float64],
+    lattice: Lattice,
+    illuminated_fraction: float | None,
+    pupil: PupilRegion | None,
 ) -> _Fit:
     """Fit the lattice to the spots; where spots are left over, follow them from neighbour to neighbour."""
     image = image - np.median(image)

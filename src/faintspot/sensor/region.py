@@ -13,7 +13,7 @@ from faintspot.base.errors import InputError
 
 
 @dataclass(frozen=True)
-class Pupil:
+class PupilRegion:
     """A disk or an annulus on the detector: centre x + 1j * y, outer and inner radius, px."""
 
     centre: complex
@@ -21,7 +21,7 @@ class Pupil:
     inner: float
 
     @classmethod
-    def given(cls, value: Any) -> Pupil:
+    def given(cls, value: Any) -> PupilRegion:
         """Make one of (x, y, radius) or (x, y, radius, inner radius); InputError when it is neither."""
         numbers = numbers_between("pupil", value)
         if numbers.ndim != 1 or len(numbers) not in (3, 4):
@@ -31,7 +31,7 @@ class Pupil:
             raise InputError(f"pupil: expected radius > inner radius >= 0, got {radius:g} and {inner:g}")
         return cls(complex(x, y), radius, inner)
 
-    def moved(self, step: complex) -> Pupil:
+    def moved(self, step: complex) -> PupilRegion:
         """Return it moved by x + 1j * y."""
         return replace(self, centre=self.centre + step)
 

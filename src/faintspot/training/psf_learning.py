@@ -17,7 +17,7 @@ from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_fit import Form
 from faintspot.training.psf_rounds import (
-    Options,
+    LearningOptions,
     State,
     check_phases,
     gaussian_psf,
@@ -205,7 +205,7 @@ def learn_psf_from_images(
     return _learn(stack, numbers, start, _within(options, search_range_px), rng, progress)
 
 
-def _within(options: Options, search_range_px: float | None) -> Options:
+def _within(options: LearningOptions, search_range_px: float | None) -> LearningOptions:
     """Limit how far from the image's centre spots are sought."""
     if search_range_px is None:
         return options
@@ -239,7 +239,9 @@ def fit_spots(
     n, shape = len(stack.images), (stack.images.shape[1], stack.images.shape[2])
     index = np.zeros(n, np.int64)
     known = PSF(psf.samples[:1], psf.oversampling)
-    options = _within(Options(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2), search_range_px)
+    options = _within(
+        LearningOptions(max(shape) // 2 + 1, psf.oversampling, 0, min(shape) / 2), search_range_px
+    )
     border = np.ones(shape, dtype=bool)
     border[1:-1, 1:-1] = False
     state, wings = State(known, np.zeros(1)), np.zeros((n, *shape))
@@ -294,7 +296,7 @@ def _stack(windows: NDArray[Any], maps: NDArray[Any], calibration: Calibration, 
 
 def checked_options(
     window: tuple[int, int], oversampling: int, radius_px: int | None = None, rounds: int = 8
-) -> Options:
+) -> LearningOptions:
     """Return how to learn, checked."""
     side = min(window)
     if side < 6:
@@ -305,7 +307,7 @@ def checked_options(
         "radius_px", side // 2 if radius_px is None else radius_px, 3, max(window), integer=True
     )
     number = number_between("rounds", rounds, 4, 100, integer=True)
-    return Options(int(radius), int(oversampling), int(number), side / 2)
+    return LearningOptions(int(radius), int(oversampling), int(number), side / 2)
 
 
 def _regions(scope: str | ArrayLike, n_subapertures: int) -> NDArray[np.int64]:
@@ -325,7 +327,7 @@ def _learn(
     stack: Stack,
     index: NDArray[np.int64],
     start: PSF | float | None,
-    options: Options,
+    options: LearningOptions,
     rng: np.random.Generator | None,
     progress: Callable[[float], object] | None,
 ) -> LearntPSF:
@@ -366,7 +368,7 @@ def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> 
 
 
 def _page_state(
-    learnt: list[tuple[NDArray[np.int64], State]], index: NDArray[np.int64], options: Options
+    learnt: list[tuple[NDArray[np.int64], State]], index: NDArray[np.int64], options: LearningOptions
 ) -> LearntPSF:
     """Put the batches together."""
     spots = np.concatenate([spots for spots, _ in learnt])
@@ -384,7 +386,7 @@ def _page_state(
     )
 
 
-def _start_psf(start: PSF | float | None, stack: Stack, n_psfs: int, options: Options) -> PSF:
+def _start_psf(start: PSF | float | None, stack: Stack, n_psfs: int, options: LearningOptions) -> PSF:
     if isinstance(start, PSF):
         if len(start.samples) not in (1, n_psfs):
             raise InputError(f"start: expected 1 or {n_psfs} PSFs, got {len(start.samples)}")

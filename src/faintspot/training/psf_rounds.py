@@ -30,7 +30,7 @@ _NARROW, _HOPELESS = 0.8, 0.97  # mean resultant length of the phases: spread of
 
 
 @dataclass(frozen=True)
-class Options:
+class LearningOptions:
     """How PSFs are learnt; see `faintspot.training.psf_learning`."""
 
     radius_px: int
@@ -49,7 +49,7 @@ class State:
     found: Registered | None = None
 
 
-def gaussian_psf(fwhm_px: float, options: Options) -> PSF:
+def gaussian_psf(fwhm_px: float, options: LearningOptions) -> PSF:
     """Return a round Gaussian PSF, pixels included."""
     std = np.hypot(fwhm_px / 2.3548, 1 / np.sqrt(12))
     reach = options.radius_px * options.oversampling
@@ -73,7 +73,7 @@ def learn(
     stack: Stack,
     index: NDArray[np.int64],
     state: State,
-    options: Options,
+    options: LearningOptions,
     rng: np.random.Generator,
     progress: Callable[[], object],
 ) -> State:
@@ -100,7 +100,7 @@ def learn(
     return state
 
 
-def registered(stack: Stack, index: NDArray[np.int64], state: State, options: Options) -> State:
+def registered(stack: Stack, index: NDArray[np.int64], state: State, options: LearningOptions) -> State:
     """Return the state with the spots measured anew."""
     tables = Tables.of(state.psf, options.radius_px)
     images = stack.without(state.background_e[index])
@@ -122,7 +122,7 @@ def stacked(
     state: State,
     halves: NDArray[np.bool_],
     draws: int,
-    options: Options,
+    options: LearningOptions,
     rng: np.random.Generator,
 ) -> tuple[list[tuple[Sums, Sums]], NDArray[np.int64]]:
     """Return the sums of both halves of each PSF's spots, and how many spots are in them."""
@@ -147,7 +147,7 @@ def refitted(
     count: NDArray[np.number[Any]],
     state: State,
     choose: bool,
-    options: Options,
+    options: LearningOptions,
     rng: np.random.Generator,
 ) -> State:
     """Return the state with the PSFs fitted to the sums; a PSF with too few spots stays as it is."""

@@ -13,7 +13,7 @@ from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import checked_options, frame_stack, image_stack
-from faintspot.training.psf_rounds import Options, State, refitted, registered, stacked
+from faintspot.training.psf_rounds import LearningOptions, State, refitted, registered, stacked
 from faintspot.training.registration import Floats, Registered, Stack, Tables, start
 from faintspot.training.stacking import Sums
 
@@ -163,7 +163,7 @@ class RunningPSF:
         return kinds
 
     def _placed(
-        self, stack: Stack, kinds: NDArray[np.int64], positions: Floats, options: Options
+        self, stack: Stack, kinds: NDArray[np.int64], positions: Floats, options: LearningOptions
     ) -> Registered:
         """Spots at given positions, with the flux that the images' height tells."""
         psf = self._state.psf

@@ -74,7 +74,7 @@ def test_what_a_stream_cannot_measure() -> None:
         FrameStream(pipeline(), np.int8)
     automatic = fs.Settings(noise_std="auto", spot_fwhm_px=2.4)
     work = fs.SlopePipeline(LAYOUT, automatic, fs.Calibration(read_noise_e=1.0), device="cuda")
-    with pytest.raises(fs.InputError, match=r"settings.flux_e: expected the light per sub-aperture"):
+    with pytest.raises(fs.InputError, match=r"settings.flux_e: expected the flux per sub-aperture"):
         FrameStream(work)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, Options, ToolSlopes, parts_of
+from faintspot.adapters.base import CALIBRATION_FLUX_E, FLUX_FRAMES, AdapterOptions, ToolSlopes, parts_of
 from faintspot.adapters.checks import check_matrix, check_version
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.sensor.layout import Layout
@@ -79,7 +79,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
             precision=precision,
         )
         self._settings, self._calibration, psf, score = parts_of(faintspot)
-        self._options: Options = {
+        self._options: AdapterOptions = {
             "psf": psf,
             "score": score,
             "calibration_flux_e": calibration_flux_e,
