@@ -74,5 +74,5 @@ $(VENV)/installed-benchmarks: $(VENV)/installed
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build faintspot-demo docs/auto_tutorials docs/reference/generated docs/sg_execution_times.rst .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build faintspot-demo docs/auto_tutorials docs/reference/commands docs/reference/generated docs/reference/options docs/sg_execution_times.rst .mypy_cache .pytest_cache .ruff_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -8,12 +8,18 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
+import click
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxTranslator
 from sphinx_gallery.scrapers import figure_rst
 from sphinx_gallery.sorting import FileNameSortKey
+
+from faintspot.cli import group
+from faintspot.control.configuration import ControlOptions
+from faintspot.estimators.documentation import all_tables, option_table
+from faintspot.pipeline.settings import SharedOptions
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
@@ -33,12 +39,11 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["tutorials/GALLERY_HEADER.rst", "**sg_execution_times.rst"]
+exclude_patterns = ["reference/options/*", "tutorials/GALLERY_HEADER.rst", "**sg_execution_times.rst"]
 nitpicky = False
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
-# The option tables have marks for the test that compares them with the declarations.
 suppress_warnings = ["config.cache", "myst.header"]
 
 templates_path = ["_templates"]
@@ -81,7 +86,7 @@ sphinx_gallery_conf = {
 html_theme = "pydata_sphinx_theme"
 html_title = "faintspot"
 html_static_path = ["_static"]
-html_css_files = ["house.css"]
+html_css_files = ["pages.css"]
 html_copy_source = html_show_sourcelink = html_use_index = False
 html_theme_options = {
     "show_prev_next": True,
@@ -93,20 +98,40 @@ html_theme_options = {
     "footer_end": [],
 }
 # Pages of the first level that have none below them
-html_sidebars: dict[str, list[str]] = {
-    page: [] for page in ("index", "start", "install", "realtime", "tune", "environments")
-}
+html_sidebars: dict[str, list[str]] = {page: [] for page in ("index", "start")}
 copybutton_prompt_text = r"\$ |>>> "
 copybutton_prompt_is_regexp = True
 
 
-def _links_to_the_house(app: object, document: str, source: list[str]) -> None:
-    """Pages also read well beside the code, where they link to files that are no pages."""
+def _links_to_files(app: object, document: str, source: list[str]) -> None:
+    """Link to the files of the project as files: pages also read well beside the code."""
+    up = "../" * (document.count("/") + 1)
     source[0] = re.sub(
-        r"\]\(\.\./((?:examples|benchmarks|src|tests|README|CONTRIBUTING|SECURITY)[^)#]*)\)",
-        r"](<path:../\1>)",
+        r"\]\((?:\.\./)+((?:examples|benchmarks|src|tests|README|CONTRIBUTING|SECURITY)[^)#]*)\)",
+        rf"](<path:{up}\1>)",
         source[0],
     )
+
+
+def _write_command_pages(app: Sphinx) -> None:
+    """Write one page for each command of the command line."""
+    folder = HERE / "reference/commands"
+    folder.mkdir(exist_ok=True)
+    for name in group.list_commands(click.Context(group)):
+        directive = f".. click:: faintspot.cli.{name}:command\n   :prog: faintspot {name}\n   :nested: full\n"
+        text = f"```{{eval-rst}}\n{directive}```\n"
+        page = folder / f"{name}.md"
+        if not page.exists() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
+
+
+def _write_option_tables(app: Sphinx) -> None:
+    """Write the tables of options, for the page of the configuration."""
+    folder = HERE / "reference/options"
+    folder.mkdir(exist_ok=True)
+    tables = {**all_tables(SharedOptions), "control": option_table(ControlOptions)}
+    for name, table in tables.items():
+        (folder / f"{name}.md").write_text(f"{table}\n", encoding="utf-8")
 
 
 def _formula(translator: SphinxTranslator, node: nodes.math | nodes.math_block) -> None:
@@ -119,5 +144,7 @@ def _formula(translator: SphinxTranslator, node: nodes.math | nodes.math_block) 
 
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
-    app.connect("source-read", _links_to_the_house)
+    app.connect("builder-inited", _write_command_pages)
+    app.connect("builder-inited", _write_option_tables)
+    app.connect("source-read", _links_to_files)
     app.add_html_math_renderer("mathml", (_formula, None), (_formula, None))

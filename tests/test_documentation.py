@@ -18,11 +18,10 @@ from faintspot.io.telemetry import TelemetryStore
 from faintspot.realtime.telemetry_segment import image_type, layout_values, record_type
 
 ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("", "adapters", "guide", "reference", "results")
 PAGES = [
     ROOT / "README.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-    *sorted((ROOT / "docs/how_to").glob("*.md")),
-    *sorted((ROOT / "docs/adapters").glob("*.md")),
+    *(page for folder in FOLDERS for page in sorted((ROOT / "docs" / folder).glob("*.md"))),
 ]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 

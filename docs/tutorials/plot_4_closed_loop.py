@@ -39,8 +39,8 @@ arms = [
 records = {arm.label: simulate_loop(loop, [arm]) for arm in arms}
 
 # %%
-# One short realisation each: enough to see, not enough to judge by (:doc:`/loop` has five of them, with
-# errors).
+# One short realisation each: enough to see, not enough to judge by. :doc:`/results/closed_loop` has five
+# realisations, with errors.
 
 figure = Figure(figsize=(8, 3.8), layout="constrained")
 axes = figure.add_subplot(xlabel="frame", ylabel="H-band Strehl ratio", ylim=(0, 1))

@@ -12,11 +12,8 @@ from tests.control.control_cases import INTERACTION
 
 from faintspot.base.errors import InputError
 from faintspot.control.configuration import Control, ControlOptions, load_control, save_control
-from faintspot.estimators.documentation import option_table
 from faintspot.pipeline import configuration as configuration_file
 from faintspot.sensor.layout import Layout
-
-DOCS = Path(__file__).parents[2] / "docs" / "configuration.md"
 
 
 def _written(folder: Path, text: str, **arrays: Any) -> Path:
@@ -96,7 +93,3 @@ def test_another_sensor_is_refused() -> None:
     expected = "expected 32 rows for 16 sub-apertures (all x, then all y), got 18"
     with pytest.raises(InputError, match=re.escape(expected)):
         control.check_fits(len(Layout.grid((4, 4), pixels=8)))
-
-
-def test_the_documentation_has_the_options() -> None:
-    assert option_table(ControlOptions).replace("; whole sensor", "") in DOCS.read_text(encoding="utf-8")
