@@ -292,6 +292,9 @@ def assert_equals_oracle(case: Case, slopes: fs.Slopes) -> int:
             result = getattr(slopes, name.replace("error", "standard_error"))[s]
             assert abs(result - value) <= bound, (s, name, float(result), value, bound)
         assert_search_limit_flagged(case, s, [expected, *shaken], slopes)
+        moving = {each.is_moving for each in (expected, *shaken)}
+        if "steps" in case.settings.declared() and len(moving) == 1:
+            assert bool(slopes.flags[s] & fs.SubapertureFlag.NOT_CONVERGED) == moving.pop(), (s, expected)
     return compared
 
 

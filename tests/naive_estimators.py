@@ -84,6 +84,15 @@ class Estimate:
     error_y: float = math.inf
     margin: float = math.inf
     """How near a decision was to another one: below 1e-3 rounding to float32 may turn it."""
+    moves: tuple[float, ...] = (1.0, 0.0)
+    """How far each step went, the larger of x and y."""
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the next steps would go several standard errors, were they a geometric series."""
+        before, move = self.moves[-2:]
+        error = max(self.error_x, self.error_y)
+        return move > error and (move >= before or move**2 / (before - move) > 2 * error)
 
 
 # Start ------------------------------------------------------------------------------------------------
@@ -129,22 +138,24 @@ def start(g: ArrayLike, task: Task) -> Estimate:
     others = [item[0] for item in found if item is not best]
     flux = 1.0
     if task.spot is not None:
-        peak = smoothed_peak(task.spot, std_x, std_y, task.reach)
-        peak = max(peak - 1 / g.size, peak / 10) if task.background else peak
+        peak = smoothed_peak(task.spot, std_x, std_y, task.reach, (g.shape[0], g.shape[1]), task.background)
         flux = max(best[0] / peak, 1.0)
     distance = best[0] - max(others, default=-math.inf)
     return Estimate(best[1], best[2], flux, margin=100 * distance / max(np.abs(blurred).max(), 1e-30))
 
 
 @cache
-def smoothed_peak(spot: Spot, std_x: float, std_y: float, reach: int | None = None) -> float:
-    """What the brightest pixel of a smoothed spot of 1 e- has: the mean over places within the pixel."""
-    half = math.ceil(2.5 * max(std_x, std_y)) if reach is None else reach
-    shape = (2 * half + 1, 2 * half + 1)
-    places = [(x, y) for x in (-1 / 3, 0.0, 1 / 3) for y in (-1 / 3, 0.0, 1 / 3)]
-    return float(
-        np.mean([smoothed(spot.images(x, y, shape)[0], std_x, std_y, reach)[half, half] for x, y in places])
-    )
+def smoothed_peak(
+    spot: Spot, std_x: float, std_y: float, reach: int | None, shape: tuple[int, int], background: bool
+) -> float:
+    """The smoothed image's middle pixel for a spot of 1 e-, the mean over places of the spot in it."""
+    j, i = shape[0] // 2, shape[1] // 2
+    found = []
+    for x in (-1 / 3, 0.0, 1 / 3):
+        for y in (-1 / 3, 0.0, 1 / 3):
+            g = spot.images(x + pixel_centres(shape[1])[i], y + pixel_centres(shape[0])[j], shape)[0]
+            found.append(smoothed(g - g.mean() if background else g, std_x, std_y, reach)[j, i])
+    return max(float(np.mean(found)), 1e-5)
 
 
 # Likelihood -------------------------------------------------------------------------------------------
@@ -152,6 +163,11 @@ def smoothed_peak(spot: Spot, std_x: float, std_y: float, reach: int | None = No
 
 def clamp(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
+
+
+def largest_move(fwhm_x: float, fwhm_y: float) -> float:
+    """How far one step may go, px."""
+    return max(1.0, 0.25 * min(fwhm_x, fwhm_y))
 
 
 def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
@@ -198,7 +214,8 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
     begin = start(g, task) if begin is None else begin
     limits, margin = task.limits(g.shape), begin.margin
     x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
-    level = 0.0
+    level, most = 0.0, largest_move(*task.fwhm)
+    moves: tuple[float, ...] = (most,)
     errors = (math.inf, math.inf)
     for _ in range(STEPS[name] if task.steps is None else task.steps):
         f, fx, fy = task.spot.images(x, y, g.shape)
@@ -210,13 +227,14 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
         i, j = information(m, dm, w, task, name)
         margin = min(margin, soundness(i) - 1e-3, *phase_margins(x, y, g.shape, task.spot.phases))
         whole = np.linalg.solve(i, score) if soundness(i) > 1e-5 else np.zeros(len(score))
-        move = np.clip(whole[:2] / max(1.0, whole[2] / flux), -1.0, 1.0)
+        move = np.clip(whole[:2] / max(1.0, whole[2] / flux), -most, most)
+        moves += (float(np.abs(move).max()),)
         errors = sandwich(i, j) if soundness(i) > 1e-5 else (math.inf, math.inf)
         x, y = clamp(x + move[0], *limits[0]), clamp(y + move[1], *limits[1])
         others = np.linalg.solve(i[2:, 2:], score[2:] - i[2:, :2] @ move)
         flux = max(clamp(flux + others[0], flux / 2, flux * 2), LEAST_FLUX)
         level += others[1] if task.background else 0.0
-    return Estimate(x, y, flux, task.error_scale * errors[0], task.error_scale * errors[1], margin)
+    return Estimate(x, y, flux, task.error_scale * errors[0], task.error_scale * errors[1], margin, moves)
 
 
 def soundness(i: Floats) -> float:
@@ -299,13 +317,16 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
     u, v = pixel_centres(g.shape[1])[None, :], pixel_centres(g.shape[0])[:, None]
     floor = LEAST_FRACTION * begin.flux
     w, total = np.ones_like(g), floor
+    most = largest_move(*(task.spot_fwhm * task.axis_ratio**power for power in (-0.5, 0.5)))
+    moves: tuple[float, ...] = (most,)
     for _ in range(STEPS["weighted"] if task.steps is None else task.steps):
         margin = min(margin, *phase_margins(x, y, g.shape, task.phases))
         w = np.outer(window(g.shape[0], y, std_y, task.phases), window(g.shape[1], x, std_x, task.phases))
         total = max(float(np.sum(w * g)), floor)
         move_x, move_y = (gain * np.sum(w * g * away) / total for away in (u - x, v - y))
-        x = clamp(x + clamp(move_x, -1.0, 1.0), *limits[0])
-        y = clamp(y + clamp(move_y, -1.0, 1.0), *limits[1])
+        move_x, move_y = clamp(move_x, -most, most), clamp(move_y, -most, most)
+        moves += (max(abs(move_x), abs(move_y)),)
+        x, y = clamp(x + move_x, *limits[0]), clamp(y + move_y, *limits[1])
     noise = w**2 * (task.variance + task.excess * g)
     least = w**2 * max(task.variance, 1e-4)  # whatever noise has made of the flux
     errors = [
@@ -314,7 +335,7 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
     error_x, error_y = (
         (task.error_scale * gain * e for e in errors) if total > floor else (math.inf, math.inf)
     )
-    return Estimate(x, y, total, error_x, error_y, margin)
+    return Estimate(x, y, total, error_x, error_y, margin, moves)
 
 
 def fixed_window(

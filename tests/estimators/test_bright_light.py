@@ -64,6 +64,31 @@ def test_trained_score_in_far_more_flux_than_expected() -> None:
         assert 0.6 < gain(settings, flux, None, score=score) < 1.1
 
 
+@pytest.mark.parametrize(
+    ("fwhm_px", "side", "steps"), [(14.0, 24, 3), (14.0, 20, 3), (3.6, 8, 3), (14.0, 24, 1), (2.0, 16, 3)]
+)
+def test_steps_reach_broad_spots_or_say_that_they_do_not(fwhm_px: float, side: int, steps: int) -> None:
+    """The smoothed image of a spot as broad as its window peaks several pixels from the spot."""
+    rng = np.random.default_rng(2)
+    psf = fs.PSF.analytic("gaussian", size=fwhm_px / 2, radius_px=3 * fwhm_px)
+    positions = rng.uniform(-side / 4, side / 4, (400, 2))
+    images = rng.poisson(np.maximum(psf.images(positions, (side, side), 1e5), 0)) + rng.standard_normal(
+        (400, side, side)
+    )
+    settings = Settings("ml", local_background="on", steps=steps)
+    slopes = fs.measure_images(images, settings, calibration=fs.Calibration(read_noise_e=1.0), psf=psf)
+    off = np.abs(np.stack([slopes.x, slopes.y], axis=1) - positions)
+    stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=1)
+    # Normal deviates stay within 5 standard deviations.
+    said = (slopes.flags & fs.SubapertureFlag.NOT_CONVERGED) != 0
+    assert np.all(said | (off < 5 * stated).all(axis=1))
+    if steps == 3:
+        assert np.sqrt(np.mean(off**2)) < 1.15 * np.sqrt(np.mean(stated**2))
+        assert said.mean() < 0.5  # a last step may be long although no other would follow
+    else:
+        assert said.mean() > 0.9
+
+
 @pytest.mark.parametrize("local_background", ["on", "off"])
 def test_without_a_prior_map_is_ml(local_background: str) -> None:
     # Broad, structured spots that the PSF does not describe: the likelihood has maxima up to 0.06 px apart.

@@ -21,7 +21,8 @@ class SubapertureFlag(IntFlag):
     INFEASIBLE_STRENGTH = 16
     """The strength is too strong for the image, above 0.9 of its own rms: lowered to 0.6 of that."""
     NOT_CONVERGED = 32
-    """The iteration limit came before the tolerance was reached. Not where the tolerance is 0."""
+    """The iteration limit came before the tolerance was reached (not where that is 0), or the last steps
+    of an estimator were still long: more of them would move the slope by several standard errors."""
     OUTLIER_LIKELY = 64
     """The spot is so faint that more than about 1 % of such slopes are those of noise, not of the spot."""
     AT_SEARCH_LIMIT = 128

@@ -155,7 +155,7 @@ def describe(summary: Summary, output: str) -> list[str]:
         SubapertureFlag.BAD_PIXELS: "with a few bad pixels, filled from their neighbours",
         SubapertureFlag.SATURATED: "with saturated pixels",
         SubapertureFlag.INFEASIBLE_STRENGTH: "whose noise_std was too strong for the image and was lowered",
-        SubapertureFlag.NOT_CONVERGED: "at the iteration limit (max_iterations)",
+        SubapertureFlag.NOT_CONVERGED: "not converged (raise max_iterations or steps)",
         SubapertureFlag.OUTLIER_LIKELY: "so faint that outliers are to be expected",
         SubapertureFlag.AT_SEARCH_LIMIT: "at the limit of the search range (search_range_px)",
     }

@@ -23,6 +23,7 @@ START_SMOOTHING = (
 )
 _REACH = 2.5  # standard deviations at which a Gaussian is cut off
 _START_OFFSETS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # of the spot from the pixel that it is the brightest of, px
+_LEAST_START_FLUX = 1e-5  # of a spot's flux, where hardly any pixel exceeds the image's mean
 _OUTLIER_FRACTION = 0.01  # from which on a slope is flagged
 _NEAR_OUTLIERS = 0.9
 _GRID_OF_FWHM = 0.25  # spacing of the posterior's grid; at most ...
@@ -44,7 +45,7 @@ class SpotModel:
     taps: NDArray[np.float32]
     """Of the smoothing that finds the start, (n_models, 2, 1 + reach)."""
     start_flux: Floats
-    """What the brightest pixel of a smoothed spot has of its flux, (n_models,)."""
+    """What the brightest pixel of a spot that is smoothed in its window has of its flux, (n_models,)."""
     gain: Floats
     """Factor on the steps of the weighted centre of gravity, (n_models, 2)."""
 
@@ -54,12 +55,12 @@ class SpotModel:
         return int(self.tables.shape[2])
 
 
-def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int) -> SpotModel:
-    """Prepare the PSFs of n sub-apertures."""
+def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int, background: bool) -> SpotModel:
+    """Prepare the PSFs of n sub-apertures; `background`: images begin with their mean taken off."""
     along, across = psf.separable_terms
     tables = [_profile_tables(terms, psf.oversampling, window, width) for terms in (along, across)]
     taps = gaussian_taps(START_SMOOTHING * psf.fwhm_px, window)
-    flux = _start_flux(psf, taps)
+    flux = _start_flux(psf, taps, window, background=background)
     ones = np.ones((len(flux), 2))
     return SpotModel(np.stack(tables, axis=1), psf.index_of(n), psf.fwhm_px, taps, flux, ones)
 
@@ -85,7 +86,7 @@ def model_of_weights(
         spots, planes, gains = gaussian_psf(fwhm), np.arange(len(fwhm)), 1.0 + (fwhm / weights) ** 2
     else:
         gains = np.stack([_weighted_gain(spots, int(i), own) for i, own in zip(planes, std, strict=True)])
-    flux = np.array([_start_flux(spots, taps[i : i + 1], int(k))[0] for i, k in enumerate(planes)])
+    flux = np.array([_start_flux(spots, taps[i : i + 1], window, int(k))[0] for i, k in enumerate(planes)])
     return SpotModel(np.stack(tables, axis=1), index.reshape(-1), fwhm, taps, flux, gains)
 
 
@@ -144,17 +145,31 @@ def _gaussian_tables(std_px: Floats, window: tuple[int, int], width: int) -> NDA
     return np.ascontiguousarray(values[:, None], np.float32)
 
 
-def _start_flux(psf: PSF, taps: NDArray[np.float32], plane: int | None = None) -> Floats:
-    """Mean over sub-pixel positions of the smoothed spot's brightest pixel."""
+def _start_flux(
+    psf: PSF,
+    taps: NDArray[np.float32],
+    window: tuple[int, int],
+    plane: int | None = None,
+    *,
+    background: bool = False,
+) -> Floats:
+    """Mean over sub-pixel positions of the brightest pixel of a smoothed spot in the window's middle."""
     offsets = np.array([(x, y) for x in _START_OFFSETS for y in _START_OFFSETS])
-    reach = taps.shape[2] - 1
-    side = 2 * reach + 1
+    ny, nx = window
+    offsets += 0.5 * np.array([1 - nx % 2, 1 - ny % 2])  # from the pixel n // 2
     flux = np.empty(len(taps))
     for i, (along, across) in enumerate(taps.astype(np.float64)):
-        images = psf.images(offsets, (side, side), which=i if plane is None else plane)
-        both = [np.concatenate([values[:0:-1], values]) for values in (along, across)]
-        flux[i] = np.einsum("nyx,x,y->n", images, both[0], both[1]).mean()
-    return np.maximum(flux, 1e-6)
+        images = psf.images(offsets, window, which=i if plane is None else plane)
+        images -= images.mean(axis=(1, 2), keepdims=True) if background else 0.0
+        x, y = (_taps_around(n // 2, values, n) for n, values in ((nx, along), (ny, across)))
+        flux[i] = np.einsum("nyx,x,y->n", images, x, y).mean()
+    return np.maximum(flux, _LEAST_START_FLUX)
+
+
+def _taps_around(middle: int, taps: Floats, n: int) -> Floats:
+    """Return the taps that n pixels have in the smoothed value of the pixel `middle`."""
+    away = np.abs(np.arange(n) - middle)
+    return np.where(away < len(taps), taps[np.minimum(away, len(taps) - 1)], 0.0)
 
 
 def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:

@@ -17,6 +17,8 @@ from faintspot.kernels.groups import RANGE
 
 Floats = NDArray[np.float64]
 
+_LARGEST_MOVE = 0.25  # of a step, in units of the FWHM; 1 px for narrow spots
+
 BLURS = (0.4, 0.0, 0.8, 1.2)
 """Of a speckled spot's PSF, in units of lambda / d."""
 
@@ -75,11 +77,10 @@ class SpotPlan(EstimatorPlan):
         """See `EstimatorPlan`."""
         model, index = self.model, self.model.index
         table[spot_fits.MODEL] = index
-        start_flux = model.start_flux[index]
-        if self.fits_background:  # the image's mean, the spot's own light in it, is taken off
-            start_flux = np.maximum(start_flux - 1.0 / self.sensor.pixels, 0.1 * start_flux)
-        table[spot_fits.START_FLUX] = start_flux
+        table[spot_fits.START_FLUX] = model.start_flux[index]
         table[spot_fits.GAIN_X], table[spot_fits.GAIN_Y] = model.gain[index].T
+        narrow = model.fwhm_px.min(axis=1)[index]
+        table[spot_fits.LARGEST_MOVE] = np.maximum(1.0, _LARGEST_MOVE * narrow)
         table[spot_fits.LEAST_FLUX] = self._least_flux(table[RANGE])
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
@@ -119,4 +120,5 @@ class PSFPlan(SpotPlan):
     @cached_property
     def model(self) -> SpotModel:
         """Profiles of the spots."""
-        return spot_tables.model_of_psf(self.psf, self.sensor.n, self.sensor.window, self.sensor.width)
+        sensor = self.sensor
+        return spot_tables.model_of_psf(self.psf, sensor.n, sensor.window, sensor.width, self.fits_background)

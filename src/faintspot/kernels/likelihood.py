@@ -15,6 +15,7 @@ from faintspot.kernels.background import eliminate_background
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.profiles import look_up
 from faintspot.kernels.simd import (
+    absolute,
     load,
     maximum,
     minimum,
@@ -44,9 +45,12 @@ from faintspot.kernels.spot_rows import (
     J_XY,
     J_YF,
     J_YY,
+    LARGEST_MOVE,
     LOW_X,
     LOW_Y,
     MODEL_ERROR,
+    MOVE,
+    MOVE_BEFORE,
     PRIOR_WEIGHT,
     PRIOR_X,
     PRIOR_Y,
@@ -62,7 +66,6 @@ from faintspot.kernels.spot_rows import (
     Y,
 )
 
-LARGEST_MOVE_PX = 1.0
 LARGEST_FACTOR = 2.0  # on the flux, in one step
 LEAST_FLUX_E = 1e-2
 
@@ -227,8 +230,11 @@ def _move(lanes: Any, lane_values: Any) -> None:
     # A step is too long by how much more flux there is than the model has: linear is only their product.
     growth = maximum((sf - ixf * dx - iyf * dy) * inverse_ff, one)
     dx, dy = dx / growth, dy / growth
-    most, least = splat(lanes, LARGEST_MOVE_PX), splat(lanes, -LARGEST_MOVE_PX)
+    most = load(lanes, lane_values, LARGEST_MOVE * width)
+    least = zero - most
     dx, dy = minimum(maximum(dx, least), most), minimum(maximum(dy, least), most)
+    store(lane_values, MOVE_BEFORE * width, load(lanes, lane_values, MOVE * width))
+    store(lane_values, MOVE * width, maximum(absolute(dx), absolute(dy)))
     df = (sf - ixf * dx - iyf * dy) * inverse_ff
     factor = minimum(maximum(one + df, splat(lanes, 1.0 / LARGEST_FACTOR)), splat(lanes, LARGEST_FACTOR))
     x = minimum(

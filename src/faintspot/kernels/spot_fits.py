@@ -13,6 +13,7 @@ from faintspot.kernels.background import subtract_background
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.groups import (
     COMMON_ROWS,
+    ERROR_SCALE,
     EXCESS,
     NO_FLUX,
     RANGE,
@@ -33,12 +34,13 @@ from faintspot.kernels.weighted import weigh_group
 # Rows of the settings' table that follow the common ones: flux that is expected; weights of a fit; prior.
 FLUX, WEIGHT_FLOOR, WEIGHT_EXCESS, MODEL_ERROR, PRIOR_WEIGHT = range(COMMON_ROWS, COMMON_ROWS + 5)
 # Which model and which table of the flux's; see `spot_rows`; errors of a score; light of likely outliers.
-MODEL, KIND, START_FLUX, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_FLUX = range(
-    COMMON_ROWS + 5, COMMON_ROWS + 13
+MODEL, KIND, START_FLUX, GAIN_X, GAIN_Y, TRAINED_ERROR_X, TRAINED_ERROR_Y, LEAST_FLUX, LARGEST_MOVE = range(
+    COMMON_ROWS + 5, COMMON_ROWS + 14
 )
-SETTING_ROWS = COMMON_ROWS + 13
+SETTING_ROWS = COMMON_ROWS + 14
 
 OUTLIER_LIKELY = int(SubapertureFlag.OUTLIER_LIKELY)
+NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
 LEAST_SIGNIFICANCE = 1.0
 """A spot less significant than this many standard deviations counts as no flux."""
 SMALLEST_VARIANCE = 1e-4
@@ -50,6 +52,7 @@ BRIGHT = 2.0
 """Times the expected flux from which on that of the window is believed instead, if it is significant."""
 _LIT_FRACTION = 0.2  # of the expected flux: what is surely less is no flux
 _SURELY = 3.0  # standard deviations
+_MOVING = 2.0  # standard errors that the next steps would add
 _BROAD = 0.5  # standard deviation, in units of the grid's spacing, above which sums over the grid are good
 
 
@@ -259,6 +262,11 @@ def _begin(group: Any, scratch: Any) -> None:
         lane_values[spot_rows.START_FLUX * width + lane] = settings[START_FLUX, s]
         lane_values[spot_rows.GAIN_X * width + lane] = settings[GAIN_X, s]
         lane_values[spot_rows.GAIN_Y * width + lane] = settings[GAIN_Y, s]
+        largest = settings[LARGEST_MOVE, s]
+        lane_values[spot_rows.LARGEST_MOVE * width + lane] = largest
+        lane_values[spot_rows.MOVE * width + lane] = (
+            largest  # before the first step, in which it is not known
+        )
 
 
 @compiled
@@ -410,6 +418,14 @@ def _is_illuminated(width: Any, lane: Any, expected: Any, lane_values: Any) -> A
 
 
 @compiled
+def _is_moving(width: Any, lane: Any, error: Any, lane_values: Any) -> Any:
+    """Whether further steps would move a lane by several standard errors, were they a geometric series."""
+    move = lane_values[spot_rows.MOVE * width + lane]
+    before = lane_values[spot_rows.MOVE_BEFORE * width + lane]
+    return move > error and move * move > _MOVING * error * (before - move)
+
+
+@compiled
 def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
     """Write the lanes' results, and the bits of their flags."""
     width, settings, lane_values, found = (
@@ -431,6 +447,9 @@ def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
                 bits |= NO_FLUX
             elif flux < settings[LEAST_FLUX, s]:
                 bits |= OUTLIER_LIKELY
+            error = settings[ERROR_SCALE, s] * max(error_x, error_y)
+            if _is_moving(width, lane, error, lane_values):
+                bits |= NOT_CONVERGED
         scratch.flags[lane], scratch.iterations[lane] = bits, steps
         found[groups.X * width + lane] = lane_values[spot_rows.X * width + lane]
         found[groups.Y * width + lane] = lane_values[spot_rows.Y * width + lane]

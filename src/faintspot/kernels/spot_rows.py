@@ -23,4 +23,6 @@ START_FLUX, GAIN_X, GAIN_Y = range(36, 39)
 MEAN_X, MEAN_Y, SPREAD_X, SPREAD_Y, SPACING = range(39, 44)
 # Where the smoothed image peaks, and the flux that it shows there.
 PEAK_X, PEAK_Y, PEAK_FLUX = range(44, 47)
-LANE_ROWS = 47
+# In: the largest move of one step, px. Out: the larger of the moves along x and y in the last two steps, px.
+LARGEST_MOVE, MOVE, MOVE_BEFORE = range(47, 50)
+LANE_ROWS = 50

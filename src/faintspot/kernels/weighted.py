@@ -7,7 +7,17 @@ from typing import Any
 
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.profiles import look_up
-from faintspot.kernels.simd import load, maximum, minimum, multiply_add, select, splat, store, width_of
+from faintspot.kernels.simd import (
+    absolute,
+    load,
+    maximum,
+    minimum,
+    multiply_add,
+    select,
+    splat,
+    store,
+    width_of,
+)
 from faintspot.kernels.spot_rows import (
     ERROR_X,
     ERROR_Y,
@@ -17,8 +27,11 @@ from faintspot.kernels.spot_rows import (
     GAIN_Y,
     HIGH_X,
     HIGH_Y,
+    LARGEST_MOVE,
     LOW_X,
     LOW_Y,
+    MOVE,
+    MOVE_BEFORE,
     SEEN,
     SEEN_ERROR,
     VARIANCE,
@@ -26,7 +39,6 @@ from faintspot.kernels.spot_rows import (
     Y,
 )
 
-LARGEST_MOVE_PX = 1.0
 SMALLEST_VARIANCE = 1e-4  # of a pixel, electrons squared
 LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would only amplify noise
 
@@ -50,10 +62,14 @@ def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, l
         moment_x = multiply_add(row_x, weight_y, moment_x)
         moment_y = multiply_add(row * weight_y, splat(lanes, y - 0.5 * (ny - 1)), moment_y)
     inverse = splat(lanes, 1.0) / maximum(total, floor)
-    most, least = splat(lanes, LARGEST_MOVE_PX), splat(lanes, -LARGEST_MOVE_PX)
+    most = load(lanes, lane_values, LARGEST_MOVE * width)
+    least = zero - most
     dx = load(lanes, lane_values, GAIN_X * width) * ((moment_x - x0 * total) * inverse)
     dy = load(lanes, lane_values, GAIN_Y * width) * ((moment_y - y0 * total) * inverse)
-    x0, y0 = x0 + minimum(maximum(dx, least), most), y0 + minimum(maximum(dy, least), most)
+    dx, dy = minimum(maximum(dx, least), most), minimum(maximum(dy, least), most)
+    store(lane_values, MOVE_BEFORE * width, load(lanes, lane_values, MOVE * width))
+    store(lane_values, MOVE * width, maximum(absolute(dx), absolute(dy)))
+    x0, y0 = x0 + dx, y0 + dy
     low, high = load(lanes, lane_values, LOW_X * width), load(lanes, lane_values, HIGH_X * width)
     store(lane_values, X * width, minimum(maximum(x0, low), high))
     low, high = load(lanes, lane_values, LOW_Y * width), load(lanes, lane_values, HIGH_Y * width)

@@ -15,7 +15,7 @@ FLAG_MEANINGS = {
     SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
     SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std was above 0.9 of the image's rms, and was lowered.",
-    SubapertureFlag.NOT_CONVERGED: "The iteration limit came before the tolerance was reached.",
+    SubapertureFlag.NOT_CONVERGED: "The limit of iterations or steps came before the result had settled.",
     SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
     SubapertureFlag.AT_SEARCH_LIMIT: "The slope ends at search_range_px: the spot may be beyond.",
 }
@@ -41,8 +41,8 @@ _ADVICE = {
     ),
     SubapertureFlag.NOT_CONVERGED: (
         0.10,
-        "hit the iteration limit before the tolerance was reached",
-        "raise max_iterations, or raise tolerance if the time does not allow it",
+        "hit the limit of iterations or steps before the result had settled",
+        "raise max_iterations (or tolerance) of a denoising, steps of a fit",
     ),
     SubapertureFlag.AT_SEARCH_LIMIT: (
         0.01,
