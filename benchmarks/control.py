@@ -55,7 +55,7 @@ def small_table() -> Table:
 
     def compiled(model: SlopeModel) -> Controller:
         matrix, predictor = plant.reconstructor.matrix, SlopePredictor(model, errors**2)
-        return CompiledKalman(line(), plant.interaction, matrix, predictor, clean, 0.3, control.leak)
+        return CompiledKalman(line(), plant.interaction, matrix, matrix, predictor, clean, 0.3, control.leak)
 
     controllers: dict[str, Controller] = {
         "integrator": plant.integrator(0.4, line()),
@@ -99,7 +99,7 @@ def sizes_table() -> Table:
         interaction = rng.standard_normal((slopes, commands)) / np.sqrt(slopes)
         line = CommandDelayLine(commands, 2, 1.0)
         name = f"{slopes} slopes, {commands} commands"
-        of_mirror = interaction, interaction.T
+        of_mirror = interaction, interaction.T, interaction.T
         filtered = CompiledKalman(line, *of_mirror, predictor, interaction.T, 0.3, 0.01)
         controllers[name] = partial(
             filtered.update, 0.1 * rng.standard_normal(slopes), rng.uniform(0.5, 1.5, slopes)

@@ -72,7 +72,7 @@ def _latency() -> Table:
         },
     }
     for kind, arrays in learnt.items():
-        known = Model(kind, arrays, 0.3, 1.0, (1.0, 2.0))
+        known = Model(kind, arrays, 0.3, 1.0, (1.0, 2.0), np.zeros_like(interaction.T))
         control = Control(interaction, None, ControlOptions(controller=kind), known)
         rows.append(_row(CONTROLS[kind], layout, control, TARGETS_US[1]))
     return Table("realtime-commands", "From slopes to commands, us", rows)

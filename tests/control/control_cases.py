@@ -6,6 +6,7 @@ import numpy as np
 
 from faintspot.control.learning import Plant
 from faintspot.control.models import SlopeModel
+from faintspot.control.phase import residual_phase
 from faintspot.control.reconstructor import make_reconstructor
 from faintspot.control.telemetry import OpenLoopTelemetry
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
@@ -27,6 +28,7 @@ LAYERS = SlopeModel.of_covariances(np.array([layer.lagged_px2(FRAME_S) for layer
 INTERACTION = np.random.default_rng(1).standard_normal((18, 12))
 ERRORS = np.full(18, 0.3)
 PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
+PHASE = residual_phase(PLANT.reconstructor, INTERACTION, CELLS.astype(int))
 
 
 def telemetry(
@@ -35,10 +37,10 @@ def telemetry(
     """Return slopes as a model makes them, with noise; errors are said to be so many times the true ones."""
     rng = np.random.default_rng(seed)
     driving = np.linalg.cholesky(model.driving)
-    now = before = np.zeros((model.layers, 18))
+    now = before = np.zeros((model.layers, model.slopes))
     slopes = []
     for _ in range(frames + 300):
-        chance = rng.standard_normal((model.layers, 18))
+        chance = rng.standard_normal((model.layers, model.slopes))
         new = [
             first @ one + second @ two + each @ random
             for first, second, each, one, two, random in zip(
@@ -47,5 +49,5 @@ def telemetry(
         ]
         now, before = np.array(new), now
         slopes.append(now.sum(axis=0))
-    noisy = np.array(slopes[300:]) + noise_px * rng.standard_normal((frames, 18))
+    noisy = np.array(slopes[300:]) + noise_px * rng.standard_normal((frames, model.slopes))
     return OpenLoopTelemetry(noisy, np.full(noisy.shape, (said * noise_px) ** 2), np.ones(noisy.shape))

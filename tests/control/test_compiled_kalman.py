@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.control.control_cases import INTERACTION, LAYERS, MODEL, PLANT, telemetry
+from tests.control.control_cases import INTERACTION, LAYERS, MODEL, PHASE, PLANT, telemetry
 
 from faintspot.control.commands import CommandDelayLine
 from faintspot.control.compiled_kalman import STEPS, CompiledKalman
@@ -36,9 +36,9 @@ def both(model: SlopeModel = MODEL, largest: float = 1e30, steps: int = STEPS, *
         return Predictive(line, INTERACTION, predictor(), clean)
 
     plain = partial(PLANT.integrator, GAIN)
-    slow = Guarded(lines[0], INTERACTION, matrix, learnt, plain, **options)
+    slow = Guarded(lines[0], INTERACTION, PHASE, learnt, plain, **options)
     fast = CompiledKalman(
-        lines[1], INTERACTION, matrix, predictor(), clean, GAIN, PLANT.leak, steps=steps, **options
+        lines[1], INTERACTION, matrix, PHASE, predictor(), clean, GAIN, PLANT.leak, steps=steps, **options
     )
     return list(zip((slow, fast), lines, strict=True))
 

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
+from tests.control.control_cases import COVARIANCES, INTERACTION, PHASE, PLANT, telemetry
 
 from faintspot.control.base import Expected
 from faintspot.control.commands import CommandDelayLine
@@ -32,7 +32,7 @@ class Runaway:
 
 def _guarded(line: CommandDelayLine, learnt: object, prior: np.ndarray | None = None) -> Guarded:
     plain = partial(PLANT.integrator, 0.4)
-    return Guarded(line, INTERACTION, PLANT.reconstructor.matrix, learnt, plain, prior_std_px=prior)  # type: ignore[arg-type]
+    return Guarded(line, INTERACTION, PHASE, learnt, plain, prior_std_px=prior)  # type: ignore[arg-type]
 
 
 def test_nonsense_is_replaced() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
+from tests.control.control_cases import CELLS, COVARIANCES, INTERACTION, PLANT, telemetry
 
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
@@ -23,7 +23,7 @@ FRAMES = telemetry(600, 0.3)
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, Learnt]:
-    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES[None]}) for kind in KINDS}
+    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES[None]}, CELLS) for kind in KINDS}
 
 
 def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:

@@ -5,11 +5,13 @@ from functools import partial
 import numpy as np
 import pytest
 from tests.control.control_cases import (
+    CELLS,
     COVARIANCES,
     FRAME_S,
     INTERACTION,
     LAYERS,
     MODEL,
+    PHASE,
     PLANT,
     TURBULENCE,
     telemetry,
@@ -68,7 +70,7 @@ def _score(model: SlopeModel, frames: OpenLoopTelemetry) -> float:
         predictor = SlopePredictor(model, usual_variance(frames))
         return Predictive(line, INTERACTION, predictor, PLANT.reconstructor.clean)
 
-    return PLANT.left(made, frames)
+    return PLANT.left(made, frames, PHASE)
 
 
 def test_the_right_theory_is_chosen_and_a_wrong_one_is_mended() -> None:
@@ -101,11 +103,13 @@ def test_shares_go_from_theory_to_measured() -> None:
 def test_what_has_learnt_leaves_less(kind: str) -> None:
     """On other frames of the same air, than the integrator with the gain that is best there."""
     theories = {"told": RIGHT}
-    learnt = learn(kind, PLANT, telemetry(1200, 0.5), theories)
+    learnt = learn(kind, PLANT, telemetry(1200, 0.5), theories, CELLS)
     other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
-    plain = min(PLANT.left(partial(PLANT.integrator, gain), other) for gain in (0.1, 0.2, 0.3, 0.4, 0.5))
+    plain = min(
+        PLANT.left(partial(PLANT.integrator, gain), other, PHASE) for gain in (0.1, 0.2, 0.3, 0.4, 0.5)
+    )
     # Of a gain for each mode, in a mirror without any order, no more can be asked than to be no worse.
-    assert PLANT.left(learnt.controller, other) < plain * (1.01 if kind == "modal" else 0.99)
+    assert PLANT.left(learnt.controller, other, PHASE) < plain * (1.01 if kind == "modal" else 0.99)
 
 
 def test_the_best_gain_is_that_of_a_loop_run_through() -> None:

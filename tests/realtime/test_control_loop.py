@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
-from tests.control.control_cases import COVARIANCES, INTERACTION, PLANT, telemetry
+from tests.control.control_cases import CELLS, COVARIANCES, INTERACTION, PLANT, telemetry
 
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
@@ -39,15 +39,16 @@ class PlainControl(Control):
             numbers = self.interaction, self.reconstructor, gain, self.options.leak
             return Integrator(line, *numbers, weighted=True)
         if kind == KALMAN:
-            of_both = partial(self.model.controller, plant), partial(plant.integrator, self.model.plain_gain)
-            return Guarded(line, self.interaction, self.reconstructor.matrix, *of_both)
+            model = self.model
+            of_both = partial(model.controller, plant), partial(plant.integrator, model.plain_gain)
+            return Guarded(line, self.interaction, model.phase, *of_both)
         controller: Controller = self.model.controller(plant, line)
         return controller
 
 
 @cache
 def learnt(kind: str) -> Model:
-    return learn(kind, PLANT, telemetry(200, 0.3), {"told": COVARIANCES[None]}).model
+    return learn(kind, PLANT, telemetry(200, 0.3), {"told": COVARIANCES[None]}, CELLS).model
 
 
 def scaled(draw: Any, array: np.ndarray) -> np.ndarray:
@@ -75,7 +76,8 @@ def controls(draw: Any) -> Control:
         own = learnt(kind)
         arrays = {name: scaled(draw, array) for name, array in own.arrays.items()}
         gain, factor = (draw(st.sampled_from([usual] * 20 + [*EXTREMES])) for usual in (0.4, 1.0))
-        model = Model(kind, arrays, gain, factor, draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)])))
+        left = draw(st.sampled_from([(1.0, 2.0), (2.0, 1.0)]))
+        model = Model(kind, arrays, gain, factor, left, scaled(draw, own.phase))
     options = {
         "controller": kind,
         "gain": draw(st.sampled_from([0.4, 0.0, 2.0])),

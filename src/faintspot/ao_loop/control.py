@@ -166,7 +166,7 @@ def _learnt(
         "winds from anywhere": told.from_anywhere().lagged_px2(frame_s)[None],
     }
     plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
-    return learn(kind, plant, telemetry, theories, noise_scale)
+    return learn(kind, plant, telemetry, theories, optics.sensor.layout.cells, noise_scale)
 
 
 @lru_cache(maxsize=8)

@@ -71,13 +71,14 @@ def learn(
     layout, night = Layout.load(config), read_telemetry(store, images=False)
     prior = prior_std_px(Settings.load(config), layout)
     telemetry, rate_hz = telemetry_of_recording(night, control, prior)
-    learnt = learnt_by(kind, control.plant, telemetry, theories_of(layout, rate_hz, speeds, layers))
+    theories = theories_of(layout, rate_hz, speeds, layers)
+    learnt = learnt_by(kind, control.plant, telemetry, theories, layout.cells)
     path = derived(config, ".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)
     left = learnt.model.left
     click.echo(
         f"{len(telemetry)} frames at {rate_hz:.0f} a second: {kind} leaves {left[0] / left[1]:.2f} of the "
-        f"mean square that the integrator with gain {learnt.model.plain_gain:g} leaves"
+        f"phase variance that the integrator with gain {learnt.model.plain_gain:g} leaves"
     )
     click.echo(f"{learnt.model.description}; {path} and [control] of {config} written")

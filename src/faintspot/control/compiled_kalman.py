@@ -46,7 +46,9 @@ class CompiledKalman:
         To the mirror.
     interaction : (m, commands) array
     reconstruct : (commands, m) array
-        From slopes to what is compared, and what the integrator integrates.
+        From slopes to what the integrator integrates.
+    phase : (commands, m) array
+        From slopes to what is compared, see `residual_phase`.
     predictor : SlopePredictor
     clean : (commands, m) array
         The wavefront, as commands that cause it, from open-loop slopes without noise.
@@ -69,6 +71,7 @@ class CompiledKalman:
         line: CommandDelayLine,
         interaction: Floats,
         reconstruct: Floats,
+        phase: Floats,
         predictor: SlopePredictor,
         clean: Floats,
         plain_gain: float,
@@ -90,6 +93,7 @@ class CompiledKalman:
         self._matrices = Matrices(
             np.ascontiguousarray(interaction.T),
             np.ascontiguousarray(reconstruct.T),
+            np.ascontiguousarray(phase.T),
             np.ascontiguousarray(predictor.with_slopes.T),
             predictor.predicted_px2,
             np.linalg.inv(usual),

@@ -32,8 +32,8 @@ class Guarded:
     line : CommandDelayLine
         To the true mirror.
     interaction : (m, commands) array
-    reconstruct : (commands, m) array
-        From slopes to what is compared.
+    phase : (k, m) array
+        From slopes to what is compared, see `residual_phase`.
     learnt, plain : callable
         Return a controller, given where its commands go.
     prior_std_px : (m,) array, optional
@@ -50,7 +50,7 @@ class Guarded:
         self,
         line: CommandDelayLine,
         interaction: Floats,
-        reconstruct: Floats,
+        phase: Floats,
         learnt: Callable[[CommandDelayLine], Controller],
         plain: Callable[[CommandDelayLine], Controller],
         *,
@@ -58,7 +58,7 @@ class Guarded:
         noise_factor: float = 1.0,
         prefers_plain: bool = False,
     ) -> None:
-        self._line, self._interaction, self._reconstruct = line, interaction, reconstruct
+        self._line, self._interaction, self._phase = line, interaction, phase
         of_both = interaction.shape[1], line.delay_frames, line.largest
         self._lines = [CommandDelayLine(*of_both) for _ in range(2)]
         makers = (learnt, plain)
@@ -91,7 +91,7 @@ class Guarded:
         left = []
         for controller, line in zip(self.controllers, self._lines, strict=True):
             residual = open_loop + self._interaction @ line.acting
-            left.append(float(np.square(self._reconstruct @ (trust * residual)).sum()))
+            left.append(float(np.square(self._phase @ (trust * residual)).sum()))
             controller.update(as_estimated(residual, trust, controller), error)
         self._line.put(self._lines[self.chosen].latest)
         self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))

@@ -35,6 +35,8 @@ class Matrices(NamedTuple):
     """(commands, m)"""
     reconstruct: Any
     """(m, commands)"""
+    phase: Any
+    """(m, commands)"""
     covariance: Any
     """(m, states): of the state's error with the slopes' before a frame is measured."""
     uncertainty: Any
@@ -281,7 +283,7 @@ def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> 
         total = _integrate(matrices, memory, gain, keep, largest, lines.plain[of_plain])
     left = memory.commands[_LEFT : _LEFT + 2]
     left[:] = 0.0
-    add_products(matrices.reconstruct, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
+    add_products(matrices.phase, memory.slopes[_LEFT_LEARNT : _LEFT_PLAIN + 1], left)
     learnt, plain = 0.0, 0.0
     for c in range(left.shape[1]):
         learnt += left[0, c] * left[0, c]

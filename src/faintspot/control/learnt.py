@@ -45,7 +45,7 @@ _OF_KIND = {
 }
 _SQUARE = {"now_px2", "ahead_px2"}
 _OF_LAYERS = {"first", "second", "driving_px2"}
-_OF_ALL = ("plain_gain", "noise_factor", "left")
+_OF_ALL = ("plain_gain", "noise_factor", "left", "phase")
 _COVARIANCE = -1e8, 1e8  # px^2: of slopes of 1e4 px
 _RANGES = {
     "gains": (0.0, 2.0),
@@ -76,10 +76,9 @@ class Plant:
         """Return an integrator of this loop."""
         return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
 
-    def left(self, make: Make, telemetry: OpenLoopTelemetry) -> float:
-        """Return how much a controller would have left, see `replayed`."""
-        matrix = self.reconstructor.matrix
-        return replayed(make, telemetry, self.interaction, matrix, self.delay_frames, SETTLE_FRAMES)
+    def left(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
+        """Return the phase variance that a controller would have left, see `replayed`."""
+        return replayed(make, telemetry, self.interaction, phase, self.delay_frames, SETTLE_FRAMES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +94,10 @@ class Model:
     noise_factor: float
     """What to multiply the variances of standard errors by."""
     left: tuple[float, float]
-    """Mean square of what the learnt and the plain one leave in telemetry; of the Kalman filter in frames
+    """Phase variance that the learnt and the plain one leave in telemetry; of the Kalman filter in frames
     that it has not learnt from."""
+    phase: Floats
+    """(commands, m): what the two are compared by, see `residual_phase`."""
     description: str = ""
 
     def controller(self, plant: Plant, line: CommandDelayLine) -> Controller:
@@ -166,6 +167,7 @@ class Model:
             float(numbers["plain_gain"]),
             float(numbers["noise_factor"]),
             (float(learnt), float(plain)),
+            numbers["phase"],
         )
 
     def check(self, plant: Plant) -> None:
@@ -176,14 +178,16 @@ class Model:
         InputError
             One line.
         """
-        _checked({**self.arrays, "plain_gain": self.plain_gain, "noise_factor": self.noise_factor}, plant)
+        numbers = {name: getattr(self, name) for name in _OF_ALL}
+        _checked({**self.arrays, **numbers}, plant)
 
 
 def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
     """Return a model's numbers as float64, of the shapes that the loop needs and within `_RANGES`."""
     numbers = {name: numbers_between(name, value, *_RANGES.get(name, ())) for name, value in found.items()}
-    slopes, modes = len(plant.interaction), plant.reconstructor.modes.shape[1]
+    (slopes, commands), modes = plant.interaction.shape, plant.reconstructor.modes.shape[1]
     shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
+    shapes["phase"] = commands, slopes
     shapes |= dict.fromkeys(_SQUARE, (slopes, slopes))
     layers = len(numbers["first"]) if "first" in numbers and numbers["first"].ndim == 3 else 1
     shapes |= dict.fromkeys(_OF_LAYERS, (layers, slopes, slopes))
@@ -220,6 +224,7 @@ class Learnt:
                 line,
                 plant.interaction,
                 plant.reconstructor.matrix,
+                model.phase,
                 model.predictor(),
                 plant.reconstructor.clean,
                 model.plain_gain,
@@ -231,7 +236,7 @@ class Learnt:
         return Guarded(
             line,
             plant.interaction,
-            plant.reconstructor.matrix,
+            model.phase,
             partial(model.controller, plant),
             partial(plant.integrator, model.plain_gain),
             prior_std_px=prior_std_px,

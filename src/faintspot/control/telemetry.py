@@ -104,7 +104,7 @@ def replayed(
     make: Callable[[CommandDelayLine], Controller],
     telemetry: OpenLoopTelemetry,
     interaction: Floats,
-    reconstruct: Floats,
+    phase: Floats,
     delay_frames: int,
     settle_frames: int = 0,
 ) -> float:
@@ -119,8 +119,8 @@ def replayed(
         Returns the controller, given where its commands go.
     telemetry : Telemetry
     interaction : (m, commands) array
-    reconstruct : (commands, m) array
-        From slopes to what is scored.
+    phase : (k, m) array
+        From slopes to what is scored, see `residual_phase`.
     delay_frames, settle_frames : int
         Frames at the start that are not scored.
     """
@@ -134,7 +134,7 @@ def replayed(
             trust = telemetry.trust[frame]
             left[frame] = trust * residual
             controller.update(as_estimated(residual, trust, controller), error[frame])
-        seen = np.square(left[settle_frames:] @ reconstruct.T).mean()
+        seen = np.square(left[settle_frames:] @ phase.T).sum(axis=1).mean()
     share = np.square(telemetry.trust[settle_frames:]).mean()
     return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
 

@@ -33,8 +33,8 @@ LOOP_GAIN = "loop_gain"
 NOISE_SCALE = "noise_scale"
 _NOISE_SCALES = (0.35, 0.6, 1.0)
 _FIRST_NOISE_SCALES = (0.6,)
-_LOOP_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-_FIRST_LOOP_GAINS = (0.2, 0.4, 0.7)
+_LOOP_GAINS = (0.05, 0.07, 0.1, 0.13, 0.17, 0.22, 0.28, 0.35, 0.43, 0.52, 0.62, 0.73, 0.85)
+_FIRST_LOOP_GAINS = (0.17, 0.35, 0.62)
 # Of control that learns it is only the gain at which telemetry is taken, which takes long.
 _TELEMETRY_GAINS = (0.05, 0.1, 0.2, 0.3, 0.4)
 _FIRST_TELEMETRY_GAINS = (0.2,)

@@ -1,0 +1,54 @@
+"""Residual phase from slopes: the measure by which controllers are compared.
+
+Commands are no such measure: a unit of one combination of actuators moves the phase far more than that of
+another, and the combinations that move it least are the noisiest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from faintspot.control.reconstructor import Reconstructor
+
+Floats = NDArray[np.float64]
+
+_CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+_UNSEEN = 0.05  # of the largest singular value: piston and waffle, which slopes do not show
+_MASS = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6  # products of linear elements, integrated over a side
+
+
+def residual_phase(reconstructor: Reconstructor, interaction: Floats, cells: ArrayLike) -> Floats:
+    """Return the matrix (commands, 2 n) from slopes to amplitudes whose sum of squares is the phase variance.
+
+    The slopes' commands cause a wavefront that is bilinear between the corners of the sub-apertures (Fried
+    1977, JOSA 67, 370); its variance over all sub-apertures is in (px x side of a sub-aperture)^2.
+
+    Parameters
+    ----------
+    reconstructor : Reconstructor
+    interaction : (2 n, commands) array
+        Slopes for a unit of each command.
+    cells : (n, 2) array of int
+        Row and column of each sub-aperture in the lenslet array.
+    """
+    slopes, mass, mean = _corner_geometry(np.asarray(cells))
+    corners = np.linalg.pinv(slopes, rcond=_UNSEEN) @ interaction
+    corners -= mean @ corners
+    values, vectors = np.linalg.eigh(corners.T @ mass @ corners)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.asarray(root @ reconstructor.matrix)
+
+
+def _corner_geometry(cells: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
+    """Return slopes (2 n, corners) of the phase at corners, and matrix and weights of its square and mean."""
+    n = len(cells)
+    places = cells[:, None] + _CORNERS
+    corners, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
+    which = which.reshape(n, len(_CORNERS))
+    slopes, mass = np.zeros((2 * n, len(corners))), np.zeros((len(corners),) * 2)
+    for number, own in enumerate(which):
+        slopes[number, own] = _CORNERS[:, 1] - 0.5
+        slopes[n + number, own] = _CORNERS[:, 0] - 0.5
+        mass[np.ix_(own, own)] += np.kron(_MASS, _MASS) / n
+    return slopes, mass, mass.sum(axis=0)
