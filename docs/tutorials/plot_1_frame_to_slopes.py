@@ -44,9 +44,9 @@ figure.colorbar(shown, label="ADU", shrink=0.8)
 # %%
 # Measure
 # -------
-# What is known of the detector goes into a `Calibration`, what is wanted into `Settings`. Nobody gave a
-# dark, so the background of the frame itself stands for it, and says so (`rough_dark`). The strength of the
-# denoising is a noise level in electrons.
+# A `Calibration` describes the detector, `Settings` the estimator. There is no dark frame here, so the
+# background of the frame replaces it; `rough_dark` says that it is approximate. The strength of the denoising
+# is a noise level in electrons.
 
 dark = float(np.median(frame))
 calibration = fs.Calibration(dark=dark, rough_dark=True, bad_pixels=hot)

@@ -2,13 +2,13 @@
 Which settings for my camera and star?
 ======================================
 
-`faintspot tune` answers from a simulation of your spots: every estimator, tuned on other spots than those
-that score. The same from Python.
+`faintspot tune` simulates your spots and compares every estimator, tuned on other spots than those that
+score. This is the same from Python.
 """
 
 # %%
 # A sensor of 0.6 m lenslets with a camera of 3 electrons, at 500 frames a second; a star of magnitude 10;
-# seeing with r0 of 0.12 m. Numbers of your own go in the same places.
+# seeing with r0 of 0.12 m. Replace them by your own numbers.
 
 import numpy as np
 

@@ -9,7 +9,7 @@ without bias can pass (Cramer and Rao).
 
 # %%
 # Frames of 36 sub-apertures, 150 electrons a spot, 3 electrons of read noise. They are simulated, so that
-# the truth is known; the elongated spot is not told to anybody.
+# the truth is known; no estimator knows that the spot is elongated.
 
 import numpy as np
 from matplotlib.figure import Figure

@@ -2,14 +2,14 @@
 A loop in simulation: baseline, window, Kalman filter
 =====================================================
 
-What counts on the sky is the image. A simulated 4.2 m telescope closes its loop on one faint star four
-times: same air, same photons, other slopes and other control.
+The Strehl ratio decides on the sky. A simulated 4.2 m telescope closes its loop on one faint star four times:
+the same turbulence and photons, other slopes and other control.
 """
 
 # %%
 # Near the diffraction limit, 3 electrons of read noise, 20 photons a sub-aperture and frame: where
 # brightest pixels lose the star. Values come from `faintspot loop magnitude`, which tunes each on other
-# air.
+# realisations of the turbulence.
 
 from matplotlib.figure import Figure
 
