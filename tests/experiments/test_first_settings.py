@@ -40,23 +40,44 @@ def error(
     return float(np.abs(np.stack([slopes.x, slopes.y], axis=-1) - truth).mean())
 
 
-@pytest.mark.parametrize(("flux_e", "read_noise_e"), [(50, 0.1), (200, 3.0), (2000, 3.0), (40, 3.0)])
+@pytest.mark.parametrize(
+    ("flux_e", "read_noise_e"), [(50, 0.1), (200, 3.0), (2000, 3.0), (40, 3.0), (10, 3.0)]
+)
 def test_not_worse_than_a_fixed_window_or_the_reference(flux_e: float, read_noise_e: float) -> None:
+    """At most 5 % worse, which is three standard errors of 360 slopes that share their images."""
     side = 27
     shown, layout = frames(flux_e, read_noise_e, side, 1)
     found = first_settings(layout, fs.Calibration(dark=0.0), shown)
     assert found.noise == pytest.approx(read_noise_e, rel=0.15)
-    assert found.lost == (flux_e == 40)
+    assert (found.response < 1) == (flux_e <= 40)
     images, truth = simulated(flux_e, read_noise_e, side, 2)
-    window = fs.Settings("window", spot_fwhm_px=3.6, normalisation="frame")
+    window = fs.Settings("window", spot_fwhm_px=3.6, flux_e=flux_e)
     reached = error(found.settings, layout, images, truth)
     assert reached < 1.05 * error(window, layout, images, truth)
-    # Spots that are lost are not better known than by their reference, but not much worse.
-    assert reached < (1.5 if found.lost else 0.7) * float(np.abs(truth).mean())
+    assert reached < 1.05 * float(np.abs(truth).mean())
+
+
+@pytest.mark.parametrize("range_px", [0.0, 1.0, 3.0])
+def test_spots_that_move_more_get_a_larger_range(range_px: float) -> None:
+    images, _ = fs.simulate.subapertures(
+        20 * N,
+        shape=(20, 20),
+        flux_e=100.0,
+        size=1.5,
+        position_range_px=max(range_px, 0.01),
+        detector=fs.simulate.Detector(3.0),
+        rng=np.random.default_rng(3),
+    )
+    layout = fs.Layout.stacked(N, (20, 20))
+    found = first_settings(layout, fs.Calibration(dark=0.0), images.reshape(20, N * 20, 20))
+    reach = float(found.settings.search_range_px)
+    assert range_px < reach < 2 * range_px + 6.0
 
 
 def test_no_spots() -> None:
+    """The reference is the best answer."""
     noise = np.random.default_rng(1).normal(0.0, 3.0, (1, N * 16, 16))
-    found = first_settings(fs.Layout.stacked(N, (16, 16)), fs.Calibration(dark=0.0), noise)
-    assert found.lost
+    layout = fs.Layout.stacked(N, (16, 16))
+    found = first_settings(layout, fs.Calibration(dark=0.0), noise)
+    assert found.response < 0.2
     assert found.settings.search_range_px <= 4.0

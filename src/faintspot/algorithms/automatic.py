@@ -240,23 +240,6 @@ def automatic_kept_pixels(
     return _whole(kept, sensor)
 
 
-def is_lost(**sensor: Any) -> bool:
-    """Return whether a spot's core does not stand out of the noise of dark pixels after Gaussian smoothing.
-
-    Parameters and errors as `automatic_strength`, but plain numbers by name.
-    """
-    given = {
-        "elongation": 1.0,
-        "excess_noise": 1.0,
-        "background_e": 0.0,
-        "position_range_px": 1.0,
-        "profile": "diffraction",
-        **sensor,
-    }
-    lost, off = _lost_and_off(_sensor(**given), KEPT["smoothed"])
-    return bool(np.any(lost | off))
-
-
 class _Sensor(NamedTuple):
     """Flux, camera and window in electrons and pixels; each a number or an array."""
 

@@ -18,7 +18,7 @@ from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
-from faintspot.experiments.first_settings import FirstSettings, first_settings
+from faintspot.experiments.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import configuration
 from faintspot.pipeline.settings import Settings
@@ -29,6 +29,7 @@ from faintspot.sensor.layout import GEOMETRIES, Layout
 _MOST_FRAMES = 200  # averaged to find the spots
 _MOST_NAMED = 12  # sub-apertures in one line
 _FIRST_FRAMES = 20  # measured for the settings
+_FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
 # What the finder calls what these options give.
 _OPTIONS = {
     "pitch_px": "--pitch",
@@ -165,8 +166,9 @@ def command(
     which are lit.
 
     A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
-    Else the settings written beside the layout are a start: Gaussian smoothing and brightest pixels, chosen
-    by the noise, flux and spot width of the first 20 frames, which must be typical of the frames to come.
+    Else the settings written beside the layout are a start: a centre of gravity under a weight that follows
+    the spot, or under a fixed window where the flux is too low for that. They suit the noise, flux, spot
+    width and displacements of the first 20 frames, which must be typical of the frames to come.
     `faintspot tune` finds better ones.
 
     \b
@@ -207,7 +209,13 @@ def command(
         layout = replace(found.layout[kept], **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
+    unit = "ADU" if gain is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
+    if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
+        likely = float(f"{(calibration.read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
+        notes.append(f"  gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed")
+        calibration = replace(calibration, gain_e_per_adu=likely)
+        unit, seen = "e-", first_settings(layout, calibration, first)
     settings = configuration.load(target, "settings") if keeps_settings else seen.settings
     if keeps_settings:
         notes.append(f"  the settings that {output} has are kept")
@@ -220,7 +228,6 @@ def command(
     # The layout last: it may be long, and whatever is saved after it reads it again.
     for item in (settings, calibration, layout):
         configuration.save(target, item)
-    unit = "ADU" if gain is None and calibration.gain_e_per_adu == 1.0 else "e-"
     if isinstance(found, KnownGrid):
         lines = layout_grid.describe(output, found, layout, calibration)
     else:
@@ -257,10 +264,10 @@ def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, 
         f"  background noise {plain(seen.noise)} {unit}, flux of a spot {plain(seen.flux)} {unit}",
         f"  {estimator.name}: {estimator.in_words(len(layout), layout.pixels)}{within}",
     ]
-    if seen.lost:
+    if seen.response < 1:
         lines.append(
-            "  the spots of single frames are lost in the noise: expect slope errors as large as the slopes; "
-            "`faintspot tune --frames` says what is possible"
+            f"  the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
+            "displacements; `faintspot tune --frames` says what is possible"
         )
     return lines
 
