@@ -82,7 +82,9 @@ def first_settings(layout: Layout, calibration: Calibration, frames: NDArray[Any
     spots = _seen(images)
     if spots is None:
         side = _rounded(_WIDTH_OF_WINDOW * min(layout.window))
-        unseen = Settings("window", spot_fwhm_px=side, search_range_px=_LEAST_RANGE_PX)
+        unseen = Settings(
+            "window", spot_fwhm_px=side, centroid_gain=_LARGEST_GAIN, search_range_px=_LEAST_RANGE_PX
+        )
         return FirstSettings(unseen, noise, 0.0, 0.0)
     noise = max(noise, _LEAST_NOISE * spots.flux)
     settings, response = _Trial(images, layout, noise, spots).best()
