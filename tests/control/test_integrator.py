@@ -82,3 +82,11 @@ def test_equal_gains_of_all_modes_are_one_gain_on_what_is_driven() -> None:
         one.update(slopes, ERRORS)
         several.update(slopes, ERRORS)
     np.testing.assert_allclose(lines[0].latest, lines[1].latest, atol=1e-12)
+
+
+def test_each_mode_has_its_own_gain() -> None:
+    reconstructor, line = make_reconstructor(INTERACTION), CommandDelayLine(INTERACTION.shape[1], 2)
+    modes = reconstructor.modes
+    gains = np.linspace(0.1, 0.5, modes.shape[1])
+    Integrator(line, INTERACTION, reconstructor, gains, 0.0).follow(modes[:, 2])
+    np.testing.assert_allclose(line.latest, -gains[2] * modes[:, 2], atol=1e-12)

@@ -123,6 +123,9 @@ def test_theory_of_a_layout() -> None:
     assert by_side.shape == (3, 18, 18)
     assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0
     assert len(CELLS) == 9
+    # 500 nm, r0 of 0.15 m: the tilt without an outer scale (Noll), of which 25 m leave a part.
+    tilt_arcsec2 = 0.17 * np.rad2deg(500e-9 / 0.6) ** 2 * 3600**2 * (0.6 / 0.15) ** (5 / 3)
+    assert 0.3 < np.trace(by_side[0]) / 18 / tilt_arcsec2 < 1.0
     told = theories_of(layouts[0], 250.0, layers=[(12.6, 18.0, 0.6), (20.0, 104.0, 0.2)])["winds as told"]
     assert told.shape == (2, 3, 18, 18)
     assert np.trace(told[0, 0]) == pytest.approx(3 * np.trace(told[1, 0]))

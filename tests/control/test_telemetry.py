@@ -112,6 +112,17 @@ def test_what_has_learnt_leaves_less(kind: str) -> None:
     assert PLANT.left(learnt.controller, other, PHASE) < plain * (1.01 if kind == "modal" else 0.99)
 
 
+def test_gains_make_up_for_slopes_drawn_to_zero() -> None:
+    frames = telemetry(600, 0.5)
+    drawn = Telemetry(frames.open_loop_px, frames.variance_px2, np.full(frames.trust.shape, 0.8))
+    whole, larger = (
+        learn("modal", PLANT, each, {"told": RIGHT}).model.arrays["gains"] for each in (frames, drawn)
+    )
+    below = larger < larger.max()
+    assert below.any()
+    np.testing.assert_allclose(larger[below], whole[below] / 0.8)
+
+
 def test_the_best_gain_is_that_of_a_loop_run_through() -> None:
     rng = np.random.default_rng(4)
     walk = np.cumsum(rng.standard_normal((20_000, 2)), axis=0)

@@ -6,9 +6,11 @@ import contextlib
 import importlib
 import os
 import re
+import resource
 import shutil
 import tempfile
 import warnings
+import zipfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -78,6 +80,12 @@ def _read_frames(path: Path) -> None:
     read_array(path)
 
 
+def _read_slopes(path: Path) -> None:
+    slopes = read_slopes(path)
+    assert len({array.shape for array in slopes.variables.values()}) == 1
+    assert all(array.shape == slopes.variables["x"].shape[1:] for array in slopes.coordinates.values())
+
+
 def _read_configuration(path: Path) -> None:
     configuration.has(path, "settings")
     fs.SlopePipeline(**_parts(configuration.load_all(path)))
@@ -109,8 +117,8 @@ def _frame_readers() -> dict[str, Callable[[Path], Any]]:
 
 READERS: dict[str, Callable[[Path], Any]] = {
     **_frame_readers(),
-    **{f"slopes.{form}": read_slopes for form in ("zarr", "npz", "fits", "fits.gz", "csv")},
-    ".slopes.npz.partial": read_slopes,
+    **{f"slopes.{form}": _read_slopes for form in ("zarr", "npz", "fits", "fits.gz", "csv")},
+    ".slopes.npz.partial": _read_slopes,
     "reference.npz": read_reference,
     "telemetry.zarr": _read_telemetry,
     "aot.fits": _read_aot,
@@ -187,14 +195,18 @@ def _damage(rng: np.random.Generator, path: Path) -> None:
     if path.is_dir():
         inside = sorted(file for file in path.rglob("*") if file.is_file())
         described = [file for file in inside if file.suffix == ".json" or file.name.startswith(".z")]
+        if rng.random() < 0.2:
+            _replace(rng, inside[rng.integers(len(inside))])
+            return
         chosen = described if described and rng.random() < 0.6 else inside
         file = chosen[rng.integers(len(chosen))]
         if rng.random() < 0.1:
             file.unlink()
-        elif rng.random() < 0.2:
-            _replace(rng, file)
         else:
             file.write_bytes(_damaged(rng, file.read_bytes()))
+        return
+    if path.suffix == ".npz" and rng.random() < 0.3:
+        _lie(rng, path)
         return
     if path.suffix == ".npz" and rng.random() < 0.5:
         with np.load(path) as archive:
@@ -204,6 +216,23 @@ def _damage(rng: np.random.Generator, path: Path) -> None:
         np.savez_compressed(path, **arrays)
         return
     path.write_bytes(_damaged(rng, path.read_bytes()))
+
+
+def _lie(rng: np.random.Generator, path: Path) -> None:
+    """State more rows than there are in the headers of all arrays of the same length, or of one."""
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    chosen, factor = str(rng.choice(list(arrays))), int(rng.choice([2, 1 << 20, 1 << 25, 1 << 40]))
+    every, length = rng.random() < 0.7, arrays[chosen].shape[:1]
+    with zipfile.ZipFile(path, "w") as packed:
+        for name, array in arrays.items():
+            shape = array.shape
+            if shape and shape[:1] == length and (every or name == chosen):
+                shape = (shape[0] * factor, *shape[1:])
+            described = np.lib.format.header_data_from_array_1_0(array)
+            with packed.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array_header_1_0(member, {**described, "shape": shape})
+                member.write(np.ascontiguousarray(array).tobytes())
 
 
 def _replace(rng: np.random.Generator, path: Path) -> None:
@@ -222,8 +251,13 @@ def _replace(rng: np.random.Generator, path: Path) -> None:
 def _inflating(zstandard: bool) -> bytes:
     """Return 1.5 GiB of zeros, compressed by Zstandard or gzip."""
     numcodecs: Any = importlib.import_module("numcodecs")
-    zeros = np.zeros(3 << 29, np.uint8)
-    return bytes((numcodecs.Zstd() if zstandard else numcodecs.GZip()).encode(zeros))
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limits[1], limits[1]))
+    try:
+        zeros = np.zeros(3 << 29, np.uint8)
+        return bytes((numcodecs.Zstd() if zstandard else numcodecs.GZip()).encode(zeros))
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def _damaged(rng: np.random.Generator, content: bytes) -> bytes:

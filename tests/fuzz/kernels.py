@@ -1,6 +1,7 @@
 """Every kernel on hostile frames, with all that it reads and writes between guard pages.
 
-Slopes must be those of the same frames in ordinary memory, bit by bit, and finite.
+Slopes must be those of the same frames in ordinary memory, bit by bit, and finite; slopes of ordinary spots
+must be those of the oracle.
 """
 
 from __future__ import annotations
@@ -15,7 +16,16 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 from tests import estimator_cases
-from tests.estimator_cases import NEED_PSF, assert_same, assert_sane, one_psf, several_psfs, with_options
+from tests.estimator_cases import (
+    NEED_PSF,
+    assert_same,
+    assert_sane,
+    one_psf,
+    random_case,
+    several_psfs,
+    with_options,
+)
+from tests.estimator_oracle import assert_equals_oracle
 from tests.fuzz.guarded import guarded, guarded_tree
 from tests.fuzz.refused import refused_in_one_line
 
@@ -45,6 +55,8 @@ def combinations(widths: tuple[int, ...] = WIDTHS) -> list[tuple[str, int, str]]
 def run(seed: int, chosen: list[tuple[str, int, str]]) -> None:
     """Measure one random sensor, with one of these combinations in turn."""
     estimator, width, dtype = chosen[seed % len(chosen)]
+    case = random_case(seed, estimator, n=2)
+    assert_equals_oracle(case, case.measure(width=width))
     rng = np.random.default_rng(seed)
     at_end = bool(rng.random() < 0.5)
     pipeline = refused_in_one_line(lambda: _pipeline(rng, estimator, width))

@@ -1,21 +1,28 @@
-"""Public functions with any values, by Hypothesis: a result, or an InputError in one line."""
+"""Public functions and safety rules with any values: a result, or an InputError in one line."""
 
 from __future__ import annotations
 
+import ipaddress
+import socket
 import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+from urllib.parse import urlsplit
 
 import hypothesis
 import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
+from tests.estimators.test_python import BRIGHT, FAULTS, FRAME, pipeline, raising
 from tests.fuzz.refused import refused_in_one_line
+from tests.realtime.test_control_loop import any_control
 
 import faintspot as fs
 from faintspot.estimators import estimators
+from faintspot.io.frame_numbers import LARGEST_GAP, left_out
+from faintspot.live_page.access import Access
 from faintspot.pipeline.settings import option_names
 
 _EXAMPLES = 100
@@ -91,6 +98,37 @@ def any_frame(frame: Any, prior: Any, reference: Any) -> None:
     refused_in_one_line(lambda: fs.centre_of_gravity(frame))
 
 
+def any_plug_in(fault: BaseException, result: Any) -> None:
+    """What code of others raises or returns is refused; in the frame path it flags the frame."""
+    for action in (raising(fault), lambda images, sensor: result):
+        refused_in_one_line(lambda: pipeline(action, always=True))  # noqa: B023  (called at once)
+        slopes = pipeline(action)(FRAME * BRIGHT)
+        assert np.isfinite(slopes.vector).all()
+
+
+def any_headers(host: str, origin: str) -> None:
+    """Only this machine's names, and the page's own origin, are let in."""
+    access = Access("127.0.0.1")
+    if access.permits_host(host):
+        name = urlsplit(f"http://{host}").hostname or ""
+        if name not in ("localhost", socket.gethostname().lower()):
+            ipaddress.ip_address(name)
+        if access.permits_origin({"Host": host, "Origin": origin}):
+            assert urlsplit(origin).netloc == host
+
+
+def any_frame_numbers(before: int, after: int) -> None:
+    """A jump is a plausible number of lost frames, or a restart."""
+    lost = left_out(before, after)
+    assert lost == -1 or (0 <= lost <= LARGEST_GAP and after == before + 1 + lost)
+
+
+HOSTS = st.builds(
+    str.__add__,
+    st.sampled_from(["127.0.0.1", "127.0.0.1:8642", "[::1]", "localhost", "localhost:8642", ""]),
+    st.sampled_from(["", "evil.com", ".evil.com", "@evil.com", "/x", ":99999"]) | st.text(max_size=5),
+)
+FRAME_NUMBERS = st.integers(0, 2**63 - 1) | st.integers(0, 9) | st.integers(LARGEST_GAP - 5, LARGEST_GAP + 5)
 _PSF = fs.PSF.analytic("gaussian", radius_px=5)
 _PIPELINE = fs.SlopePipeline(SOUND, fs.Settings("brightest", keep_brightest=5))
 CHECKS: tuple[tuple[Callable[..., None], tuple[Any, ...]], ...] = (
@@ -164,6 +202,10 @@ CHECKS: tuple[tuple[Callable[..., None], tuple[Any, ...]], ...] = (
             ANYTHING,
         ),
     ),
+    (any_control, (st.data(),)),
+    (any_plug_in, (st.sampled_from(FAULTS), ANYTHING)),
+    (any_headers, (HOSTS, st.builds("http://{}".format, HOSTS))),
+    (any_frame_numbers, (FRAME_NUMBERS, FRAME_NUMBERS)),
 )
 
 

@@ -111,6 +111,15 @@ class TestFits:
             with open_frames([location]) as source:
                 np.testing.assert_array_equal(source.block(0, 11), expected)
 
+    def test_blank_of_numbers_that_are_not_whole_means_nothing(self, tmp_path: Path) -> None:
+        header = fits.Header([("BLANK", 3)])
+        frames = cube().astype(np.float32)
+        frames[1, 2, 3] = 3.0
+        fits.HDUList([fits.PrimaryHDU(frames, header)]).writeto(tmp_path / "a.fits", output_verify="ignore")
+        content = (tmp_path / "a.fits").read_bytes()
+        assert b"BLANK " in content
+        np.testing.assert_array_equal(read_array(tmp_path / "a.fits"), frames)
+
     def test_blank_becomes_nan(self, tmp_path: Path) -> None:
         header = fits.Header([("BLANK", -7), ("BSCALE", 2.0), ("BZERO", 1.0)])
         stored = np.array([[[1, -7], [3, 4]]], np.int16)

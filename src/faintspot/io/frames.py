@@ -185,6 +185,7 @@ def read_array(location: str | Path) -> NDArray[Any]:
     if 0 in array.shape:
         raise InputError(f"{array.name}: expected at least one value, got shape {array.shape}")
     check_bytes(array.name, math.prod(array.shape) * array.dtype.itemsize, MOST_WHOLE_BYTES, "an array")
+    check_size(array.name, array.shape)
     try:
         return array.read(0, array.shape[0])
     finally:
