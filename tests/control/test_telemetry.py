@@ -114,9 +114,9 @@ def test_what_has_learnt_leaves_less(kind: str) -> None:
 
 def test_gains_make_up_for_slopes_drawn_to_zero() -> None:
     frames = telemetry(600, 0.5)
-    drawn = Telemetry(frames.open_loop_px, frames.variance_px2, np.full(frames.trust.shape, 0.8))
+    drawn = OpenLoopTelemetry(frames.open_loop_px, frames.variance_px2, np.full(frames.trust.shape, 0.8))
     whole, larger = (
-        learn("modal", PLANT, each, {"told": RIGHT}).model.arrays["gains"] for each in (frames, drawn)
+        learn("modal", PLANT, each, {"told": RIGHT}, CELLS).model.arrays["gains"] for each in (frames, drawn)
     )
     below = larger < larger.max()
     assert below.any()

@@ -348,3 +348,11 @@ def test_zip_with_other_files_in_it(tmp_path: Path) -> None:
         archive.writestr("notes.txt", "hello")
     with open_frames([path]) as source:
         assert source.n_frames == 11
+
+
+def test_more_pixels_than_a_frame_may_have(tmp_path: Path) -> None:
+    """Of one byte each they are less memory than is allowed; what is made of them is more."""
+    np.lib.format.open_memmap(tmp_path / "map.npy", "w+", np.uint8, (1 << 14, 1 << 15))  # no disk is used
+    with pytest.raises(InputError) as error:
+        read_array(tmp_path / "map.npy")
+    assert "16384 x 32768" in str(error.value)
