@@ -43,6 +43,8 @@ def test_round_trip_beside_what_else_there_is(tmp_path: Path) -> None:
 def test_reference_as_positions() -> None:
     positions = np.arange(18.0).reshape(9, 2)
     np.testing.assert_array_equal(Control(INTERACTION, positions).reference, positions.T.reshape(-1))
+    with pytest.raises(InputError):
+        Control(INTERACTION, positions.T)
 
 
 BAD = INTERACTION.copy()

@@ -36,7 +36,8 @@ def test_equal_errors_weigh_as_none() -> None:
 def test_slopes_without_a_standard_error_do_not_count() -> None:
     reconstructor, slopes = make_reconstructor(_matrix()), np.random.default_rng(5).standard_normal(40)
     errors = np.where(np.arange(40) % 4 == 0, np.inf, 0.2)
-    wrong = np.where(np.isinf(errors), 1e6, slopes)
+    errors[4] = 0.0  # no standard error either
+    wrong = np.where(np.isinf(errors) | (errors == 0), 1e6, slopes)
     np.testing.assert_allclose(
         reconstructor.weighted(wrong, errors), reconstructor.weighted(slopes, errors), atol=1e-9
     )
