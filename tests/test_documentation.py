@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -133,6 +135,15 @@ def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
         compiled = compile(code, f"{page.name}, block {number}", "exec")  # also what is not run is Python
         if not any(mark in code for mark in NOT_RUN):
             exec(compiled, names)
+
+
+def test_names_are_there_after_the_import() -> None:
+    """Blocks share a process with others that import more than they do."""
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    names = sorted(set(re.findall(r"\bfs\.([A-Za-z]\w*)", text)))
+    code = "import faintspot, sys; print([name for name in sys.argv[1:] if not hasattr(faintspot, name)])"
+    done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
