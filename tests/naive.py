@@ -263,8 +263,6 @@ def slopes(
             flags |= Flag.SATURATED
         if bad > value["max_bad_fraction"] * ny * nx:
             flags |= Flag.TOO_MANY_BAD_PIXELS
-        elif bad:
-            flags |= Flag.BAD_PIXELS
         denoised = _denoised(fill_bad_pixels(image), settings, s, n)
         if denoised.infeasible:
             flags |= Flag.INFEASIBLE_STRENGTH
@@ -275,6 +273,34 @@ def slopes(
             results[-1].x -= float(np.asarray(reference)[s, 0])
             results[-1].y -= float(np.asarray(reference)[s, 1])
     return results
+
+
+def doubtful(
+    measured: fs.Slopes, layout: fs.Layout, fwhm: ArrayLike, reference: ArrayLike | float = 0.0
+) -> NDArray[np.int64]:
+    """Flags of the spots of one frame that their window cuts, or that are unlike all their neighbours.
+
+    fwhm and reference are (n, 2).
+    """
+    n, half = len(layout), np.array(layout.window[::-1]) / 2
+    slopes = np.column_stack([measured.x, measured.y]).astype(np.float64)
+    places = slopes + layout.offsets + np.asarray(reference, np.float64)
+    least = np.full(n, np.nan)
+    for s in range(n):
+        away = np.hypot(*(layout.centres - layout.centres[s]).T)
+        near = (away > 0) & (away < 1.6 * (layout.pitch_px or 0.0)) & measured.valid
+        if measured.valid[s] and near.sum() >= 2:
+            least[s] = np.hypot(*(slopes[near] - slopes[s]).T).min()
+    several = np.sort(least[~np.isnan(least)])
+    usual = float(several[(len(several) - 1) // 2]) if several.size else 0.0
+    flags = np.zeros(n, np.int64)
+    for s in np.flatnonzero(measured.valid).tolist():
+        whole = half - np.broadcast_to(fwhm, (n, 2))[s] / 2
+        if np.any((np.abs(places[s]) > whole) & (whole > half / 2)):
+            flags[s] |= int(Flag.AT_SEARCH_LIMIT)
+        if least[s] > max(0.1 * (layout.pitch_px or 0.0), 5 * usual):
+            flags[s] |= int(Flag.UNLIKE_NEIGHBOURS)
+    return flags
 
 
 def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:

@@ -221,6 +221,7 @@ def test_frames_of_a_stream() -> None:
 def test_recorded_frames_give_the_slopes_that_they_give_offline(bench: Bench, tmp_path: Path) -> None:
     """Replayed row by row, much faster than it measures: every frame, as the pipeline measures it."""
     data = simulated(20)
+    data[5:10, 8:16, 8:16] = np.roll(data[5:10, 8:16, 8:16], 3, axis=2)  # a spot off its place
     np.save(tmp_path / "frames.npy", data)
     with (
         open_frames([tmp_path / "frames.npy"]) as source,
@@ -230,6 +231,7 @@ def test_recorded_frames_give_the_slopes_that_they_give_offline(bench: Bench, tm
         assert (player.run().frames, player.lost) == (20, 0)
     bench.detached()
     expected, records = make(SETTINGS)(data), bench.records
+    assert expected.flags[5, 5] & fs.SubapertureFlag.UNLIKE_NEIGHBOURS
     assert records["frame"].tolist() == list(range(20))
     for record in records:
         for name in ("x", "y", "flux", "flags", "iterations", "standard_error_x"):

@@ -111,8 +111,7 @@ def test_dark_flat_gain_and_bad_pixels(fwhm_px: float) -> None:
         fs.Layout.grid((20, 1), pixels=16), window(fwhm_px), fs.Calibration(read_noise_e=2.0)
     )(filled.reshape(-1, 16))
     np.testing.assert_allclose(found.vector, clean.vector, atol=2e-4)  # float32 sums of 1000 ADU
-    flagged = (found.flags & fs.SubapertureFlag.BAD_PIXELS) != 0
-    assert np.flatnonzero(flagged).tolist() == ([0] if fwhm_px < 2 else [0, 6])
+    assert np.flatnonzero(found.bad_pixels).tolist() == ([0] if fwhm_px < 2 else [0, 6])
 
 
 def test_saturated_pixels_that_count() -> None:

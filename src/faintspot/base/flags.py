@@ -14,8 +14,10 @@ class SubapertureFlag(IntFlag):
     """More bad pixels than the settings allow; the slope is that of the reference (0).
 
     No further reason is given then."""
-    BAD_PIXELS = 4
-    """Some pixels were bad (masked, NaN or infinite) and were filled from their neighbours."""
+    UNLIKE_NEIGHBOURS = 4
+    """The slope is far from those of all neighbours, as that of a wrong spot; other slopes are not.
+
+    Not where the layout has no pitch."""
     SATURATED = 8
     """At least one pixel reached the saturation level."""
     INFEASIBLE_STRENGTH = 16
@@ -26,7 +28,9 @@ class SubapertureFlag(IntFlag):
     OUTLIER_LIKELY = 64
     """The spot is so faint that more than about 1 % of such slopes are those of noise, not of the spot."""
     AT_SEARCH_LIMIT = 128
-    """The slope ends at `search_range_px`, along x or y: the spot may be beyond."""
+    """The slope ends at `search_range_px`, along x or y, or the window's edge cuts the spot.
+
+    The spot may be beyond."""
 
 
 INVALID = SubapertureFlag.NO_FLUX | SubapertureFlag.TOO_MANY_BAD_PIXELS

@@ -152,12 +152,12 @@ def describe(summary: Summary, output: str) -> list[str]:
     texts = {
         SubapertureFlag.NO_FLUX: "without flux",
         SubapertureFlag.TOO_MANY_BAD_PIXELS: "with too many bad pixels",
-        SubapertureFlag.BAD_PIXELS: "with a few bad pixels, filled from their neighbours",
+        SubapertureFlag.UNLIKE_NEIGHBOURS: "unlike those of all neighbours (probably a wrong spot)",
         SubapertureFlag.SATURATED: "with saturated pixels",
         SubapertureFlag.INFEASIBLE_STRENGTH: "whose noise_std was too strong for the image and was lowered",
         SubapertureFlag.NOT_CONVERGED: "not converged (raise max_iterations or steps)",
         SubapertureFlag.OUTLIER_LIKELY: "so faint that outliers are to be expected",
-        SubapertureFlag.AT_SEARCH_LIMIT: "at the limit of the search range (search_range_px)",
+        SubapertureFlag.AT_SEARCH_LIMIT: "at the limit of search_range_px, or of a spot that its window cuts",
     }
     for flag, text in texts.items():
         count = summary.flag_counts.get(flag, 0)

@@ -239,12 +239,12 @@ class _Pokes:
             )
 
     def refuse_saturated(self) -> None:
-        """Raise InputError where pokes moved spots to the end of their search range."""
+        """Raise InputError where pokes moved spots to the end of their search range or window."""
         total, _, at_limit = self._counts
         if at_limit > _MOST_AT_LIMIT * total:
             raise InputError(
                 f"amplitude = {self.amplitude:g}: pokes move {100 * at_limit / total:.0f} % of the spots to "
-                "the end of their search range; choose a smaller one"
+                "the end of their search range or the edge of their window; choose a smaller one"
             )
 
     def refuse_unsettled(self) -> None:

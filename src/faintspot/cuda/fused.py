@@ -41,7 +41,6 @@ from faintspot.kernels.gravity import (
 )
 from faintspot.kernels.groups import (
     AT_SEARCH_LIMIT,
-    BAD_PIXELS,
     ERROR_SCALE,
     EXCESS,
     LIMIT_ROUNDING_PX,
@@ -76,8 +75,6 @@ def judge(bad: Any, saturated: Any, most_bad: Any, converged: Any, infeasible: A
     bits = int32(SATURATED) if saturated > float32(0.0) else int32(0)
     if bad > most_bad:
         return bits | int32(TOO_MANY_BAD_PIXELS)  # which says it all
-    if bad > float32(0.0):
-        bits |= int32(BAD_PIXELS)
     if infeasible:
         bits |= int32(INFEASIBLE_STRENGTH)
     if not converged:

@@ -23,7 +23,6 @@ from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 NO_FLUX = int(SubapertureFlag.NO_FLUX)
 TOO_MANY_BAD_PIXELS = int(SubapertureFlag.TOO_MANY_BAD_PIXELS)
-BAD_PIXELS = int(SubapertureFlag.BAD_PIXELS)
 SATURATED = int(SubapertureFlag.SATURATED)
 AT_SEARCH_LIMIT = int(SubapertureFlag.AT_SEARCH_LIMIT)
 
@@ -168,7 +167,7 @@ def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) 
         scratch.flags[lane] = SATURATED if scratch.results[width + lane] > 0.0 else 0
         if bad > 0:
             fill_bad_pixels(width, lane, ny, nx, scratch.image, scratch.spare)
-            scratch.flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else BAD_PIXELS
+            scratch.flags[lane] |= TOO_MANY_BAD_PIXELS if bad > settings[MOST_BAD, s] else 0
 
 
 @compiled

@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike
 
 from faintspot.base.errors import InputError
 from faintspot.cuda.availability import simulated
+from faintspot.kernels.groups import SlopeArrays
 from faintspot.pipeline.device import DevicePipeline, Results
 from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.pipeline.slopes import Slopes
@@ -69,6 +70,8 @@ class FrameStream:
         self._results = self._work.new_results(1)
         self._memory: Any = cuda.pinned_array(Results.size_of(1, n), np.uint8)
         measured = Results.within(self._memory, 1, n).slopes()
+        self._arrays = SlopeArrays(*(getattr(measured, field.name) for field in fields(measured)))
+        self._flag_doubtful = pipeline.flag_doubtful
         self._slopes = Slopes(*(getattr(measured, field.name)[0] for field in fields(measured)))
         self._start_steps()  # compiles, loads and brings the tables over
         self.stream.synchronize()
@@ -92,6 +95,7 @@ class FrameStream:
         They are views of memory that the next `submit` overwrites.
         """
         self.stream.synchronize()
+        self._flag_doubtful(self._arrays)
         return self._slopes
 
     def _start_steps(self) -> None:

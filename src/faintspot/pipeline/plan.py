@@ -10,17 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.camera.calibration import Calibration
+from faintspot.config.options import is_auto
 from faintspot.estimators.base import Estimator, EstimatorPlan
 from faintspot.estimators.python import PythonPlan
 from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import groups
 from faintspot.kernels.compiling import Direct
+from faintspot.kernels.doubtful import Expected
 from faintspot.kernels.groups import Task
 from faintspot.pipeline.settings import Settings, spot_fwhm_px
 from faintspot.sensor.layout import Layout
+from faintspot.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
 
+_FWHM_OF_KEPT = 0.58  # px, times the root of a good number of kept pixels: 12 of a spot of FWHM 2 px
 _MOST_FLUX_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
 
 Floats = NDArray[np.float64]
@@ -86,6 +90,8 @@ class Plan:
         self.estimator.check(self.sensor)
         own = self.estimator.prepared(self.sensor)
         self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if own is None else own
+        self.expected = self._expected(settings)
+        """Where spots may be: those elsewhere are flagged."""
         self.no_prior = np.zeros((1, 2, n), np.float32)
         """The prior of slopes that nobody has predicted: 0."""
         self._fixed = self._fixed_table(each)
@@ -165,6 +171,24 @@ class Plan:
         table = self._fixed.copy()
         self.prepared.fill_flux(table, flux_e)
         self._levels.append(table)
+
+    def _expected(self, settings: Settings) -> Expected:
+        """Return where spots may be; they are whole where half their width is inside the window."""
+        sensor, layout = self.sensor, self.sensor.layout
+        fwhm = np.ones((sensor.n, 2))
+        if "keep_brightest" in settings.declared() and not is_auto(settings.keep_brightest):
+            kept = settings.values("keep_brightest", sensor.n, sensor.pixels).astype(np.float64)
+            fwhm *= _FWHM_OF_KEPT * np.sqrt(kept)[:, None]
+        fwhm = np.where(np.isnan(sensor.spot_fwhm_px), fwhm, sensor.spot_fwhm_px)
+        half = 0.5 * np.array(sensor.window[::-1])
+        edge = np.where(fwhm < half, half - 0.5 * fwhm, np.inf)
+        pitch = layout.pitch_px
+        return Expected(
+            np.ascontiguousarray(sensor.zero.T, np.float32),
+            np.ascontiguousarray(edge.T, np.float32),
+            neighbours_of(layout.cells, layout.geometry, diagonal=True),
+            np.float32(np.inf if pitch is None else LEAST_DIFFERENCE * pitch),
+        )
 
     def _fixed_table(self, each: Any) -> NDArray[np.float32]:
         """The settings that do not depend on the flux."""

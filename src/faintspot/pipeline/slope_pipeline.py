@@ -17,6 +17,7 @@ from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator
 from faintspot.estimators.python import PythonPlan
+from faintspot.kernels.doubtful import flag_doubtful
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.kernels.host import lanes_for
 from faintspot.kernels.parallel import run_groups
@@ -302,6 +303,7 @@ class SlopePipeline:
         variants = self._variants(source)
         if self.on_device is not None and not explain:
             measured = self.on_device.measure_from_host(frames, dtype, variants)
+            self.flag_doubtful(SlopeArrays(*measured))
             return Slopes(*(result.reshape(*array.shape[:-2], n) for result in measured)), stages
         predicted = None if prior is None else _prior_slopes(prior, n_frames, self.layout)
         task = self.plan.task(variants, predicted)
@@ -319,7 +321,16 @@ class SlopePipeline:
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]
                 prepared.locate_frame(images[f], predicted_f, task.settings[0], f, results)
+        self.flag_doubtful(results)
         return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
+
+    def flag_doubtful(self, results: SlopeArrays) -> None:
+        """Add the flags of spots that their window's edge cuts, or that are unlike all their neighbours.
+
+        They follow from the slopes of whole frames, and are no reason to wait with the slopes.
+        """
+        scratch = np.empty(len(self.layout), np.float32)
+        flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
         """Return what kernels read of frames.

@@ -365,6 +365,7 @@ class Engine:
             state = STATES.index(CLOSED if was_closed else OPEN)
             loop.look_after()
         self.latencies.add(latency)
+        path.flag_doubtful()
         change = self.live.change_number
         self._streams.publish_marks((number, arm, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)

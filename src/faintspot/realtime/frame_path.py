@@ -181,6 +181,7 @@ class FramePath:
             wait_for_rows(cells, progress.frame_cell, progress.rows_cell, 0, 1, self._control, STOP_CELL)
         for share in range(self._shares):
             self._work(share, (0, 0), there, self._explaining)
+        self.flag_doubtful()
 
     def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
         """Measure a frame, waiting for its rows; return whether it was measured to its end.
@@ -205,6 +206,10 @@ class FramePath:
         self._workers.post(lambda share: self._work(share, frame, self._progress, after))
         whole = self._work(0, frame, self._progress, after)
         return self._workers.wait() and whole
+
+    def flag_doubtful(self) -> None:
+        """Add to the flags of the frame measured last what needs all its slopes; see `SlopePipeline`."""
+        self.pipeline.flag_doubtful(self._results)
 
     def await_start(self, number: int) -> None:
         """Wait for the first row of a frame, or until `stop` is called."""

@@ -12,12 +12,12 @@ from faintspot.recorded.statistics import MeasuredSlopes, SlopesSummary
 FLAG_MEANINGS = {
     SubapertureFlag.NO_FLUX: "Nothing usable was left of the flux: invalid, slope 0.",
     SubapertureFlag.TOO_MANY_BAD_PIXELS: "More bad pixels than the settings allow: invalid, slope 0.",
-    SubapertureFlag.BAD_PIXELS: "Some pixels were bad and were filled from their neighbours.",
+    SubapertureFlag.UNLIKE_NEIGHBOURS: "The slope is unlike those of all neighbours: probably a wrong spot.",
     SubapertureFlag.SATURATED: "At least one pixel reached the saturation level.",
     SubapertureFlag.INFEASIBLE_STRENGTH: "noise_std was above 0.9 of the image's rms, and was lowered.",
     SubapertureFlag.NOT_CONVERGED: "The limit of iterations or steps came before the result had settled.",
     SubapertureFlag.OUTLIER_LIKELY: "So faint that more than about 1 % of such slopes are those of noise.",
-    SubapertureFlag.AT_SEARCH_LIMIT: "The slope ends at search_range_px: the spot may be beyond.",
+    SubapertureFlag.AT_SEARCH_LIMIT: "The slope ends at search_range_px, or the window cuts the spot.",
 }
 FLAGS_OF_DENOISING = (SubapertureFlag.INFEASIBLE_STRENGTH, SubapertureFlag.NOT_CONVERGED)
 _MOST_LISTED = 20
@@ -46,8 +46,13 @@ _ADVICE = {
     ),
     SubapertureFlag.AT_SEARCH_LIMIT: (
         0.01,
-        "ended at the limit of the search range, which the spots may have left",
-        "raise search_range_px; where there is too low flux, it is noise that ends there",
+        "ended at the limit of the search range, or their spots are cut by the window's edge",
+        "raise search_range_px, or check that the windows lie on the spots; at low flux noise ends there",
+    ),
+    SubapertureFlag.UNLIKE_NEIGHBOURS: (
+        0.001,
+        "were displaced unlike all their neighbours, as a wrong spot is",
+        "check their windows (faintspot layout draws them), or leave these sub-apertures out",
     ),
 }
 

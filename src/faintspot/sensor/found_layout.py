@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from faintspot.kernels.doubtful import Expected, flag_doubtful
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.lenslets import LensletGrid
+from faintspot.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
 from faintspot.sensor.windows import Windows, find_windows
-
-# A spot is unlike its neighbours when its displacement differs from each of theirs by so many pitches, and by
-# so many times the median of that difference.
-_UNLIKE, _TYPICAL = 0.2, 4.0
 
 
 @dataclass(frozen=True)
@@ -93,14 +91,15 @@ def _outside(found: Windows) -> NDArray[np.float64]:
 
 def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
     """Return which spots are displaced unlike those of all their neighbours (two at least)."""
-    shifts = grid.spots - grid.centres - grid.drifts
-    near, neighbour = cKDTree(grid.centres).query(
-        grid.centres, min(9, len(shifts)), distance_upper_bound=1.6 * grid.pitch_px
+    x, y = np.asarray(grid.spots - grid.centres - grid.drifts, np.float32).T
+    n = len(x)
+    flags = np.zeros((1, n), np.uint8)
+    expected = Expected(
+        np.zeros((2, n), np.float32),
+        np.full((2, n), np.inf, np.float32),
+        neighbours_of(grid.cells, grid.geometry, diagonal=True),
+        np.float32(LEAST_DIFFERENCE * grid.pitch_px),
     )
-    known = np.isfinite(near)
-    known[:, 0] = False
-    differences = np.linalg.norm(shifts[np.where(known, neighbour, 0)] - shifts[:, None], axis=-1)
-    least = np.where(known, differences, np.inf).min(axis=1)
-    several = known.sum(axis=1) >= 2
-    usual = float(np.median(least[several])) if several.any() else 0.0
-    return np.asarray(several & (least > max(_UNLIKE * grid.pitch_px, _TYPICAL * usual)))
+    x, y = np.ascontiguousarray(x[None]), np.ascontiguousarray(y[None])
+    flag_doubtful(x, y, flags, expected, np.empty(n, np.float32))
+    return np.asarray(flags[0] != 0)

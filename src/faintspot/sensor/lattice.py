@@ -22,6 +22,8 @@ import scipy.ndimage
 import scipy.optimize
 from numpy.typing import NDArray
 
+from faintspot.sensor.neighbours import neighbours_of
+
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
 # The lines of a hexagonal lattice are sqrt(3) / 2 of its pitch apart and its steps lie 30 degrees off.
 _STEPS = {"square": 1 + 0j, "hexagonal": complex(2 / np.sqrt(3) * np.exp(1j * np.pi / 6))}
@@ -126,13 +128,7 @@ class Lattice:
 
     def neighbours(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the (n, 4 or 6) indices of the neighbours of every cell, n where there is none."""
-        steps = [(0, 1), (0, -1), (1, 0), (-1, 0)]
-        if self.geometry == "hexagonal":
-            steps += [(1, -1), (-1, 1)]
-        shifted = cells - cells.min(axis=0) + 1
-        index = np.full(shifted.max(axis=0) + 2, len(cells), dtype=np.int64)
-        index[shifted[:, 0], shifted[:, 1]] = np.arange(len(cells))
-        return np.column_stack([index[shifted[:, 0] + row, shifted[:, 1] + column] for row, column in steps])
+        return neighbours_of(cells, self.geometry)
 
     def distance_px(self, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return how far from the node of its cell every pixel of these rows and columns lies: (y, x)."""
