@@ -19,6 +19,7 @@ UNCHECKED = (
 )
 _HELPS_ABOVE_MAG = 0.02
 _LOW_GAIN = 0.9
+_PLACED = 1.03  # R at the recording's places over that of even spots, from which it is named
 _SMALLEST_ERROR_MAG = 0.01  # that is shown
 
 
@@ -84,6 +85,11 @@ def promise_lines(answer: Answer) -> list[str]:
     )
     if math.isfinite(promise.frame_to_frame.value):
         text += f"; from frame to frame, movement included, {_with_error(promise.frame_to_frame)} px"
+    if not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px:
+        text += (
+            f"; expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px: these spots are "
+            "nearer the middle of the search range, which limits their errors less"
+        )
     lines = [text]
     simulated = min(answer.results, key=lambda result: _rms(result.statistics.corrected_rms.value))
     if answer.promises[simulated.arm.name].factor > 1 and simulated is not answer.best:
