@@ -48,9 +48,10 @@ def test_never_below_the_integrator(assumed: float, kinds: list[str]) -> None:
 
     Three runs of 250 scored frames: differences are paired, and 0.015 is three of their standard errors.
     """
-    configuration = FAINT.replace(
-        "control", assumed_wind_factor=assumed, assumed_wind_turn_deg=90.0 * (assumed != 1)
-    )
+    configuration = FAINT
+    if assumed != 1:
+        wrong = {"assumed_wind_factor": assumed, "assumed_wind_turn_deg": 90.0}
+        configuration = FAINT.replace("control", winds="assumed", **wrong)
 
     def strehl(arm: Arm) -> float:
         return float(
@@ -115,6 +116,8 @@ def test_names_of_arms_say_their_control() -> None:
         arm_kind("map+lqg")
 
 
-def test_the_winds_that_are_told_are_of_the_configuration() -> None:
-    told = LoopConfiguration.from_text(FAINT.replace("control", assumed_wind_factor=1.5).to_text())
-    assert told.control.assumed_wind_factor == 1.5
+def test_assumed_winds_are_of_the_configuration() -> None:
+    changed = FAINT.replace("control", winds="assumed", assumed_wind_factor=1.5)
+    assert LoopConfiguration.from_text(changed.to_text()).control == changed.control
+    with pytest.raises(InputError, match=r"control\.winds"):
+        FAINT.replace("control", winds="guessed")

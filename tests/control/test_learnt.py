@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.control.control_cases import CELLS, COVARIANCES, INTERACTION, PLANT, telemetry
+from tests.control.control_cases import COVARIANCES, FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
 
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
@@ -23,7 +23,7 @@ FRAMES = telemetry(600, 0.3)
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[str, Learnt]:
-    return {kind: learn(kind, PLANT, FRAMES, {"told": COVARIANCES[None]}, CELLS) for kind in KINDS}
+    return {kind: learn(kind, PLANT, FRAMES, TURBULENCE, 1 / FRAME_S) for kind in KINDS}
 
 
 def commands(controller: Any, line: CommandDelayLine, frames: int = 60) -> np.ndarray:
@@ -103,7 +103,8 @@ def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
     np.savez(path, **{**arrays, "first": arrays["first"][0]})
     refused("first: expected shape (1, 18, 18), got (18, 18)", kalman)
     np.savez(path, **{**arrays, "first": np.tile(arrays["first"], (2, 1, 1))})
-    refused("second: expected shape (2, 18, 18), got (1, 18, 18)", kalman)
+    layers = len(arrays["first"])
+    refused(f"second: expected shape ({2 * layers}, 18, 18), got ({layers}, 18, 18)", kalman)
     np.savez(path, **{**arrays, "variance_px2": np.full(18, np.nan)})
     refused("variance_px2: expected finite numbers", kalman)
     np.savez(path, **{**arrays, "kind": "pid"})

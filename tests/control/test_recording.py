@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.cli import realtime_learn
 from faintspot.control.compiled import CompiledIntegrator
 from faintspot.control.configuration import Control, ControlOptions, load_control, save_control
-from faintspot.control.recording import telemetry_of_recording, theories_of
+from faintspot.control.recording import site_of, telemetry_of_recording
 from faintspot.pipeline import configuration as configuration_file
 from faintspot.pipeline.settings import Settings
 from faintspot.sensor.layout import Layout
@@ -110,30 +110,27 @@ def test_what_is_refused() -> None:
         with pytest.raises(InputError, match=message):
             telemetry_of_recording(night, CONTROL)
     with pytest.raises(InputError, match="expected subaperture_m or diameter_m"):
-        theories_of(LAYOUT, 250.0)
+        site_of(LAYOUT)
 
 
-def test_theory_of_a_layout() -> None:
+def test_site_of_a_layout() -> None:
     layouts = (
         Layout.grid((3, 3), pixels=8, subaperture_m=0.6),
         Layout.grid((3, 3), pixels=8, diameter_m=1.8),
     )
-    by_side, by_diameter = (theories_of(each, 250.0)["winds from anywhere"][0] for each in layouts)
-    np.testing.assert_allclose(by_side, by_diameter)
-    assert by_side.shape == (3, 18, 18)
-    assert np.trace(by_side[0]) > np.trace(by_side[1]) > np.trace(by_side[2]) > 0
-    assert len(CELLS) == 9
+    by_side, by_diameter = (site_of(each) for each in layouts)
+    np.testing.assert_allclose(by_side.positions_m, CELLS[:, ::-1] * 0.6)
+    np.testing.assert_allclose(by_diameter.positions_m, by_side.positions_m)
+    known = site_of(layouts[0], [(12.6, 18.0, 0.6), (20.0, 104.0, 0.2)])
+    np.testing.assert_array_equal(known.fraction, [0.6, 0.2])
     # 500 nm, r0 of 0.15 m: the tilt without an outer scale (Noll), of which 25 m leave a part.
     tilt_arcsec2 = 0.17 * np.rad2deg(500e-9 / 0.6) ** 2 * 3600**2 * (0.6 / 0.15) ** (5 / 3)
-    assert 0.3 < np.trace(by_side[0]) / 18 / tilt_arcsec2 < 1.0
-    told = theories_of(layouts[0], 250.0, layers=[(12.6, 18.0, 0.6), (20.0, 104.0, 0.2)])["winds as told"]
-    assert told.shape == (2, 3, 18, 18)
-    assert np.trace(told[0, 0]) == pytest.approx(3 * np.trace(told[1, 0]))
+    assert 0.3 < np.trace(by_side.covariance_px2()) / 18 / tilt_arcsec2 < 1.0
     # The wind goes along +x: what one sub-aperture has seen, the next one in this direction sees.
-    along = theories_of(layouts[0], 250.0, layers=[(30.0, 0.0, 1.0)])["winds as told"][0, 2]
+    along = site_of(layouts[0], [(30.0, 0.0, 1.0)]).covariance_px2(0.008)
     assert along[1, 0] > 1.2 * along[0, 1]
     with pytest.raises(InputError, match="layers: strength"):
-        theories_of(layouts[0], 250.0, layers=[(12.0, 18.0, 0.0)])
+        site_of(layouts[0], [(12.0, 18.0, 0.0)])
 
 
 def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,10 +145,9 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     assert "expected a table [control]" in str(learn().exception)
     save_control(path, interaction_matrix="m.npy", centroid_gain=GAIN)
-    assert "expected numbers such as 5,10,20" in str(learn("--wind-speeds", "fast").exception)
     pytest.importorskip("zarr")
     monkeypatch.setattr("faintspot.io.read_telemetry", lambda *_, **__: recording())
-    result = learn("--control", "kalman", "--wind-speeds", "12,20")
+    result = learn("--control", "kalman", "--winds", "none")
     assert result.exception is None, result.exception
     assert "597 frames at 250 a second: kalman leaves 0." in result.output
     control = load_control(path)

@@ -4,30 +4,11 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.control.control_cases import (
-    CELLS,
-    COVARIANCES,
-    FRAME_S,
-    INTERACTION,
-    LAYERS,
-    MODEL,
-    PHASE,
-    PLANT,
-    TURBULENCE,
-    telemetry,
-)
+from tests.control.control_cases import FRAME_S, PHASE, PLANT, TURBULENCE, telemetry
 
-from faintspot.control.identification import Strengths, identify
-from faintspot.control.kalman import SlopePredictor
 from faintspot.control.learning import CONTROLS, INTEGRATOR, learn
 from faintspot.control.modal_gains import GAINS, largest_stable_gain, modal_gains
-from faintspot.control.models import SlopeModel, joint_moments
-from faintspot.control.predictive import Predictive
-from faintspot.control.smoothing import smoothed_moments
-from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance, without_prior
-
-AGAINST = TURBULENCE.turned(3.0, 180.0).lagged_px2(FRAME_S)[None]
-RIGHT = COVARIANCES[None]
+from faintspot.control.telemetry import OpenLoopTelemetry, without_prior
 
 
 def test_a_prior_is_taken_out_again() -> None:
@@ -50,60 +31,10 @@ def test_posteriors_wider_than_the_prior_stay_harmless() -> None:
     np.testing.assert_allclose(trust, [1 / 51, 1 / 51, 0.0])
 
 
-def test_strengths_of_noise_and_turbulence_are_measured() -> None:
-    """Errors that are told twice too large; turbulence four times weaker than theory."""
-    found = Strengths.of(telemetry(4000, 0.5, said=2.0))
-    assert found.noise_factor == pytest.approx(0.25, rel=0.05)
-    assert found.relative_to(4 * COVARIANCES) == pytest.approx(0.25, rel=0.2)
-
-
-def test_moments_behind_noise_are_found() -> None:
-    """Smoothed with the true model they are those of slopes without noise, but for statistics."""
-    noisy, clear = telemetry(6000, 0.5), telemetry(6000, 1e-4)
-    found, expected = smoothed_moments(MODEL, noisy), smoothed_moments(MODEL, clear)
-    assert np.linalg.eigvalsh(found)[0] > 0
-    assert np.linalg.norm(found - expected) < 0.15 * np.linalg.norm(expected)
-
-
-def _score(model: SlopeModel, frames: OpenLoopTelemetry) -> float:
-    def made(line):  # type: ignore[no-untyped-def]
-        predictor = SlopePredictor(model, usual_variance(frames))
-        return Predictive(line, INTERACTION, predictor, PLANT.reconstructor.clean)
-
-    return PLANT.left(made, frames, PHASE)
-
-
-def test_the_right_theory_is_chosen_and_a_wrong_one_is_mended() -> None:
-    frames = telemetry(1500, 0.5)
-    both = identify(frames, {"against": AGAINST, "right": RIGHT}, _score)
-    assert both.source.startswith("right")
-    wrong_only = identify(frames, {"against": AGAINST}, _score)
-    assert "measured moments" in wrong_only.source
-    unmended = identify(frames, {"against": AGAINST}, _score, shares=())
-    assert both.score < wrong_only.score < unmended.score
-
-
-def test_layers_are_told_apart_where_that_leaves_less() -> None:
-    """Slopes of two layers, each of which goes on by itself; telemetry has only their sum."""
-    layers = np.array([layer.lagged_px2(FRAME_S) for layer in TURBULENCE.layers()])
-    np.testing.assert_allclose(layers.sum(axis=0), COVARIANCES, rtol=1e-9)
-    frames = telemetry(1500, 0.5, model=LAYERS)
-    found = identify(frames, {"told": layers, "against": AGAINST}, _score)
-    assert found.source == "told, 2 layers"
-    assert found.model.layers == 2
-    assert found.score < identify(frames, {"told": RIGHT}, _score, shares=()).score
-
-
-def test_shares_go_from_theory_to_measured() -> None:
-    model = SlopeModel.of_moments(joint_moments(COVARIANCES))
-    np.testing.assert_array_equal(model.first, MODEL.first)
-
-
 @pytest.mark.parametrize("kind", [kind for kind in CONTROLS if kind != INTEGRATOR])
 def test_what_has_learnt_leaves_less(kind: str) -> None:
     """On other frames of the same air, than the integrator with the gain that is best there."""
-    theories = {"told": RIGHT}
-    learnt = learn(kind, PLANT, telemetry(1200, 0.5), theories, CELLS)
+    learnt = learn(kind, PLANT, telemetry(1200, 0.5), TURBULENCE, 1 / FRAME_S)
     other = telemetry(1500, 0.5, seed=6).scaled(learnt.noise_factor)
     plain = min(
         PLANT.left(partial(PLANT.integrator, gain), other, PHASE) for gain in (0.1, 0.2, 0.3, 0.4, 0.5)
@@ -116,7 +47,7 @@ def test_gains_make_up_for_slopes_drawn_to_zero() -> None:
     frames = telemetry(600, 0.5)
     drawn = OpenLoopTelemetry(frames.open_loop_px, frames.variance_px2, np.full(frames.trust.shape, 0.8))
     whole, larger = (
-        learn("modal", PLANT, each, {"told": RIGHT}, CELLS).model.arrays["gains"] for each in (frames, drawn)
+        learn("modal", PLANT, each, TURBULENCE, 1 / FRAME_S).model.arrays["gains"] for each in (frames, drawn)
     )
     below = larger < larger.max()
     assert below.any()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
-from tests.control.control_cases import CELLS, COVARIANCES, INTERACTION, PLANT, telemetry
+from tests.control.control_cases import FRAME_S, INTERACTION, PLANT, TURBULENCE, telemetry
 
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
@@ -48,7 +48,7 @@ class PlainControl(Control):
 
 @cache
 def learnt(kind: str) -> Model:
-    return learn(kind, PLANT, telemetry(200, 0.3), {"told": COVARIANCES[None]}, CELLS).model
+    return learn(kind, PLANT, telemetry(200, 0.3), TURBULENCE, 1 / FRAME_S).model
 
 
 def scaled(draw: Any, array: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, check_known, checked_table, parse_file, parse_text
+from faintspot.control.base import LEARNT, WINDS
 from faintspot.estimators.scene import Scene
 from faintspot.simulate.photometry import DEFAULT_BAND, ZERO_POINTS, Photometry
 from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
@@ -126,10 +127,12 @@ class ControlParameters:
     """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
     telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
     """Closed loop with an integrator that other kinds of control learn from, on air that is not scored."""
+    winds: str = LEARNT
+    """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
     assumed_wind_factor: float = number(1.0, 0.0, 100.0)
-    """Winds that control is told, as a multiple of the true ones."""
+    """Assumed winds as a multiple of the true ones."""
     assumed_wind_turn_deg: float = number(0.0, -360.0, 360.0)
-    """Angle by which the winds that control is told are turned."""
+    """Angle by which assumed winds are turned."""
 
 
 @dataclass(frozen=True)
@@ -421,6 +424,7 @@ def _check_flux(camera: Camera) -> None:
 def _check_sampling(whole: LoopConfiguration) -> None:
     """Refuse what the sensor's phase cannot hold and control that cannot be."""
     one_of("control.mode", whole.control.mode, (CLOSED, OPEN))
+    one_of("control.winds", whole.control.winds, WINDS)
     if not isinstance(whole.mirror.tip_tilt, bool):
         raise InputError(f"mirror.tip_tilt = {whole.mirror.tip_tilt!r}: expected true or false")
     sensor = whole.sensor

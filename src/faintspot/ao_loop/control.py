@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.arms import PRIOR, Arm
-from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration, RunLength
+from faintspot.ao_loop.configuration import CLOSED, ControlParameters, LoopConfiguration, RunLength
 from faintspot.ao_loop.record import LoopRecord
 from faintspot.base.errors import InputError
 from faintspot.control.base import Controller
@@ -105,7 +105,7 @@ def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
 
 
 def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
-    """Return what theory knows of the slopes of sub-apertures, with the winds that control is told."""
+    """Return what theory knows of the slopes of sub-apertures, with the winds that control assumes."""
     atmosphere, control = configuration.atmosphere, configuration.control
     angle = np.deg2rad(atmosphere.wind_direction_deg)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -159,14 +159,9 @@ def _learnt(
         return replace(usual, model=usual.model.with_noise(noise_scale))
     optics, control = prepare(configuration), configuration.control
     telemetry = _telemetry(_without_assumed(configuration), known, seed, simulate)
-    told = slope_turbulence(configuration, optics.sensor.layout.cells)
-    frame_s = 1 / control.frame_rate_hz
-    theories = {
-        "winds as told": np.array([layer.lagged_px2(frame_s) for layer in told.layers()]),
-        "winds from anywhere": told.from_anywhere().lagged_px2(frame_s)[None],
-    }
+    site = slope_turbulence(configuration, optics.sensor.layout.cells)
     plant = Plant(optics.interaction, optics.reconstructor, control.delay_frames, control.leak)
-    return learn(kind, plant, telemetry, theories, optics.sensor.layout.cells, noise_scale)
+    return learn(kind, plant, telemetry, site, control.frame_rate_hz, control.winds, noise_scale)
 
 
 @lru_cache(maxsize=8)
@@ -211,4 +206,6 @@ def _with_prior(arm: Arm, std_px: float | Floats) -> Arm:
 
 def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:
     """Return the configuration as far as its telemetry depends on it."""
-    return configuration.replace("control", assumed_wind_factor=1.0, assumed_wind_turn_deg=0.0)
+    usual = ControlParameters()
+    names = ("winds", "assumed_wind_factor", "assumed_wind_turn_deg")
+    return configuration.replace("control", **{name: getattr(usual, name) for name in names})

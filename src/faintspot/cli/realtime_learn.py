@@ -25,11 +25,11 @@ from faintspot.cli.shared_options import configuration_option
     help="What learns.",
 )
 @click.option(
-    "--wind-speeds",
-    default="5,10,20",
+    "--winds",
+    type=click.Choice(["learnt", "none"]),
+    default="learnt",
     show_default=True,
-    metavar="LIST",
-    help="Wind speeds of the theory's layers, m/s.",
+    help="Measure the winds, or take them from all directions alike.",
 )
 @click.option(
     "--layer",
@@ -37,10 +37,10 @@ from faintspot.cli.shared_options import configuration_option
     type=(float, float, float),
     multiple=True,
     metavar="SPEED DIRECTION STRENGTH",
-    help="A layer of the air, where its wind is known, m/s and degrees from +x to +y; as often as needed.",
+    help="Assume a layer with this wind, m/s and degrees from +x to +y; repeatable.",
 )
 def learn(
-    store: Path, config: str, kind: str, wind_speeds: str, layers: tuple[tuple[float, float, float], ...]
+    store: Path, config: str, kind: str, winds: str, layers: tuple[tuple[float, float, float], ...]
 ) -> None:
     """Have a controller learn from a recording of the loop, closed with an integrator, and put it into TOML.
 
@@ -54,9 +54,10 @@ def learn(
       faintspot realtime learn night.zarr --control kalman
       faintspot realtime learn night.zarr --layer 6 20 0.6 --layer 14 150 0.4
     """
+    from faintspot.control.base import ASSUMED
     from faintspot.control.configuration import load_control, prior_std_px, save_control
     from faintspot.control.learning import learn as learnt_by
-    from faintspot.control.recording import telemetry_of_recording, theories_of
+    from faintspot.control.recording import site_of, telemetry_of_recording
     from faintspot.io import read_telemetry
     from faintspot.pipeline.settings import Settings
     from faintspot.sensor.layout import Layout
@@ -64,15 +65,11 @@ def learn(
     control = load_control(config)
     if control is None:
         raise InputError(f"{config}: expected a table [control], which calibrate writes")
-    try:
-        speeds = [float(each) for each in wind_speeds.split(",")]
-    except ValueError:
-        raise InputError(f"--wind-speeds {wind_speeds!r}: expected numbers such as 5,10,20") from None
     layout, night = Layout.load(config), read_telemetry(store, images=False)
     prior = prior_std_px(Settings.load(config), layout)
     telemetry, rate_hz = telemetry_of_recording(night, control, prior)
-    theories = theories_of(layout, rate_hz, speeds, layers)
-    learnt = learnt_by(kind, control.plant, telemetry, theories, layout.cells)
+    known = site_of(layout, layers), rate_hz, ASSUMED if layers else winds
+    learnt = learnt_by(kind, control.plant, telemetry, *known)
     path = derived(config, ".model.npz")
     learnt.model.save(path)
     save_control(config, controller=kind, model=path.name)

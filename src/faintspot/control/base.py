@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+LEARNT, ASSUMED, NONE = "learnt", "assumed", "none"
+WINDS = LEARNT, ASSUMED, NONE
+"""Winds of a predictive model: found in telemetry, given, or from all directions alike."""
+
 
 class Expected(NamedTuple):
     """The slopes of the next frame before it is measured: an estimator's prior."""

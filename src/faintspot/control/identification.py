@@ -1,151 +1,125 @@
-"""Learning a model of open-loop slopes from short, noisy telemetry, with the help of theory.
-
-What telemetry says of the slopes behind its noise depends on the model that they are smoothed with: theory's
-at first (expectation maximisation). A ridge regression of z[k + 1] on z[k], z[k - 1] draws the model back to
-theory, in the metric of theory's own covariances: its normal equations are those of a weighted mean of
-measured and theoretical moments. Which theory, and how much weight the measured moments get, is decided by
-what the control would have left of the turbulence in frames that it has not learnt from. A theory that knows
-layers is tried with each of them by itself, too; telemetry cannot tell them apart.
-"""
+"""What open-loop slopes say about wind layers, turbulence, noise and vibrations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
-from typing import Self
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.control.models import SlopeModel, joint_moments
-from faintspot.control.smoothing import smoothed_moments
-from faintspot.control.telemetry import OpenLoopTelemetry, lagged_covariance
+from faintspot.control.layer_likelihood import LayerLikelihood, Layers
+from faintspot.control.models import SlopeModel
+from faintspot.control.slope_records import SlopeRecords
+from faintspot.control.telemetry import OpenLoopTelemetry
+from faintspot.control.vibrations import Vibration, find_vibrations, with_vibrations
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
-Score = Callable[[SlopeModel, OpenLoopTelemetry], float]
 
-MEASURED_SHARES = (0.1, 0.25, 0.5, 0.75)
-_NOISE_FACTORS = (0.1, 30.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Strengths:
-    """How strong turbulence and noise are in telemetry."""
-
-    later_px2: Floats
-    """(2, m, m): covariances of slopes one and two frames apart, which have no noise."""
-    noise_factor: float
-    """Actual variance of the noise as a multiple of what the standard errors say."""
-
-    @classmethod
-    def of(cls, telemetry: OpenLoopTelemetry) -> Self:
-        """Measure them: noise is what the variance has beyond its extrapolation from later lags."""
-        later = np.array([lagged_covariance(telemetry, lag) for lag in (1, 2)])
-        finite = np.where(np.isfinite(telemetry.variance_px2), telemetry.variance_px2, 0.0)
-        squares = np.square(telemetry.trust)
-        noise = (squares * finite).sum(axis=0) / np.maximum(squares.sum(axis=0), 1e-12)
-        beyond = np.trace(lagged_covariance(telemetry, 0)) - np.trace(_extrapolated(later))
-        factor = float(np.clip(beyond / max(noise.sum(), 1e-12), *_NOISE_FACTORS))
-        return cls(later, factor)
-
-    def relative_to(self, theory_px2: Floats) -> float:
-        """Return by what to multiply theoretical covariances (3, m, m): by slopes without tip and tilt."""
-        theory = _without_tilt(_extrapolated(theory_px2[1:]))
-        return max(_without_tilt(_extrapolated(self.later_px2)), 0.01 * theory) / theory
+_SPEEDS_M_PER_S = (5.0, 10.0, 20.0)  # of winds from anywhere
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """What was learnt."""
+    """Turbulence, noise and vibrations of a piece of telemetry."""
 
-    model: SlopeModel
+    turbulence: SlopeTurbulence
     noise_factor: float
-    """What to multiply the variances of standard errors by."""
-    source: str
-    """What it was learnt from: which theory, and how much telemetry counts."""
-    score: float
-    """Mean square of what control by it leaves, in frames that were not learnt from."""
+    """Actual variance of the noise as a multiple of what the standard errors say."""
+    vibrations: tuple[Vibration, ...]
+    rate_hz: float
+    is_layered: bool
+    """Whether each layer goes on by itself; else winds only stand for turbulence that changes as fast."""
+    wind_error_m_per_s: Floats
+    """(layers, 2): standard errors; nan of winds that were not fitted."""
+    fraction_error: Floats
+    """(layers,): standard errors, likewise."""
+    criterion: float
+    """Half the Bayesian information criterion: differences count."""
+
+    def covariances_px2(self) -> Floats:
+        """Return (layers, 3, m, m): covariances of each layer's slopes for lags of 0, 1 and 2 frames."""
+        frame_s = 1 / self.rate_hz
+        if not self.is_layered:
+            return self.turbulence.lagged_px2(frame_s)[None]
+        return np.array([layer.lagged_px2(frame_s) for layer in self.turbulence.layers()])
+
+    def slope_model(self) -> SlopeModel:
+        """Return how the slopes go on from frame to frame, vibrations included."""
+        model = SlopeModel.of_covariances(self.covariances_px2())
+        return with_vibrations(model, self.vibrations, self.turbulence.positions_m, self.rate_hz)
+
+    def summary(self) -> str:
+        """Return one line."""
+        winds, shares = self.turbulence.wind_m_per_s, self.turbulence.fraction
+        layers = [
+            f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
+            for (x, y), part in sorted(zip(winds, shares, strict=True), key=lambda each: -each[1])
+        ]
+        shaking = [f"{each.mode} shakes at {each.frequency_hz:.1f} Hz" for each in self.vibrations]
+        air = ", ".join(layers) if self.is_layered else "winds from anywhere"
+        return ", ".join([air, *shaking])
 
 
-def identify(
-    telemetry: OpenLoopTelemetry,
-    theories_px2: Mapping[str, Floats],
-    score: Score,
-    shares: Sequence[float] = MEASURED_SHARES,
-) -> Identified:
-    """Choose a model: of each half of the frames, the other half is scored.
+class Identification:
+    """Models of one piece of telemetry.
 
     Parameters
     ----------
-    telemetry : Telemetry
-    theories_px2 : mapping of (layers, 3, m, m) arrays
-        Theoretical covariances for lags of 0, 1 and 2 frames, by name; only the ratio of the layers'
-        strengths is used.
-    score : callable
-        Mean square of what control by a model leaves in some frames.
-    shares : sequence of float
-        Weights of measured moments that are tried beside none.
+    telemetry : OpenLoopTelemetry
+    site : SlopeTurbulence
+        Positions, sub-aperture and pixel scale; its outer scale is assumed within a factor of two.
+    rate_hz : float
+        Frames per second.
+
+    Raises
+    ------
+    InputError
+        When too few sub-apertures were measured, or too few frames without a gap.
     """
-    middle = len(telemetry) // 2
-    parts = telemetry.part(0, middle), telemetry.part(middle, len(telemetry)), telemetry
-    strengths = [Strengths.of(part) for part in parts]
-    together = {name: theory.sum(axis=0) for name, theory in theories_px2.items()}
-    makers: dict[str, Callable[[int], SlopeModel]] = {}
-    tried: dict[str, float] = {}
 
-    def of_theory(name: str, layers: Floats, part: int) -> SlopeModel:
-        return SlopeModel.of_covariances(strengths[part].relative_to(together[name]) * layers)
+    def __init__(self, telemetry: OpenLoopTelemetry, site: SlopeTurbulence, rate_hz: float) -> None:
+        self._site, self._rate_hz = site, rate_hz
+        records = SlopeRecords.of(telemetry, site)
+        self._vibrations = find_vibrations(records.modes(), rate_hz, records.slopes.shape[1])
+        self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
 
-    @cache
-    def moments(name: str, part: int) -> tuple[Floats, Floats]:
-        return _moments(parts[part], strengths[part], together[name])
+    def layers(self) -> Identified:
+        """Return layers with the winds that the telemetry shows."""
+        layers = self._likelihood.selected(self._likelihood.peaks())
+        return self._identified(layers, self._likelihood.errors(layers))
 
-    def measured(name: str, share: float, part: int) -> SlopeModel:
-        return SlopeModel.of_moments(mixed(*moments(name, part), share))
+    def of_winds(self, winds_m_per_s: Floats) -> Identified:
+        """Return layers with given winds, (layers, 2), and the strengths that the telemetry shows."""
+        return self._identified(self._likelihood.of_winds(np.asarray(winds_m_per_s, np.float64)[:, None]))
 
-    def attempt(source: str, make: Callable[[int], SlopeModel]) -> None:
-        makers[source] = make
-        left = [score(make(of), parts[1 - of].scaled(strengths[of].noise_factor)) for of in (0, 1)]
-        tried[source] = float(np.mean(left))
+    def anywhere(self) -> Identified:
+        """Return turbulence that winds of some speeds carry from all directions alike."""
+        speeds = np.array(_SPEEDS_M_PER_S)
+        still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
+        winds = still.from_anywhere().wind_m_per_s
+        return self._identified(self._likelihood.of_winds(winds[None]), is_layered=False)
 
-    for name, theory in together.items():
-        attempt(name, partial(of_theory, name, theory))
-    nearest = min(tried, key=tried.__getitem__)
-    for share in shares:
-        attempt(f"{nearest}, measured moments {share:g}", partial(measured, nearest, share))
-    for name, layers in theories_px2.items():
-        if len(layers) > 1:
-            source = f"{name}, {len(layers)} layers"
-            makers[source] = partial(of_theory, name, layers)
-            # Two numbers are learnt from all frames, which are scored at once: its filter takes long to make.
-            tried[source] = score(makers[source](2), telemetry.scaled(strengths[2].noise_factor))
-    best = min(tried, key=tried.__getitem__)
-    return Identified(makers[best](2), strengths[2].noise_factor, best, tried[best])
-
-
-def mixed(measured_px2: Floats, theory_px2: Floats, share: float) -> Floats:
-    """Return a weighted mean of moments."""
-    return share * measured_px2 + (1 - share) * theory_px2
-
-
-def _moments(telemetry: OpenLoopTelemetry, strengths: Strengths, theory_px2: Floats) -> tuple[Floats, Floats]:
-    """Return the moments (3 m, 3 m) of telemetry, smoothed with a theory, and of the theory."""
-    theory = strengths.relative_to(theory_px2) * theory_px2
-    model = SlopeModel.of_covariances(theory)
-    return smoothed_moments(model, telemetry.scaled(strengths.noise_factor)), joint_moments(theory)
-
-
-def _extrapolated(later: Floats) -> Floats:
-    """Return the covariance of no lag, without noise, from those of one and two frames."""
-    mean = (4 * later[0] - later[1]) / 3
-    return np.asarray(0.5 * (mean + mean.T))
-
-
-def _without_tilt(covariance: Floats) -> float:
-    """Return the sum of variances about each axis's mean over the sub-apertures."""
-    n = len(covariance) // 2
-    total = np.trace(covariance)
-    for axis in (slice(0, n), slice(n, 2 * n)):
-        total -= covariance[axis, axis].mean() * n
-    return float(total)
+    def _identified(
+        self, layers: Layers, errors: Floats | None = None, *, is_layered: bool = True
+    ) -> Identified:
+        fraction = layers.strength / layers.strength.sum()
+        errors = np.full((len(fraction), 3), np.nan) if errors is None else errors
+        turbulence = replace(
+            self._site,
+            r0_m=float(layers.strength.sum() ** (-3 / 5)),
+            outer_scale_m=layers.outer_scale_m,
+            fraction=fraction,
+            wind_m_per_s=layers.wind_m_per_s,
+        )
+        return Identified(
+            turbulence,
+            layers.noise,
+            self._vibrations,
+            self._rate_hz,
+            is_layered,
+            errors[:, :2],
+            fraction * errors[:, 2],
+            layers.criterion,
+        )

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from faintspot.control.base import Controller
+from faintspot.control.base import ASSUMED, LEARNT, Controller
 from faintspot.control.commands import CommandDelayLine
-from faintspot.control.identification import Strengths, identify
+from faintspot.control.identification import Identification, Identified
 from faintspot.control.kalman import SlopePredictor
 from faintspot.control.learnt import (
     CONTROLS,
@@ -24,14 +24,15 @@ from faintspot.control.learnt import (
     Plant,
 )
 from faintspot.control.modal_gains import largest_stable_gain, modal_gains
-from faintspot.control.models import SlopeModel
 from faintspot.control.phase import residual_phase
 from faintspot.control.predictive import Predictive, PseudoOpenLoop
 from faintspot.control.telemetry import OpenLoopTelemetry, usual_variance
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 __all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "Learnt", "Plant", "learn"]
 
 Floats = NDArray[np.float64]
+
 
 _GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
 _POLC_GAINS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.65)
@@ -42,8 +43,9 @@ def learn(
     kind: str,
     plant: Plant,
     telemetry: OpenLoopTelemetry,
-    theories_px2: Mapping[str, Floats],
-    cells: ArrayLike,
+    site: SlopeTurbulence,
+    rate_hz: float,
+    winds: str = LEARNT,
     noise_scale: float = 1.0,
 ) -> Learnt:
     """Return a controller of a kind that has learnt from telemetry.
@@ -53,41 +55,52 @@ def learn(
     kind : str
         One of `CONTROLS` but the plain integrator.
     plant : Plant
-    telemetry : Telemetry
-    theories_px2 : mapping of (layers, 3, m, m) arrays
-        Theoretical covariances of each layer's slopes for lags of 0, 1 and 2 frames, by name; at least one
-        theory. Their strength as a whole is taken from telemetry.
-    cells : (n, 2) array of int
-        Row and column of each sub-aperture in the lenslet array.
+    telemetry : OpenLoopTelemetry
+    site : SlopeTurbulence
+        Geometry of the sensor, outer scale and, for winds that are assumed, these.
+    rate_hz : float
+        Frames per second.
+    winds : str
+        One of `WINDS`.
     noise_scale : float
-        What to multiply the variance of the noise by that telemetry shows.
+        Factor on the noise variance that telemetry shows.
     """
+    cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
     phase = residual_phase(plant.reconstructor, plant.interaction, cells)
     gain, plain_left = _best_gain(lambda gain: partial(plant.integrator, gain), plant, telemetry, phase)
     if kind == MODAL:
         return Learnt(plant, _modal(plant, telemetry, gain, plain_left, phase))
-    if kind == POLC:
-        of_all = theories_px2, noise_scale, gain, plain_left, phase
-        return Learnt(plant, _pseudo_open_loop(plant, telemetry, *of_all))
-    clean = plant.reconstructor.clean
+    identification = Identification(telemetry, site, rate_hz)
+    tried = [identification.anywhere()]
+    if winds == LEARNT:
+        tried.append(identification.layers())
+    elif winds == ASSUMED:
+        tried.append(identification.of_winds(site.wind_m_per_s))
+    make = _pseudo_open_loop if kind == POLC else _kalman
+    made = [(*make(plant, telemetry.scaled(each.noise_factor), each, phase), each) for each in tried]
+    left, arrays, found = min(made, key=lambda each: each[0])
+    text = f"{found.summary()}, noise variance x {found.noise_factor:.2f}"
+    model = Model(kind, arrays, gain, found.noise_factor, (left, plain_left), phase, text)
+    return Learnt(plant, model.with_noise(noise_scale) if kind == KALMAN else model)
 
-    def predictive(model: SlopeModel, variance_px2: Floats, line: CommandDelayLine) -> Controller:
-        return Predictive(line, plant.interaction, SlopePredictor(model, variance_px2), clean)
 
-    def score(model: SlopeModel, frames: OpenLoopTelemetry) -> float:
-        return plant.left(partial(predictive, model, usual_variance(frames)), frames, phase)
+def _kalman(
+    plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
+) -> tuple[float, dict[str, Floats]]:
+    """Return what the Kalman filter needs, and how much it leaves."""
+    model, variance, clean = found.slope_model(), usual_variance(telemetry), plant.reconstructor.clean
+    predictor = SlopePredictor(model, variance)
 
-    found = identify(telemetry, theories_px2, score)
-    factor, model = found.noise_factor, found.model
-    text = f"{found.source}, noise variance x {factor:.2f}"
+    def predictive(line: CommandDelayLine) -> Controller:
+        return Predictive(line, plant.interaction, predictor, clean)
+
     arrays = {
         "first": model.first,
         "second": model.second,
         "driving_px2": model.driving,
-        "variance_px2": usual_variance(telemetry.scaled(factor)),
+        "variance_px2": variance,
     }
-    learnt = Model(kind, arrays, gain, factor, (found.score, plain_left), phase, text)
-    return Learnt(plant, learnt.with_noise(noise_scale))
+    return plant.left(predictive, telemetry, phase), arrays
 
 
 def _modal(
@@ -105,33 +118,17 @@ def _modal(
 
 
 def _pseudo_open_loop(
-    plant: Plant,
-    telemetry: OpenLoopTelemetry,
-    theories_px2: Mapping[str, Floats],
-    noise_scale: float,
-    plain_gain: float,
-    plain_left: float,
-    phase: Floats,
-) -> Model:
+    plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
+) -> tuple[float, dict[str, Floats]]:
     """Return what pseudo-open-loop control needs, for the wavefront of when the command acts."""
-    strengths = Strengths.of(telemetry)
-    factor = noise_scale * strengths.noise_factor
-    frames, clean = telemetry.scaled(factor), plant.reconstructor.clean
-    tried = []
-    for name, layers in theories_px2.items():
-        theory = layers.sum(axis=0)
-        covariances = strengths.relative_to(theory) * theory
-        now = covariances[0]
-        ahead = covariances[min(plant.delay_frames, 2)]
+    covariances, clean = found.covariances_px2().sum(axis=0), plant.reconstructor.clean
+    now, ahead = covariances[0], covariances[min(plant.delay_frames, 2)]
 
-        def made(gain: float, now: Floats = now, ahead: Floats = ahead) -> Make:
-            return lambda line: PseudoOpenLoop(line, plant.interaction, now, ahead, clean, gain)
+    def made(gain: float) -> Make:
+        return lambda line: PseudoOpenLoop(line, plant.interaction, now, ahead, clean, gain)
 
-        gain, left = _best_gain(made, plant, frames, phase, _POLC_GAINS)
-        arrays = {"now_px2": now, "ahead_px2": ahead, "gain": np.array(gain)}
-        tried.append((left, f"{name}, gain {gain:g}", arrays))
-    left, text, arrays = min(tried, key=lambda each: each[0])
-    return Model(POLC, arrays, plain_gain, factor, (left, plain_left), phase, text)
+    gain, left = _best_gain(made, plant, telemetry, phase, _POLC_GAINS)
+    return left, {"now_px2": now, "ahead_px2": ahead, "gain": np.array(gain)}
 
 
 def _best_gain(

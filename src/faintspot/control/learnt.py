@@ -94,8 +94,7 @@ class Model:
     noise_factor: float
     """What to multiply the variances of standard errors by."""
     left: tuple[float, float]
-    """Phase variance that the learnt and the plain one leave in telemetry; of the Kalman filter in frames
-    that it has not learnt from."""
+    """Phase variance that the learnt and the plain one leave in telemetry, noise included."""
     phase: Floats
     """(commands, m): what the two are compared by, see `residual_phase`."""
     description: str = ""

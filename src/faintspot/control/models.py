@@ -44,19 +44,8 @@ class SlopeModel:
             E[y[k + lag] y[k]^T] of each layer for lags of 0, 1 and 2 frames.
         """
         lags = covariances_px2.shape[-3:]
-        layers = [_regression(joint_moments(each)) for each in covariances_px2.reshape(-1, *lags)]
+        layers = [_regression(_joint_moments(each)) for each in covariances_px2.reshape(-1, *lags)]
         return cls(*(np.array(each) for each in zip(*layers, strict=True)))
-
-    @classmethod
-    def of_moments(cls, moments_px2: Floats) -> Self:
-        """Return the regression of z[k + 1] on z[k], z[k - 1], with a small ridge, as one layer.
-
-        Parameters
-        ----------
-        moments_px2 : (3 m, 3 m) array
-            Second moments of z[k + 1], z[k], z[k - 1].
-        """
-        return cls(*(each[None] for each in _regression(moments_px2)))
 
     @property
     def layers(self) -> int:
@@ -109,7 +98,7 @@ def _regression(moments_px2: Floats) -> tuple[Floats, Floats, Floats]:
     return both[:, :m], both[:, m:], _positive(left, _LEAST_DRIVING * variance)
 
 
-def joint_moments(covariances_px2: Floats) -> Floats:
+def _joint_moments(covariances_px2: Floats) -> Floats:
     """Return second moments (3 m, 3 m) of z[k + 1], z[k], z[k - 1], from covariances (3, m, m)."""
     same, one, two = covariances_px2
     return np.block([[same, one, two], [one.T, same, one], [two.T, one.T, same]])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +24,6 @@ Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 200
 OUTER_SCALE_M = 25.0
-WIND_SPEEDS_M_PER_S = (5.0, 10.0, 20.0)
 _ARCSEC = math.pi / 180 / 3600
 _CLOSED = 2
 
@@ -129,22 +127,12 @@ def recorded_slopes(
     return slopes, error / gain, held, expected
 
 
-def theories_of(
-    layout: Layout,
-    frame_rate_hz: float,
-    wind_speeds_m_per_s: Sequence[float] = WIND_SPEEDS_M_PER_S,
-    layers: Sequence[tuple[float, float, float]] = (),
-) -> Mapping[str, Floats]:
-    """Return what theory says of slopes without r0: with layers, and as if winds came from anywhere.
-
-    Covariances for lags of 0, 1 and 2 frames, as `learn` takes them; their strength means nothing.
+def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:
+    """Return what is known of slopes in turbulence before a recording: geometry, outer scale, winds.
 
     Parameters
     ----------
     layout : Layout
-    frame_rate_hz : float
-    wind_speeds_m_per_s : sequence of float
-        Of winds from all directions alike.
     layers : sequence of (float, float, float)
         Speed in m/s, direction in degrees from +x (along columns) to +y (along rows), and strength of each,
         where they are known, of which only the ratios count.
@@ -152,7 +140,7 @@ def theories_of(
     Raises
     ------
     InputError
-        When the layout does not know the size of a sub-aperture, or a speed is out of range.
+        When the layout does not know the size of a sub-aperture, or a value is out of range.
     """
     across = int(np.ptp(layout.cells, axis=0).max()) + 1
     side = layout.subaperture_m
@@ -162,25 +150,14 @@ def theories_of(
         raise InputError(
             "layout: expected subaperture_m or diameter_m, which say how fast the wind crosses a sub-aperture"
         )
-    speeds = np.atleast_1d(numbers_between("wind_speeds_m_per_s", wind_speeds_m_per_s, 0, 200))
     positions = layout.cells[:, ::-1].astype(np.float64) * side
-    winds = np.column_stack([speeds, np.zeros_like(speeds)])
     scale = (layout.pixel_scale_arcsec or 1.0) * _ARCSEC
-    turbulence = SlopeTurbulence(positions, side, scale, 0.15, OUTER_SCALE_M, np.ones(len(speeds)), winds)
-    anywhere = {"winds from anywhere": turbulence.from_anywhere().lagged_px2(1 / frame_rate_hz)[None]}
-    if not layers:
-        return anywhere
-    told = _told(turbulence, layers).layers()
-    return {"winds as told": np.array([layer.lagged_px2(1 / frame_rate_hz) for layer in told]), **anywhere}
-
-
-def _told(turbulence: SlopeTurbulence, layers: Sequence[tuple[float, float, float]]) -> SlopeTurbulence:
-    speed, direction, share = np.asarray(layers, np.float64).reshape(-1, 3).T
+    speed, direction, share = np.asarray(layers or [(0.0, 0.0, 1.0)], np.float64).reshape(-1, 3).T
     numbers_between("layers: speed", speed, 0, 200)
     numbers_between("layers: direction", direction, -360, 360)
     numbers_between("layers: strength", share, 0, 1e6, low_open=True)
     winds = speed * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
-    return replace(turbulence, fraction=share, wind_m_per_s=winds.T)
+    return SlopeTurbulence(positions, side, scale, 0.15, OUTER_SCALE_M, share, winds.T)
 
 
 def _longest(frame: NDArray[np.int64], closed: NDArray[np.bool_]) -> tuple[int, int]:

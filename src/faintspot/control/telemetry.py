@@ -93,13 +93,6 @@ def usual_variance(telemetry: OpenLoopTelemetry) -> Floats:
     return np.asarray(1 / np.maximum(information.mean(axis=0), 1e-6))
 
 
-def lagged_covariance(telemetry: OpenLoopTelemetry, lag: int) -> Floats:
-    """Return E[slopes `lag` frames later, slopes], (m, m) px^2; slopes count as far as they are trusted."""
-    weighted, stop = telemetry.trust * telemetry.open_loop_px, len(telemetry) - lag
-    together = telemetry.trust[lag:].T @ telemetry.trust[:stop]
-    return np.asarray(weighted[lag:].T @ weighted[:stop] / np.maximum(together, 1e-12))
-
-
 def replayed(
     make: Callable[[CommandDelayLine], Controller],
     telemetry: OpenLoopTelemetry,

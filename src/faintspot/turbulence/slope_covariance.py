@@ -63,8 +63,12 @@ class SlopeTurbulence:
         total = 0.0
         for strength, (wind_x, wind_y) in zip(part, self.wind_m_per_s, strict=True):
             total = total + strength * self._of_layer(x - wind_x * later_s, y - wind_y * later_s)
-        scale = self.r0_m ** (-5 / 3) * (R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
-        return np.asarray(scale * total)
+        return np.asarray(self.r0_m ** (-5 / 3) * self.px2_per_rad2_per_m2 * total)
+
+    @property
+    def px2_per_rad2_per_m2(self) -> float:
+        """Square of the slope in px of a gradient of 1 rad/m at 500 nm."""
+        return (R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
 
     def turned(self, factor: float, degrees: float) -> Self:
         """Return the same with all winds as many times as fast and turned by an angle."""
@@ -100,19 +104,34 @@ class SlopeTurbulence:
 
     def _of_layer(self, x: Floats, y: Floats) -> Floats:
         """Return the covariance of gradients with such separations, rad^2 m^-2 for r0 = 1 m."""
-        structure = _structure(self.outer_scale_m)
         offsets, which = np.unique(
             np.round(np.column_stack([x.ravel(), y.ravel()]), 9), axis=0, return_inverse=True
         )
         along, across = offsets.T
-        side = self.subaperture_m
-        values = (
-            _same_axis(along, across, side, structure),
-            _both_axes(along, across, side, structure),
-            _same_axis(across, along, side, structure),
-        )
+        values = gradient_covariances(along, across, self.subaperture_m, self.outer_scale_m)
         xx, xy, yy = (each[which.reshape(-1)].reshape(x.shape) for each in values)
         return np.block([[xx, xy], [xy, yy]])
+
+
+def gradient_covariances(along: Floats, across: Floats, side_m: float, outer_scale_m: float) -> Floats:
+    """Return covariances of mean gradients over squares, (3, ...) rad^2 m^-2 for r0 = 1 m: xx, xy, yy.
+
+    Parameters
+    ----------
+    along, across : array
+        Separations along x and y, m.
+    side_m : float
+        Of the squares.
+    outer_scale_m : float
+    """
+    structure = _structure(outer_scale_m)
+    return np.array(
+        [
+            _same_axis(along, across, side_m, structure),
+            _both_axes(along, across, side_m, structure),
+            _same_axis(across, along, side_m, structure),
+        ]
+    )
 
 
 def phase_covariance_rad2(positions_m: Floats, r0_m: float, outer_scale_m: float) -> Floats:
