@@ -311,12 +311,7 @@ def _denoised(image: Floats, settings: fs.Settings, s: int, n: int) -> Denoised:
         settings.values(name, n, image.size)[s] for name in ("noise_std", "tolerance", "max_iterations")
     )
     denoised = tv_denoise(
-        image,
-        float(strength),
-        settings.algorithm,
-        float(tolerance),
-        int(limit),
-        lower=True,
+        image, float(strength), settings.algorithm, float(tolerance), int(limit), lower=True
     )
     return replace(denoised, converged=denoised.converged or tolerance == 0)
 

@@ -339,12 +339,7 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
 
 
 def fixed_window(
-    g: ArrayLike,
-    task: Task,
-    window_fwhm: float,
-    region: float,
-    divisor: float | None,
-    gain: float | None,
+    g: ArrayLike, task: Task, window_fwhm: float, region: float, divisor: float | None, gain: float | None
 ) -> Estimate:
     """Sum pixels under a Gaussian at the reference, over the expected flux, or the frame's own where None.
 

@@ -70,12 +70,7 @@ def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[
 def flat_case(estimator: str, images: NDArray[Any], **changes: Any) -> Case:
     """Images with the simplest settings."""
     n = len(images)
-    chosen: dict[str, Any] = {
-        "threshold_e": 1.0,
-        "spot_fwhm_px": 2.0,
-        "keep_brightest": 5,
-        **changes,
-    }
+    chosen: dict[str, Any] = {"threshold_e": 1.0, "spot_fwhm_px": 2.0, "keep_brightest": 5, **changes}
     score = random_score(np.random.default_rng(0), n) if estimator == "trained" else None
     psf = one_psf() if estimator in FITTED else None
     return Case(

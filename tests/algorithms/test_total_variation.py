@@ -129,12 +129,7 @@ class TestSolution:
         for shape in ((2, 2), (3, 9), (8, 8), (11, 5)):
             g = rng.normal(size=shape) + 4 * np.exp(-(np.linspace(-2, 2, shape[0])[:, None] ** 2))
             result = fs.tv_denoise(
-                g,
-                0.7 * g.std(),
-                algorithm=algorithm,
-                tolerance=0,
-                max_iterations=20_000,
-                full_output=True,
+                g, 0.7 * g.std(), algorithm=algorithm, tolerance=0, max_iterations=20_000, full_output=True
             )
             u, multiplier = result.images, float(result.multiplier)
             v = (g - u) / multiplier

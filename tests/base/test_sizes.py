@@ -61,10 +61,7 @@ CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
     "grid": (of_text("[layout.grid]\nshape = [10000, 10000]\npixels = 16\n"), ("layout.grid.shape",)),
     "pitch": (lambda _: fs.Layout.grid((3, 3), pixels=8, pitch=10_000), ("frame_shape",)),
     "cells": (lambda _: with_cells([[0, 0], [1e300, 0]]), ("layout.cells = 1e+300",)),
-    "map of cells": (
-        lambda _: with_cells([[0, 0], [9999, 9999]]),
-        ("layout.cells = 10000 x 10000",),
-    ),
+    "map of cells": (lambda _: with_cells([[0, 0], [9999, 9999]]), ("layout.cells = 10000 x 10000",)),
     "read noise": (
         of_text(f"{GRID}{SETTINGS}[calibration]\nread_noise_e = 1e200\n"),
         ("read_noise_e = 1e+200",),

@@ -73,11 +73,7 @@ def linked(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("window", "before", "algorithm"),
-    [
-        ((16, 16), DENOISE, FGP),
-        ((10, 10), SMOOTH, CHAMBOLLE),
-    ],
+    ("window", "before", "algorithm"), [((16, 16), DENOISE, FGP), ((10, 10), SMOOTH, CHAMBOLLE)]
 )
 def test_nothing_spills(
     window: tuple[int, int], before: int, algorithm: bool | None, monkeypatch: pytest.MonkeyPatch

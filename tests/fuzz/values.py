@@ -35,8 +35,7 @@ NUMBERS = st.one_of(
 )
 _KINDS: Any = st.sampled_from([np.dtype(kind) for kind in ("f4", "f8", "i8", "u2", "?", "c8", "U3")])
 ARRAYS: Any = arrays_of.arrays(
-    _KINDS,
-    arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=12),
+    _KINDS, arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=12)
 )
 PAIRS = st.lists(st.lists(st.one_of(st.integers(-2, 30), NUMBERS), min_size=1, max_size=3), max_size=9)
 ANYTHING = st.one_of(
@@ -184,24 +183,8 @@ CHECKS: tuple[tuple[Callable[..., None], tuple[Any, ...]], ...] = (
             ),
         ),
     ),
-    (
-        any_psf,
-        (
-            ANYTHING,
-            ANYTHING,
-            ANYTHING,
-            ANYTHING,
-            ANYTHING,
-        ),
-    ),
-    (
-        any_frame,
-        (
-            ANYTHING,
-            ANYTHING,
-            ANYTHING,
-        ),
-    ),
+    (any_psf, (ANYTHING, ANYTHING, ANYTHING, ANYTHING, ANYTHING)),
+    (any_frame, (ANYTHING, ANYTHING, ANYTHING)),
     (any_control, (st.data(),)),
     (any_plug_in, (st.sampled_from(FAULTS), ANYTHING)),
     (any_headers, (HOSTS, st.builds("http://{}".format, HOSTS))),

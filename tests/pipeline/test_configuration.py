@@ -290,10 +290,7 @@ def estimator(text: str) -> str:
         ("estimator.name: expected one of brightest, tv", "[estimator]\nnoise_std = 1"),
         ("estimator = 'newton': expected one of", "[estimator]\nname = 'newton'"),
         ("estimator = 3: expected one of", "[estimator]\nname = 3"),
-        (
-            "estimator.noise_sdt: unknown option of 'tv'; did you mean noise_std?",
-            estimator("noise_sdt = 1"),
-        ),
+        ("estimator.noise_sdt: unknown option of 'tv'; did you mean noise_std?", estimator("noise_sdt = 1")),
         ("estimator.zzz: unknown option of 'tv'; known: flux_floor", estimator("noise_std = 1\nzzz = 1")),
         ("estimator.threshold_e: an option of 'thresholded', not of 'tv'", estimator("threshold_e = 1")),
         ("estimator.flux_e: expected in the table [settings]", estimator("noise_std = 1\nflux_e = 9")),

@@ -121,9 +121,7 @@ def test_another_program_takes_the_stream_of_commands(
         path.unlink()
     environment = {**os.environ, "PYSHMEM_LOCK_DIR": str(tmp_path)}
     with subprocess.Popen(
-        [sys.executable, "-c", code, f"{sky.name}_commands"],
-        env=environment,
-        stdin=subprocess.PIPE,
+        [sys.executable, "-c", code, f"{sky.name}_commands"], env=environment, stdin=subprocess.PIPE
     ) as other:
         try:
             sky.until(lambda: maker(sky) == other.pid)

@@ -190,10 +190,7 @@ def test_stop_while_the_disk_is_slow(name: str, tmp_path: Path, monkeypatch: pyt
         return read(self, start, end)
 
     monkeypatch.setattr(FrameSource, "block", slow)
-    with (
-        open_frames([stored(tmp_path, cube(4))]) as source,
-        PixelRing.create(name, SHAPE, np.uint16) as ring,
-    ):
+    with open_frames([stored(tmp_path, cube(4))]) as source, PixelRing.create(name, SHAPE, np.uint16) as ring:
         player = Replay(source, ring, frame_rate_hz=100.0)
         with player:
             threading.Timer(0.1, stop.set).start()

@@ -15,12 +15,7 @@ from scipy.stats import norm, poisson
 
 from faintspot.base.errors import InputError
 from faintspot.simulate import Detector, spots, subapertures
-from faintspot.spots.bounds import (
-    MEAN_ABSOLUTE,
-    cramer_rao,
-    photon_efficiency,
-    poisson_gaussian_information,
-)
+from faintspot.spots.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency, poisson_gaussian_information
 
 PIXEL_VARIANCE = 1 / 12  # of a position within a pixel: widens a well-sampled spot
 GAUSSIAN_STD = 3 / math.sqrt(2 * math.log(2))  # of a "gaussian" spot of size 3

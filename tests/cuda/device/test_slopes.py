@@ -76,11 +76,7 @@ def test_estimators(estimator: str) -> None:
     frame[2:5, 3:6] += np.uint16(20)
     frame[3, 11:13] += np.uint16(40)
     settings = settings_of(
-        estimator,
-        keep_brightest=9,
-        smoothing_px=[0.6, 0.9, 0.6],
-        threshold_e=5.0,
-        search_range_px=0.4,
+        estimator, keep_brightest=9, smoothing_px=[0.6, 0.9, 0.6], threshold_e=5.0, search_range_px=0.4
     )
     calibration = fs.Calibration(read_noise_e=1.0, bad_pixels=np.array([[0, 0], [3, 4], [3, 5]]))
     reference = np.array([[0.1, -0.2], [0.0, 0.3], [0.2, 0.2]])
