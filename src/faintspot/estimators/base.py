@@ -258,6 +258,8 @@ class EstimatorPlan:
     """Measured flux counts in steps of this factor, so that settings vary slowly."""
     prior_weight_row: int | None = None
     """Of the table of settings: 1 / prior_std_px^2, for a prior whose width may change between frames."""
+    in_python: bool = False
+    """Whether the kernel only calibrates the images, and `locate_frame` finds the positions."""
     fewer_lanes_are_faster: bool = False
     """Whether a group that is not full is measured faster with a narrower vector."""
     variance: float
@@ -280,6 +282,17 @@ class EstimatorPlan:
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """Write those that do, for a flux (electrons) of every sub-aperture; NaN where it is not known."""
+
+    def locate_frame(
+        self,
+        images: NDArray[np.float32],
+        prior: NDArray[np.float32],
+        table: NDArray[np.float32],
+        frame: int,
+        slopes: Any,
+    ) -> None:
+        """Write the slopes of one frame where `in_python`; see `faintspot.estimators.python.PythonPlan`."""
+        raise NotImplementedError
 
     @property
     def tables(self) -> Any:

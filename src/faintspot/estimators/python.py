@@ -59,6 +59,7 @@ class PythonPlan(EstimatorPlan):
 
     kernel = staticmethod(gravity.gravity_of_groups)
     setting_rows = gravity.SETTING_ROWS
+    in_python = True
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         zero = sensor.zero.copy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numba import cuda
@@ -24,11 +24,11 @@ from faintspot.cuda.fused import (
     slopes_kernel,
 )
 from faintspot.cuda.strips import WARP
-from faintspot.estimators.gravity import GravityPlan
 from faintspot.estimators.registry import estimators
 
 if TYPE_CHECKING:
     from faintspot.camera.calibration import Calibration
+    from faintspot.estimators.gravity import GravityPlan
     from faintspot.pipeline.plan import Plan
     from faintspot.sensor.layout import Layout
 
@@ -113,8 +113,7 @@ class DevicePipeline:
     """
 
     def __init__(self, layout: Layout, calibration: Calibration, plan: Plan) -> None:
-        prepared = plan.prepared
-        if not plan.estimator.runs_on_gpu or not isinstance(prepared, GravityPlan):
+        if not plan.estimator.runs_on_gpu:
             able = ", ".join(repr(name) for name, kind in estimators().items() if kind.runs_on_gpu)
             raise InputError(
                 f'estimator = {plan.estimator.name!r}: device="cuda" runs {able}; use one of these or '
@@ -123,6 +122,7 @@ class DevicePipeline:
         self.layout = layout
         self.calibration = calibration
         self._plan = plan
+        prepared = cast("GravityPlan", plan.prepared)  # of all estimators that run on the GPU
         first_step = prepared.first_step
         self._kernel = slopes_kernel(layout.window, prepared.before, first_step.algorithm)
         height, line = layout.frame_shape

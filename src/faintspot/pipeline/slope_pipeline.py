@@ -16,7 +16,6 @@ from faintspot.base.checks import number_between, numbers_between, one_of, real_
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator
-from faintspot.estimators.python import PythonPlan
 from faintspot.kernels.doubtful import flag_doubtful
 from faintspot.kernels.groups import CALIBRATED, STAGE_ROWS, Scratch, SlopeArrays, Source
 from faintspot.kernels.host import lanes_for
@@ -297,7 +296,7 @@ class SlopePipeline:
         results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
         prepared = self.plan.prepared
         stages = _NO_STAGES
-        if explain or isinstance(prepared, PythonPlan):
+        if explain or prepared.in_python:
             stages = np.empty((STAGE_ROWS, n_frames, n, self.layout.pixels), np.float32)
         source = self.source(frames, dtype)
         variants = self._variants(source)
@@ -316,7 +315,7 @@ class SlopePipeline:
         own_scratch = self.plan.own_scratch
         cost = self.plan.estimator.cost
         run_groups(job, n_groups, self._lanes, self.layout.window, self.threads, own_scratch, cost)
-        if isinstance(prepared, PythonPlan):
+        if prepared.in_python:
             images = stages[CALIBRATED].reshape(n_frames, n, *self.layout.window)
             for f in range(n_frames):
                 predicted_f = task.prior[min(f, len(task.prior) - 1)]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.estimators.base import Estimator
-from faintspot.estimators.python import PythonPlan
 from faintspot.estimators.registry import estimator_named
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -92,7 +91,7 @@ class EnginePlan:
         made_for = pipeline, pixels, progress
         path = (
             PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
-            if isinstance(pipeline.plan.prepared, PythonPlan)
+            if pipeline.plan.prepared.in_python
             else FramePath(*made_for, workers=self._workers, prior=self._prior)
         )
         path.warm_up()

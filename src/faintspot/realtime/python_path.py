@@ -75,13 +75,13 @@ class PythonPath(FramePath):
         """Measure a frame, waiting for its rows; see `FramePath.measure`."""
         if not super().measure(number, slot, explain=True):
             return False
-        found = self._spot_fits() if self.fault is None else self.fault
+        found = self._find_positions() if self.fault is None else self.fault
         self.failed = isinstance(found, str)
         positions = None if isinstance(found, str) else found
         self._prepared.write(positions, self._wide.settings, 0, self._results)
         return True
 
-    def _spot_fits(self) -> Found:
+    def _find_positions(self) -> Found:
         """Have the estimator's thread find the positions; set `fault` when it is given up."""
         zero, prior = self._prepared.sensor.zero, self._prior
         self._requests.put(zero.copy() if prior is None else zero + prior.mean_px[0].T)
