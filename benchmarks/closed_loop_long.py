@@ -2,7 +2,7 @@
 
 Engine, page and a cheap sky are processes of their own. Arms take turns, two clients read the page and one
 does not, and every `CHANGE_S` something changes: settings, arms, the loop gain, the loop is opened and
-closed, or a wrong value is refused. The files are those of `faintspot demo --live`.
+closed, or a wrong value is refused. The files are those of `faintspot realtime demo`.
 
 The sky stands for a telescope, which a busy machine cannot simulate a million times within an hour: spots of
 one shape, moved by a disturbance of the mirror's own modes (three sines each) and by what the mirror does

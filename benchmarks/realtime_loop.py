@@ -173,7 +173,7 @@ def _processes(name: str, folder: Path, engine: Path, realisation: int) -> Itera
             str(realisation),
         ]
         started.append(
-            subprocess.Popen([*_COMMAND, "telescope", str(folder / "loop.toml"), *options], **quiet)
+            subprocess.Popen([*_COMMAND, "telescope", "run", str(folder / "loop.toml"), *options], **quiet)
         )
         yield started[-1]
     finally:

@@ -29,7 +29,7 @@ _TINY = {"across": 3, "pixels": 4, "outer_radius": 9, "inner_radius": 0}
 
 def _sustained(name: str, values: dict[str, Any], rate_hz: int) -> Row:
     """Run for SECONDS and count."""
-    camera = ["--rate", str(rate_hz), "--rows-per-block", "8"]
+    camera = ["--frame-rate-hz", str(rate_hz), "--rows-per-block", "8"]
     with engine_and_camera({**values, **USUAL}, camera) as processes:
         first = processes.until_processed(rate_hz // 2)["counters"]
         pids = processes.engine.pid, processes.camera.pid
@@ -56,7 +56,9 @@ def _sustained(name: str, values: dict[str, Any], rate_hz: int) -> Row:
 
 def _long() -> Row:
     """Measure a million frames of a small sensor and compare memory."""
-    with engine_and_camera({**_TINY, **USUAL, "iterations": 2}, ["--rate", str(LONG_RATE_HZ)]) as processes:
+    with engine_and_camera(
+        {**_TINY, **USUAL, "iterations": 2}, ["--frame-rate-hz", str(LONG_RATE_HZ)]
+    ) as processes:
         processes.until_processed(LONG_FRAMES // 100)
         before = resident_bytes(processes.engine.pid)
         while (counters := processes.status()["counters"])["processed"] < LONG_FRAMES:

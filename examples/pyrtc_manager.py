@@ -39,7 +39,15 @@ def beside(what: str) -> Iterator[None]:
     started: list[subprocess.Popen[bytes]] = []
     try:
         if what == TELESCOPE:
-            arguments = ["telescope", "canary", "--rate", str(RATE_HZ), "--write-config", str(BENCH)]
+            arguments = [
+                "telescope",
+                "run",
+                "canary",
+                "--frame-rate-hz",
+                str(RATE_HZ),
+                "--write-config",
+                str(BENCH),
+            ]
             started.append(subprocess.Popen([*FAINTSPOT, *arguments], stdin=subprocess.DEVNULL))
             wait_for("faintspot_frames")
         if what == ENGINE:

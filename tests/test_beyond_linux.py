@@ -88,5 +88,5 @@ def test_the_other_ways_into_real_time_say_so_too(
 ) -> None:
     run = Commands(capsys)
     monkeypatch.setattr(extras, "SHARED_MEMORY", tmp_path / "none")
-    for line in ("live", "demo --live", "realtime advise"):
+    for line in ("live", "realtime demo", "realtime advise"):
         run.refused(*line.split(), naming=("needs shared memory", "which Linux has"))

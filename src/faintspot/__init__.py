@@ -8,9 +8,19 @@ from faintspot.base.lazy import lazy_attributes
 from faintspot.base.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from faintspot import adapters as adapters
+    from faintspot import ao_loop as ao_loop
+    from faintspot import control as control
+    from faintspot import data as data
     from faintspot import estimators as estimators
     from faintspot import experiments as experiments
+    from faintspot import export as export
+    from faintspot import io as io
+    from faintspot import realtime as realtime
     from faintspot import simulate as simulate
+    from faintspot import testing as testing
+    from faintspot import training as training
+    from faintspot import wavefront as wavefront
     from faintspot.algorithms.brightest import brightest_pixels as brightest_pixels
     from faintspot.algorithms.centroid import centre_of_gravity as centre_of_gravity
     from faintspot.algorithms.total_variation import Denoised as Denoised
@@ -39,6 +49,21 @@ if TYPE_CHECKING:
     from faintspot.wavefront import Wavefront as Wavefront
     from faintspot.wavefront import fit_wavefront as fit_wavefront
 
+_PACKAGES = (
+    "adapters",
+    "ao_loop",
+    "control",
+    "data",
+    "estimators",
+    "experiments",
+    "export",
+    "io",
+    "realtime",
+    "simulate",
+    "testing",
+    "training",
+    "wavefront",
+)
 # Where each public name lives. They are imported at first use: `import faintspot` itself stays fast.
 _HOMES = {
     "Calibration": "faintspot.camera.calibration",
@@ -60,17 +85,15 @@ _HOMES = {
     "brightest_pixels": "faintspot.algorithms.brightest",
     "centre_of_gravity": "faintspot.algorithms.centroid",
     "cramer_rao": "faintspot.spots.bounds",
-    "estimators": "faintspot.estimators",
-    "experiments": "faintspot.experiments",
     "fit_wavefront": "faintspot.wavefront",
     "learn_psf": "faintspot.training",
     "measure_images": "faintspot.pipeline.images",
     "measure_detector": "faintspot.camera.photon_transfer",
     "photon_efficiency": "faintspot.spots.bounds",
-    "simulate": "faintspot.simulate",
     "train_estimator": "faintspot.training",
     "tune": "faintspot.experiments",
     "tv_denoise": "faintspot.algorithms.total_variation",
+    **{name: f"faintspot.{name}" for name in _PACKAGES},
 }
 
 __all__ = [*sorted(_HOMES), "__version__"]

@@ -101,7 +101,7 @@ def test_slopes_do_not_depend_on_the_unit_of_the_frames(folder: Path, run: Comma
 @pytest.mark.usefixtures("no_picture")
 def test_gain_goes_into_the_calibration(folder: Path, run: Commands) -> None:
     np.save("a.npy", frames())
-    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain", "2", "--pixels", 16)
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain-e-per-adu", "2", "--pixels", 16)
     assert Calibration.load("new.toml") == Calibration(dark=100.0, gain_e_per_adu=2.0)
 
 
@@ -126,13 +126,18 @@ def test_options(folder: Path, run: Commands) -> None:
     np.savez("a b.npz", night=frames(), day=frames())
     result = run.ok(
         *("layout", "a b.npz", "--key", "night", "-o", "new.toml", "--picture", "p.png"),
-        *("--pitch", "20.5", "--pixels", "12", "--geometry", "square"),
+        *("--pitch-px", "20.5", "--pixels", "12", "--geometry", "square"),
     )
     assert Layout.load("new.toml").window == (12, 12)
     assert is_png(folder / "p.png")
     assert not (folder / "new.png").exists()
     assert "slopes 'a b.npz' --key night --config" in result.out
-    for option, value in (("--pixels", "1"), ("--pitch", "-1"), ("--gain", "0"), ("--gain", "nan")):
+    for option, value in (
+        ("--pixels", "1"),
+        ("--pitch-px", "-1"),
+        ("--gain-e-per-adu", "0"),
+        ("--gain-e-per-adu", "nan"),
+    ):
         result = run.refused("layout", "a b.npz", "--key", "night", "-o", "o.toml", option, value)
         assert option.removeprefix("--") in result.error
     assert not (folder / "o.toml").exists()
@@ -141,7 +146,7 @@ def test_options(folder: Path, run: Commands) -> None:
 @pytest.mark.usefixtures("no_picture")
 def test_exists_already_and_overwrite_keeps_the_calibration(folder: Path, run: Commands) -> None:
     np.save("a.npy", frames())
-    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain", "2")
+    run.ok("layout", "a.npy", "-o", "new.toml", "--dark", "100", "--gain-e-per-adu", "2")
     before = (folder / "new.toml").read_bytes()
     run.refused("layout", "a.npy", "-o", "new.toml", naming=("new.toml", "exists already", "--overwrite"))
     assert (folder / "new.toml").read_bytes() == before
@@ -163,7 +168,7 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     np.save("flat.npy", np.stack([20000 * flat, 20000 * flat]))
     np.save("map.npy", bad)
     np.save("list.npy", np.argwhere(bad))
-    options = ("--dark", "dark.npy", "--flat", "flat.npy", "--read-noise", "3", "--pixels", 16)
+    options = ("--dark", "dark.npy", "--flat", "flat.npy", "--read-noise-e", "3", "--pixels", 16)
     run.ok("layout", "a.npy", "-o", "new.toml", *options, "--bad-pixels", "map.npy")
     calibration = Calibration.load("new.toml")
     np.testing.assert_allclose(calibration.dark, dark)
@@ -174,7 +179,7 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     assert np.asarray(Calibration.load("other.toml").bad_pixels).tolist() == [[3, 5], [40, 41]]
     np.save("dark.npy", dark[:, :10])
     run.refused("layout", "a.npy", "-o", "o.toml", *options, naming=("dark", "(150, 160)"))
-    run.refused("layout", "a.npy", "-o", "o.toml", "--read-noise", "-1", naming=("read_noise_e",))
+    run.refused("layout", "a.npy", "-o", "o.toml", "--read-noise-e", "-1", naming=("read_noise_e",))
     np.save("flat.npy", np.zeros(SHAPE))
     run.refused("layout", "a.npy", "-o", "o.toml", "--flat", "flat.npy", naming=("flat.npy", "above 0"))
 
@@ -182,14 +187,16 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
 @pytest.mark.usefixtures("no_picture")
 def test_scales_on_the_sky_and_in_the_pupil(folder: Path, run: Commands) -> None:
     np.save("a.npy", frames())
-    scales = ("--pixel-scale", 0.4, "--subaperture-size", 0.6, "--diameter", 4.2)
+    scales = ("--pixel-scale-arcsec", 0.4, "--subaperture-m", 0.6, "--diameter-m", 4.2)
     run.ok("layout", "a.npy", "-o", "new.toml", *scales)
     layout = Layout.load("new.toml")
     assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.4, 0.6, 4.2)
-    run.ok("layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixel-scale", 0.5)  # keeps the others
+    run.ok(
+        "layout", "a.npy", "-o", "new.toml", "--overwrite", "--pixel-scale-arcsec", 0.5
+    )  # keeps the others
     layout = Layout.load("new.toml")
     assert (layout.pixel_scale_arcsec, layout.subaperture_m, layout.diameter_m) == (0.5, 0.6, 4.2)
-    run.refused("layout", "a.npy", "-o", "o.toml", "--diameter", 0, naming=("diameter_m = 0",))
+    run.refused("layout", "a.npy", "-o", "o.toml", "--diameter-m", 0, naming=("diameter_m = 0",))
     assert not Path("o.toml").exists()
 
 
@@ -222,7 +229,7 @@ def test_which_lenslets(folder: Path, run: Commands) -> None:
         ("--window", "12", "height and width"),
         ("--window", "1,12", "pixels = 1"),
         ("--illuminated-fraction", "2", "lit-fraction = 2"),
-        ("--pitch", "2", "spots of quad cells overlap"),
+        ("--pitch-px", "2", "spots of quad cells overlap"),
     ):
         assert words in run.refused("layout", "a.npy", "-o", "o.toml", option, value).error
     run.refused(
@@ -245,7 +252,7 @@ def test_numbers_are_plain_and_doubt_is_said(folder: Path, run: Commands) -> Non
 
 def test_pure_noise(folder: Path, run: Commands) -> None:
     np.save("a.npy", np.random.default_rng(3).normal(100, 5, (3, 128, 128)))
-    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch"))
+    run.refused("layout", "a.npy", "-o", "new.toml", naming=("a.npy", "no square or hexagonal", "--pitch-px"))
     np.save("b.npy", np.full((3, 128, 128), np.nan))
     run.refused("layout", "b.npy", "-o", "new.toml", naming=("b.npy", "every pixel is NaN"))
     np.save("c.npy", np.ones((128, 128)))

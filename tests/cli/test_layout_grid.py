@@ -71,7 +71,7 @@ def test_windows_that_are_smaller_than_the_pitch_are_said(folder: Path, run: Com
     ("options", "naming"),
     [
         (("--grid", "8"), "--grid 8"),
-        (("--grid", "8x8", "--pitch", "2"), "--pitch"),
+        (("--grid", "8x8", "--pitch-px", "2"), "--pitch-px"),
         (("--grid", "80x8"), "cells of at least"),
         (("--grid", "8x8", "--illuminated-fraction", "2"), "--illuminated-fraction"),
     ],

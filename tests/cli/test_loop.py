@@ -53,7 +53,7 @@ def test_run_and_report(run: Commands) -> None:
 
 def test_magnitude(run: Commands) -> None:
     result = run(
-        "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--arms", "brightest", "-o", "here"
+        "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--methods", "brightest", "-o", "here"
     )
     assert result.code == 0, result.err
     assert result.out.splitlines()[0].split() == ["photo-electrons", "40", "400"]
@@ -61,7 +61,7 @@ def test_magnitude(run: Commands) -> None:
 
 
 def test_budget(run: Commands) -> None:
-    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--arms", "centroid")
+    result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--methods", "centroid")
     assert result.code == 0, result.err
     lines = result.out.splitlines()
     assert lines[0].split() == ["without", "centre", "of", "gravity"]
@@ -70,10 +70,10 @@ def test_budget(run: Commands) -> None:
 
 
 def test_engine_files_close_the_loop(run: Commands) -> None:
-    """What `tune --loop` has chosen stays, and an engine has all that it needs."""
+    """What `loop tune` has chosen stays, and an engine has all that it needs."""
     Path("bench").mkdir()
     Path("bench/faintspot.toml").write_text('[estimator]\nname = "centroid"\n', encoding="utf-8")
-    result = run("loop", "engine", "small.toml", "-o", "bench", "--rate", 100)
+    result = run("loop", "engine", "small.toml", "-o", "bench", "--frame-rate-hz", 100)
     assert result.out.endswith("next: faintspot realtime run --config bench/faintspot.toml --close-loop\n")
     settings = configuration.load_all("bench/faintspot.toml").settings
     control = load_control("bench/faintspot.toml")
@@ -88,10 +88,10 @@ def test_engine_files_close_the_loop(run: Commands) -> None:
     [
         (["run", "nowhere.toml"], "nowhere.toml: no such file; none of the shipped configurations"),
         (["show", "nowhere"], "nowhere: no such file"),
-        (["engine", "small.toml", "--rate", "0"], "frame_rate_hz"),
-        (["magnitude", "small.toml", "--arms", "kog"], "arm = 'kog': expected one of"),
-        (["magnitude", "small.toml", "--photons", "1,x"], "--photons: expected numbers with commas, got 'x'"),
-        (["magnitude", "small.toml", "--photons", "-1"], "photons"),
+        (["engine", "small.toml", "--frame-rate-hz", "0"], "frame_rate_hz"),
+        (["magnitude", "small.toml", "--methods", "kog"], "arm = 'kog': expected one of"),
+        (["magnitude", "small.toml", "--flux-e", "1,x"], "--flux-e: expected numbers with commas, got 'x'"),
+        (["magnitude", "small.toml", "--flux-e", "-1"], "photons"),
         (["run", "small.toml", "-o", "no/where"], "the folder no does not exist"),
         (["budget", "open_loop"], "expected 'closed' for an error budget"),
     ],

@@ -41,7 +41,7 @@ def test_camera_file_and_options_that_count_more(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "camera.toml").write_text(
-        "[camera]\nread_noise_e = 2.0\npixels = 8\n[spot]\nfwhm_px = 1.8\nlenslet_m = 0.5\n"
+        "[camera]\nread_noise_e = 2.0\npixels = 8\n[spot]\nfwhm_px = 1.8\nsubaperture_m = 0.5\n"
         "[star]\nmagnitude = 9.0\nframe_rate_hz = 500\n[tune]\nbudget = 0.2\n"
         "[layout.grid]\nshape = [4, 4]\npixels = 8\n"
     )
@@ -82,7 +82,7 @@ def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     np.save("frames.npy", simulated())
     LAYOUT.save("layout.toml")
-    arguments = ("--frames", "frames.npy", "--layout", "layout.toml", "--gain-e-per-adu", 1)
+    arguments = ("--recording", "frames.npy", "--layout", "layout.toml", "--gain-e-per-adu", 1)
     result = run.ok("tune", *arguments, "--flux-e", 150)
     assert "PSF learnt" in result.out
     assert len(SlopePipeline.from_file("faintspot.toml").layout) == 16
@@ -100,23 +100,14 @@ def test_from_frames(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ((*KNOWN, "--grid", "7-7"), ("--grid", "7x7")),
         ((*KNOWN, "--grid", "7x7", "--layout", "a.toml"), ("--grid", "--layout")),
         ((*KNOWN, "--layout", "nothere.toml"), ("nothere.toml",)),
-        ((*KNOWN, "--dark", "dark.fits"), ("--frames",)),
+        ((*KNOWN, "--dark", "dark.fits"), ("--recording",)),
         ((*KNOWN, "-o", "nofolder/faintspot.toml"), ("nofolder",)),
-        (("--loop", "nothere"), ("nothere", "shipped")),
-        (("--loop", "canary", "--read-noise-e", 3), ("--read-noise-e", "without --loop")),
-        (("--loop", "canary", "--frames", "a.fits", "--grid", "7x7"), ("--frames, --grid",)),
-        (("--loop", "canary", "--magnitude", 9, "--photons", 10), ("--magnitude", "both")),
-        (("--loop", "canary", "--magnitudes", "8"), ("--magnitudes 8", "8,14")),
-        (("--loop", "canary", "--strehl", 2), ("strehl = 2",)),
-        (("--loop", "canary", "--arms", "kog"), ("kog",)),
-        (("--loop", "canary", "-o", "nofolder/faintspot.toml"), ("nofolder",)),
-        ((*KNOWN, "--strehl", 0.3, "--magnitudes", "8,9"), ("--magnitudes, --strehl", "with --loop")),
         (("--camera", "nothere.toml"), ("nothere.toml",)),
         (("--camera", "broken.toml"), ("broken.toml", "TOML")),
         (("--camera", "typo.toml"), ("read_noise", "did you mean read_noise_e")),
         (("--camera", "table.toml"), ("cameras", "did you mean camera")),
         (("--camera", "layout.toml"), ("layout.grid.shape",)),
-        (("--frames", "nothere.fits"), ("nothere.fits",)),
+        (("--recording", "nothere.fits"), ("nothere.fits",)),
     ],
 )
 def test_mistakes_are_named_in_one_line(
@@ -135,6 +126,25 @@ def test_mistakes_are_named_in_one_line(
     assert not (tmp_path / "faintspot.toml").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "naming"),
+    [
+        (("nothere",), ("nothere", "shipped")),
+        (("canary", "--read-noise-e", 3), ("--read-noise-e",)),
+        (("canary", "--magnitude", 9, "--flux-e", 10), ("--magnitude", "both")),
+        (("canary", "--magnitudes", "8"), ("--magnitudes 8", "8,14")),
+        (("canary", "--strehl", 2), ("strehl = 2",)),
+        (("canary", "--methods", "kog"), ("kog",)),
+        (("canary", "-o", "nofolder/faintspot.toml"), ("nofolder",)),
+    ],
+)
+def test_mistakes_about_a_loop_are_named_in_one_line(
+    run: Commands, arguments: tuple[str, ...], naming: tuple[str, ...], folder: Path
+) -> None:
+    run.refused("loop", "tune", *arguments, naming=naming)
+    assert not (folder / "faintspot.toml").exists()
+
+
 def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a made-up answer; how it comes about is tested where it is made."""
     monkeypatch.chdir(tmp_path)
@@ -146,8 +156,9 @@ def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(loop_tuning, "tune_loop", made)
     result = run.ok(
-        *("tune", "--loop", "diffraction_limit", "--magnitudes", "9,13", "--magnitude", "12"),
-        *("--arms", "tv, map+kalman", "--strehl", 0.3, "--radius", 20, "--minutes", 2, "--workers", 1),
+        *("loop", "tune", "diffraction_limit", "--magnitudes", "9,13", "--magnitude", "12"),
+        *("--methods", "tv, map+kalman", "--strehl", 0.3, "--radius-arcsec", 20),
+        *("--minutes", 2, "--workers", 1),
     )
     question = asked["question"]
     assert isinstance(question, LoopQuestion)

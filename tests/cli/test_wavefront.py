@@ -14,7 +14,7 @@ from faintspot.io import read_slopes
 from faintspot.pipeline.slopes import Slopes
 from faintspot.wavefront import fit_wavefront
 
-SCALES = ("--pixel-scale", 0.4, "--diameter", 4.2)
+SCALES = ("--pixel-scale-arcsec", 0.4, "--diameter-m", 4.2)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_table_picture_and_files(run: Commands, slopes: Path) -> None:
 def test_without_scales_it_says_its_unit(run: Commands, slopes: Path) -> None:
     result = run.ok("wavefront", slopes, "--modes", 5)
     assert "In pixels times sub-apertures" in result.out
-    assert "--pixel-scale" in result.out
+    assert "--pixel-scale-arcsec" in result.out
     assert "Z6" in result.out
     assert "Z7" not in result.out
 
@@ -80,6 +80,6 @@ def test_refused(run: Commands, slopes: Path) -> None:
     run.refused("wavefront", "nothing.npz", naming=("nothing.npz",))
     run.refused("wavefront", slopes, "-o", "w.txt", naming=("w.txt", ".csv, .json, .fits"))
     run.refused("wavefront", slopes, "--modes", 30, naming=("modes = 30", "from 2 to 24"))
-    run.refused("wavefront", slopes, "--pixel-scale", -1, naming=("pixel_scale_arcsec", "-1"))
+    run.refused("wavefront", slopes, "--pixel-scale-arcsec", -1, naming=("pixel_scale_arcsec", "-1"))
     run.ok("slopes", "frames.npy", "-o", "slopes.csv")
     run.refused("wavefront", "slopes.csv", naming=("slopes.csv", "layout"))

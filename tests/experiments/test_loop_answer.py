@@ -154,7 +154,7 @@ def test_without_turbulence_above_the_ground_the_radius_must_be_given() -> None:
     answer = made_up()
     answer = replace(answer, question=replace(answer.question, configuration=ground))
     assert answer.coverage("window", "galactic pole") is None
-    assert "--radius" in loop_text.about_the_sky(answer)[0]
+    assert "--radius-arcsec" in loop_text.about_the_sky(answer)[0]
     answer = replace(answer, question=replace(answer.question, radius_arcsec=10.0))
     assert answer.coverage("window", "galactic pole") is not None
 

@@ -10,8 +10,8 @@ from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
 
 KNOWN: dict[str, Any] = {"read_noise_e": 3.0, "pixels": 16, "fwhm_px": 2.0, "flux_e": 100.0}
-OPTICS: dict[str, Any] = {"lenslet_m": 0.5, "wavelength_nm": 600.0, "pixel_scale_arcsec": 0.125}
-STAR: dict[str, Any] = {"lenslet_m": 0.5, "frame_rate_hz": 500.0, "magnitude": 10.0}
+OPTICS: dict[str, Any] = {"subaperture_m": 0.5, "wavelength_nm": 600.0, "pixel_scale_arcsec": 0.125}
+STAR: dict[str, Any] = {"subaperture_m": 0.5, "frame_rate_hz": 500.0, "magnitude": 10.0}
 
 
 def without(name: str) -> dict[str, Any]:
@@ -78,9 +78,9 @@ def test_width_of_a_psf_is_without_the_pixel() -> None:
         ({"flux_e": 0.0}, "flux_e"),
         ({"flux_e": 1e-3}, "flux_e"),
         ({"magnitude": 10.0}, "expected one of them"),
-        ({"flux_e": None, "magnitude": 10.0}, "lenslet_m"),
+        ({"flux_e": None, "magnitude": 10.0}, "subaperture_m"),
         ({"flux_e": None, **STAR, "magnitude": 40.0}, "magnitude"),
-        ({"r0_m": 0.1}, "lenslet_m"),
+        ({"r0_m": 0.1}, "subaperture_m"),
         ({**OPTICS, "r0_m": 0.01}, "r0_m"),
         ({**OPTICS, "r0_m": 0.1, "profile": "gaussian"}, "profile"),
         ({"throughput": 40.0}, "throughput"),

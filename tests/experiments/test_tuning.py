@@ -48,7 +48,12 @@ def test_tv_is_not_recommended_for_gaussian_spots_without_read_noise() -> None:
 
 def test_speckled_spots_are_measured_without_trusting_their_mean() -> None:
     answer = answered(
-        fwhm_px=None, lenslet_m=0.6, wavelength_nm=650.0, pixel_scale_arcsec=0.112, r0_m=0.15, flux_e=500.0
+        fwhm_px=None,
+        subaperture_m=0.6,
+        wavelength_nm=650.0,
+        pixel_scale_arcsec=0.112,
+        r0_m=0.15,
+        flux_e=500.0,
     )
     assert answer.question.d_over_r0 > 2
     # What is blurred or allowed to be wrong is nearer to the truth than the sharp PSF.

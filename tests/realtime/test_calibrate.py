@@ -90,14 +90,14 @@ def test_what_is_refused(files: tuple[Path, Control], tmp_path: Path) -> None:
     path.write_text((files[0]).read_text().split("[control]")[0])
     with running(files) as sky:
         assert "--commands: expected the number" in str(calibrated(path, sky).exception)
-        kept = calibrated(path, sky, "--keep-reference", "--commands", "5")
+        kept = calibrated(path, sky, "--keep-reference", "--actuators", "5")
         assert "--keep-reference: expected reference_slopes in [control]" in str(kept.exception)
         stream = pyshmem.create(f"{sky.name}_commands", shape=(COMMANDS,), dtype=np.float32)
-        somebody = calibrated(path, sky, "--commands", str(COMMANDS))
+        somebody = calibrated(path, sky, "--actuators", str(COMMANDS))
         assert "a living process publishes under this name" in str(somebody.exception)
         stream.unlink()
         # A mirror that does not follow: the stream has another length than it expects.
-        deaf = calibrated(path, sky, "--commands", "3", "--rounds", "6")
+        deaf = calibrated(path, sky, "--actuators", "3", "--rounds", "6")
         assert "the mirror does not answer: pokes of 50" in str(deaf.exception)
         assert "[control]" not in path.read_text()
         large = ("--amplitude", "60", "--commands", "3")
@@ -107,8 +107,8 @@ def test_what_is_refused(files: tuple[Path, Control], tmp_path: Path) -> None:
         )
         assert not path.with_suffix(".control.npz").exists()
     assert "no engine" in str(
-        calibrated(path, sky, "--commands", "3").exception
-    ) or "there is no telemetry" in (str(calibrated(path, sky, "--commands", "3").exception))
+        calibrated(path, sky, "--actuators", "3").exception
+    ) or "there is no telemetry" in (str(calibrated(path, sky, "--actuators", "3").exception))
 
 
 def test_an_engine_that_ends_while_it_is_poked(files: tuple[Path, Control]) -> None:

@@ -236,7 +236,18 @@ def config(tmp_path: Path) -> Path:
 
 def test_command(config: Path, name: str) -> None:
     assert isinstance(camera, click.Command)
-    options = ["--config", str(config), "--name", name, "--rate", "400", "--frames", "20", "--distinct", "5"]
+    options = [
+        "--config",
+        str(config),
+        "--name",
+        name,
+        "--frame-rate-hz",
+        "400",
+        "--frames",
+        "20",
+        "--distinct",
+        "5",
+    ]
     result = CliRunner().invoke(camera, [*options, "--bits", "12", "--offset-adu", "50", "--seed", "1"])
     assert result.exit_code == 0, result.output
     first, last = result.output.splitlines()
@@ -261,7 +272,7 @@ def test_the_camera_is_the_one_that_the_configuration_describes(
     monkeypatch.setattr(camera_module, "Camera", enough)
     Calibration(100.0, gain_e_per_adu=0.5, em_gain=20.0, read_noise_e=30.0).save(config)
     options = ["--config", str(config), "--name", name]
-    for more in ([], ["--offset-adu", "0", "--gain", "2", "--em-gain", "1", "--read-noise-e", "0"]):
+    for more in ([], ["--offset-adu", "0", "--gain-e-per-adu", "2", "--em-gain", "1", "--read-noise-e", "0"]):
         assert CliRunner().invoke(camera, [*options, *more]).exit_code == 1
     configured, given = seen
     assert (configured.offset_adu, configured.gain_e_per_adu) == (100.0, 0.5)
@@ -271,7 +282,10 @@ def test_the_camera_is_the_one_that_the_configuration_describes(
 
 def test_command_refuses(config: Path, name: str) -> None:
     options = ["--config", str(config), "--name", name, "--frames", "1", "--distinct", "1"]
-    for more, text in ((["--rate", "-5"], "frame_rate_hz = -5"), (["--name", "a/b"], "name = 'a/b'")):
+    for more, text in (
+        (["--frame-rate-hz", "-5"], "frame_rate_hz = -5"),
+        (["--name", "a/b"], "name = 'a/b'"),
+    ):
         result = CliRunner().invoke(camera, [*options, *more])
         assert isinstance(result.exception, InputError)
         assert text in str(result.exception)
@@ -285,7 +299,7 @@ def test_command_refuses(config: Path, name: str) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_command_ends_in_order(config: Path, name: str, number: signal.Signals) -> None:
     code = "from faintspot.cli.realtime_camera import camera; camera()"
-    options = ["--config", str(config), "--name", name, "--rate", "200", "--distinct", "5"]
+    options = ["--config", str(config), "--name", name, "--frame-rate-hz", "200", "--distinct", "5"]
     process = subprocess.Popen(
         [sys.executable, "-c", code, *options],
         env={**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])},

@@ -50,7 +50,19 @@ def name() -> str:
 def processes(name: str, tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Start camera and engine; end them."""
     (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
-    camera = ["camera", "--name", name, "--rate", "200", "--offset-adu", "100", "--bits", "16", "--seed", "3"]
+    camera = [
+        "camera",
+        "--name",
+        name,
+        "--frame-rate-hz",
+        "200",
+        "--offset-adu",
+        "100",
+        "--bits",
+        "16",
+        "--seed",
+        "3",
+    ]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     started = []
     for arguments in (["run", "--name", name], camera):

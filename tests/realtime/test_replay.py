@@ -248,7 +248,7 @@ def no_head_start(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_head_start")
 def test_command(name: str, tmp_path: Path) -> None:
     path = stored(tmp_path, cube(30))
-    options = [str(path), "--name", name, "--rate", "2000", "--first", "5", "--frames", "20"]
+    options = [str(path), "--name", name, "--frame-rate-hz", "2000", "--first", "5", "--frames", "20"]
     result = CliRunner().invoke(replay, options)
     assert result.exit_code == 0, result.output
     first, last = result.stdout.splitlines()
@@ -270,7 +270,7 @@ def test_command_waits(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_command_refuses(name: str, tmp_path: Path) -> None:
     path = str(stored(tmp_path, cube(4)))
     for more, text in (
-        ([path, "--rate", "-5"], "frame_rate_hz = -5"),
+        ([path, "--frame-rate-hz", "-5"], "frame_rate_hz = -5"),
         ([path, "--first", "9"], "first = 9"),
         ([str(tmp_path / "none.npy")], "none.npy"),
     ):
@@ -285,7 +285,7 @@ def test_command_ends_in_order(name: str, tmp_path: Path, number: signal.Signals
     path = stored(tmp_path, cube(30))
     code = "from faintspot.cli.realtime_sources import replay; replay()"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(path), "--name", name, "--rate", "200", "--repeat"],
+        [sys.executable, "-c", code, str(path), "--name", name, "--frame-rate-hz", "200", "--repeat"],
         env={**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -323,7 +323,7 @@ def test_commands_over_the_socket(watched: Watched, name: str, monkeypatch: pyte
     for command, options in ((telescope_set, ["photons=1"]), (telescope_status, [])):
         refused = CliRunner().invoke(command, [*options, "--name", name])
         assert isinstance(refused.exception, InputError)
-        assert "faintspot realtime telescope starts one" in str(refused.exception)
+        assert "faintspot realtime telescope run starts one" in str(refused.exception)
 
 
 # ---- pace, ends and restarts
@@ -365,9 +365,9 @@ def test_two_of_one_name_and_nothing_left_behind(watched: Watched, name: str) ->
 
 def started(name: str, *options: str) -> subprocess.Popen[str]:
     """Start the command; returns when it has published frames."""
-    code = "from faintspot.cli.realtime_telescope import telescope; telescope()"
+    code = "from faintspot.cli.realtime_telescope import run; run()"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, "canary", "--name", name, "--rate", "100", *options],
+        [sys.executable, "-c", code, "canary", "--name", name, "--frame-rate-hz", "100", *options],
         env={
             **os.environ,
             "PYTHONPATH": str(Path(faintspot.__file__).parents[1]),

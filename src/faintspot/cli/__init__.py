@@ -12,20 +12,21 @@ import click
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.version import __version__
+from faintspot.cli.commands import Group
 
 _COMMANDS = {
     "demo": "Simulate a faint star, measure it with and without denoising, and write a report.",
-    "doctor": "Say what is installed, what this machine allows, and what to do about what is missing.",
+    "doctor": "Check the installation and this machine, and say how to add what is missing.",
     "estimators": "List the estimators, or the options of one.",
-    "export": "Write settings as the files that other controllers read.",
+    "export": "Export settings as files for other controllers.",
     "layout": "Find the sub-apertures in a frame and write a configuration.",
     "live": "Show a running engine, or a recording, as a web page.",
-    "loop": "Measure what a method gains in a closed adaptive-optics loop, in simulation.",
-    "realtime": "Measure frames as they arrive, row by row, and publish slopes in shared memory.",
-    "report": "Make a web page of pictures and tables from slopes or a study.",
-    "slopes": "Turn recorded frames into slopes.",
-    "study": "Measure how large the slope error is, by Monte-Carlo simulation.",
-    "tune": "Say which estimator and settings suit a camera and a star.",
+    "loop": "Compare methods in a simulated closed loop, and recommend one.",
+    "realtime": "Measure frames as they arrive and publish slopes and commands.",
+    "report": "Write a web page of pictures and tables from slopes, studies or telemetry.",
+    "slopes": "Measure slopes from recorded frames.",
+    "study": "Measure the slope error by Monte-Carlo simulation.",
+    "tune": "Recommend an estimator and settings for a camera and a star.",
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }
 
@@ -34,7 +35,7 @@ class _Interrupted(Exception):
     """Ctrl-C, under a name that click does not print anything for."""
 
 
-class _LazyGroup(click.Group):
+class _LazyGroup(Group):
     """Imports a command's module only when it is used, so that --help answers at once."""
 
     def list_commands(self, context: click.Context) -> list[str]:
@@ -56,10 +57,9 @@ class _LazyGroup(click.Group):
         except KeyboardInterrupt:
             raise _Interrupted from None
 
-    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands without importing them."""
-        with formatter.section("Commands"):
-            formatter.write_dl(list(_COMMANDS.items()))
+    def summary(self, context: click.Context, name: str) -> str:
+        """Return a command's line without importing it."""
+        return _COMMANDS[name]
 
 
 @click.group(
@@ -70,22 +70,22 @@ class _LazyGroup(click.Group):
 @click.version_option(__version__, prog_name="faintspot")
 @click.pass_context
 def group(context: click.Context) -> None:
-    """Wavefront slopes from faint Shack-Hartmann spots.
+    """Measure wavefront slopes from faint Shack-Hartmann spots.
 
-    Removes the noise of each sub-aperture image by total-variation minimisation, subtracts the background by
-    keeping the brightest pixels, and takes the centre of gravity (Basden et al. 2015, arXiv:1503.06043).
+    Estimators from brightest pixels to maximum likelihood, the choice between them for a camera and a star,
+    closed-loop simulation, and an engine that turns pixels into slopes and commands in real time.
 
     \b
-    With frames of your own:
+    With recorded frames:
       faintspot layout frames.fits -o faintspot.toml
       faintspot slopes frames.fits --config faintspot.toml -o slopes.zarr
       faintspot report slopes.zarr
 
     \b
-    Without:
+    Without frames:
       faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
+      faintspot loop tune diffraction_limit
       faintspot demo
-      faintspot study paper --quick
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
@@ -121,8 +121,7 @@ def main(arguments: list[str] | None = None) -> Any:
         sys.exit(2)
     except (click.Abort, _Interrupted):
         click.echo(
-            "faintspot: interrupted; run the same command again (slopes and studies go on where they "
-            "stopped)",
+            "faintspot: interrupted; the same command continues slopes, studies and loops where they stopped",
             err=True,
         )
         sys.exit(130)

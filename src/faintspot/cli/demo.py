@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-from click.core import ParameterSource
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
-from faintspot.cli import demo_live
+from faintspot.cli.commands import option
 from faintspot.cli.needs import can_make
 from faintspot.cli.progress import progress_bar
 from faintspot.experiments import demonstration
@@ -30,39 +29,25 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
-@click.option("--output", "-o", default="faintspot-demo", show_default=True, help="Folder for what it makes.")
-@click.option(
-    "--frames", type=click.IntRange(20), default=600, show_default=True, help="Frames at each flux."
-)
-@click.option(
-    "--seed", type=click.IntRange(0), default=2015, show_default=True, help="Seed of the simulation."
-)
-@demo_live.live_options
-@click.pass_context
-def command(context: click.Context, /, live: bool, output: str, frames: int, seed: int, **_: Any) -> None:
+@option("--output", "-o", default="faintspot-demo", help="Folder for what it makes.")
+@option("--frames", type=click.IntRange(20), default=600, help="Frames at each flux.")
+@option("--seed", type=click.IntRange(0), default=2015, help="Seed of the simulation.")
+def command(output: str, frames: int, seed: int) -> None:
     """Simulate a faint star, measure it with and without denoising, and write a report.
 
-    A CANARY-like sensor: 7 x 7 sub-apertures of which 36 are lit, 16 x 16 pixels, Nyquist-sampled diffraction
-    spots at random known positions, an EMCCD at gain 500. At six fluxes both arms are measured: brightest
-    pixels and centre of gravity, with and without denoising. What can be chosen (pixels kept, strength) is
-    chosen on one half of the frames and scored on the other.
+    A CANARY-like sensor: 7 x 7 sub-apertures of which 36 are illuminated, 16 x 16 pixels, Nyquist-sampled
+    diffraction spots at random known positions, an EMCCD at gain 500. Brightest pixels and centre of gravity
+    are measured with and without denoising at six fluxes. Number of pixels kept and strength are chosen on
+    one half of the frames and scored on the other.
 
-    The folder then holds the frames of one flux, their configuration, the slopes of both arms and the report
+    The folder then holds the frames of one flux, their configuration, both sets of slopes and the report
     page, made by the same commands that you would use on frames of your own. The page needs the extra `web`.
-
-    With --live a simulated telescope, the real-time engine and its web page run together: the loop is closed
-    on a faint star, estimators take turns, and at the end a table says what each was worth. Needs the extras
-    `realtime`, `live` and `loop`; Linux.
+    `faintspot realtime demo` shows the closed loop in real time.
 
     \b
-    Examples:
+    Example:
       faintspot demo -o /tmp/demo --frames 2000
-      faintspot demo --live
     """
-    _check_kind(context)
-    if live:
-        demo_live.show_live(context.params)
-        return
     folder = Path(output)
     with_report = can_make("report page", "web", "matplotlib", "jinja2")
     try:
@@ -82,21 +67,8 @@ def command(context: click.Context, /, live: bool, output: str, frames: int, see
     else:
         click.echo(f"{folder}: frames, configurations and slopes")
     click.echo(
-        "With frames of your own: faintspot layout --help; in real time, on a page: faintspot demo --live"
+        "With frames of your own: faintspot layout --help; in real time, on a page: faintspot realtime demo"
     )
-
-
-def _check_kind(context: click.Context) -> None:
-    """Refuse options of the other demonstration."""
-    given = {
-        name for name in context.params if context.get_parameter_source(name) == ParameterSource.COMMANDLINE
-    }
-    if "live" in given:
-        wrong, why = given - {"live", *demo_live.NAMES, *demo_live.SHARED}, "without --live"
-    else:
-        wrong, why = given & set(demo_live.NAMES), "with --live"
-    if wrong:
-        raise InputError(f"{', '.join(f'--{name}' for name in sorted(wrong))}: expected only {why}")
 
 
 def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
@@ -165,7 +137,7 @@ def write_page(folder: Path, arms: list[Arm], **shown: Any) -> None:
 
     facts = {
         "Source": "simulated, with known truth",
-        "Light": f"{demonstration.SHOWN_FLUX_E:g} e- per sub-aperture and frame",
+        "Flux": f"{demonstration.SHOWN_FLUX_E:g} e- per sub-aperture and frame",
         "Positions": f"uniform within +-{demonstration.POSITION_RANGE_PX:g} px",
         "Camera": "EMCCD, gain 500, read noise 45 e- at the output (0.09 e- referred to photo-electrons)",
     }

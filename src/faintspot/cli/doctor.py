@@ -7,11 +7,12 @@ from dataclasses import asdict
 
 import click
 
+from faintspot.cli.commands import option
 from faintspot.cli.examination import examine
 
 
 @click.command(short_help="Say what is installed, what this machine allows, and what to do.")
-@click.option("--json", "as_json", is_flag=True, help="As JSON: name, value and advice of each finding.")
+@option("--json", "as_json", is_flag=True, help="As JSON: name, value and advice of each finding.")
 def command(as_json: bool) -> None:
     """Say what is installed, what this machine allows, and what to do about what is missing.
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import click
 
+from faintspot.cli.commands import option
 from faintspot.estimators.documentation import all_tables, allowed_in_words, needs_in_words
 from faintspot.estimators.registry import estimator_named, estimators
 
 
 @click.command(short_help="List the estimators, or the options of one.")
 @click.argument("name", required=False)
-@click.option("--markdown", is_flag=True, help="Print the tables of the documentation.")
+@option("--markdown", is_flag=True, help="Print the tables of the documentation.")
 def command(name: str | None, markdown: bool) -> None:
     """List the estimators, those of installed packages too; or the options of the one that is named.
 

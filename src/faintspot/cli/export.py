@@ -6,27 +6,27 @@ from typing import Any
 
 import click
 
+from faintspot.cli.commands import Group, option
 from faintspot.cli.shared_options import REFERENCE, configuration_option
 
 _CONFIG = configuration_option("What to export.")
 
 
-@click.group(short_help="Write settings as the files that other controllers read.")
+@click.group(cls=Group, short_help="Write settings as the files that other controllers read.")
 def command() -> None:
     """Write settings as the files that other controllers read."""
 
 
 @command.command("darc")
 @_CONFIG
-@click.option("--output", "-o", metavar="FOLDER", default="darc", show_default=True, help="A new folder.")
+@option("--output", "-o", metavar="FOLDER", default="darc", help="A new folder.")
 @REFERENCE
-@click.option("--no-control", is_flag=True, help="Without the control matrix of [control].")
-@click.option(
+@option("--no-control", is_flag=True, help="Without the control matrix of [control].")
+@option(
     "--format",
     "form",
     type=click.Choice(["fits", "npy"]),
     default="fits",
-    show_default=True,
     help="Format of arrays.",
 )
 def darc(config: str, output: str, reference: str | None, no_control: bool, form: str) -> None:
@@ -51,9 +51,7 @@ def darc(config: str, output: str, reference: str | None, no_control: bool, form
 
 @command.command("weights")
 @_CONFIG
-@click.option(
-    "--output", "-o", metavar="FITS", default="weights.fits", show_default=True, help="What to write."
-)
+@option("--output", "-o", metavar="FITS", default="weights.fits", help="What to write.")
 @REFERENCE
 def weights(config: str, output: str, reference: str | None) -> None:
     """Write the weights of estimator window as FITS.

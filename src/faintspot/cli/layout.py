@@ -16,8 +16,10 @@ from faintspot.base.files import derived
 from faintspot.camera.calibration import Calibration
 from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.cli import layout_grid, layout_options
+from faintspot.cli.commands import SectionedCommand, WindowSide, option
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import can_make, suggested_slopes
+from faintspot.cli.shared_options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
 from faintspot.experiments.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import configuration
@@ -30,103 +32,114 @@ _MOST_FRAMES = 200  # averaged to find the spots
 _MOST_NAMED = 12  # sub-apertures in one line
 _FIRST_FRAMES = 20  # measured for the settings
 _FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
+_ARRAY, _WINDOWS, _CAMERA = "Lenslet array", "Windows", "Camera"
 # What the finder calls what these options give.
 _OPTIONS = {
-    "pitch_px": "--pitch",
+    "pitch_px": "--pitch-px",
     "illuminated_fraction": "--illuminated-fraction",
     "bad_pixels": "--bad-pixels",
 }
 
 
-@click.command(short_help="Find the sub-apertures in a frame and write a configuration.")
+@click.command(
+    cls=SectionedCommand, short_help="Find the sub-apertures in a frame and write a configuration."
+)
 @click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
-@click.option(
-    "--output",
-    "-o",
-    metavar="TOML",
-    default="faintspot.toml",
-    show_default=True,
-    help="Configuration to write.",
+@option(
+    "--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", help="Packing.", section=_ARRAY
 )
-@click.option(
-    "--picture", metavar="PNG", help="Where to draw the frame and the grid. Default: beside the output."
-)
-@click.option(
-    "--geometry",
-    type=click.Choice(["auto", *GEOMETRIES]),
-    default="auto",
-    show_default=True,
-    help="How the lenslets are packed.",
-)
-@click.option(
+@option("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets.", section=_ARRAY)
+@option(
     "--grid",
     metavar="ROWSxCOLUMNS",
-    help="Rows and columns of an array that fills the frame or --roi, such as quad cells; only which "
+    help="Rows and columns of an array that fills the frame or --roi, such as quad cells; then only which "
     "lenslets are illuminated is searched for.",
+    section=_ARRAY,
 )
-@click.option("--pitch", type=float, metavar="PX", help="Distance of neighbouring lenslets, if you know it.")
-@click.option(
-    "--pixels", type=int, metavar="N", help="Side of a window. Default: the largest without overlap."
-)
-@click.option("--window", metavar="NY,NX", help="Height and width of a window that is not square, pixels.")
-@click.option(
-    "--illuminated-fraction",
-    type=float,
-    metavar="PART",
-    help="Least flux of a lit lenslet, as a part of the median. Default: where fewest are, 0.18 to 0.5; "
-    "with --grid 0.3.",
-)
-@click.option(
-    "--pupil",
-    metavar="X,Y,R[,INNER]",
-    help="Centre and radius, pixels, of the disk whose lenslets are taken, lit or not; with the inner radius "
-    "of an annulus.",
-)
-@click.option(
-    "--exclude",
-    metavar="LIST",
-    help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
-)
-@click.option(
+@option(
     "--roi",
     metavar="X0,Y0,X1,Y1",
     help="Look only at columns X0 to X1 - 1 and rows Y0 to Y1 - 1 of the frame.",
+    section=_ARRAY,
 )
-@click.option(
+@option(
+    "--illuminated-fraction",
+    type=float,
+    metavar="PART",
+    help="Least flux of an illuminated lenslet, as a part of the median.",
+    show_default="where fewest are, 0.18 to 0.5; with --grid 0.3",
+    section=_ARRAY,
+)
+@option(
+    "--pupil",
+    metavar="X,Y,R[,INNER]",
+    help="Centre and radius [px] of the disk, or annulus, whose lenslets are taken, illuminated or not.",
+    section=_ARRAY,
+)
+@option(
+    "--exclude",
+    metavar="LIST",
+    help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
+    section=_ARRAY,
+)
+@option(
+    "--pixels",
+    type=WindowSide(),
+    help="Side of a window.",
+    show_default="the largest without overlap",
+    section=_WINDOWS,
+)
+@option(
+    "--window",
+    metavar="NY,NX",
+    help="Height and width [px] of a window that is not square.",
+    section=_WINDOWS,
+)
+@option(
     "--move-windows",
     is_flag=True,
-    help="Move all windows alike, off their spots, to save lenslets at the frame's edge.",
+    help="Move all windows alike, off their spots, to keep lenslets at the frame's edge.",
+    section=_WINDOWS,
 )
-@click.option(
+@option(
     "--dark",
     metavar="FILE|ADU",
     help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU.",
+    section=_CAMERA,
 )
-@click.option("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
-@click.option(
-    "--bad-pixels", metavar="FILE", help="Map that is not 0 where a pixel is bad, or rows of row, column."
+@option(
+    "--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.", section=_CAMERA
 )
-@click.option(
-    "--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: 1, frames in electrons."
+@option(
+    "--bad-pixels",
+    metavar="FILE",
+    help="Map that is not 0 where a pixel is bad, or rows of row, column.",
+    section=_CAMERA,
 )
-@click.option("--read-noise", type=float, metavar="E", help="Read noise in electrons, for the configuration.")
-@click.option(
+@option(
     "--mask-hot-pixels",
     is_flag=True,
     help="Enter isolated bright pixels and pairs as bad pixels. Not for spots sharper than Nyquist sampling.",
+    section=_CAMERA,
 )
-@click.option(
-    "--pixel-scale",
+@option(
+    "--gain-e-per-adu",
     type=float,
-    metavar="ARCSEC",
-    help="Side of a pixel on the sky: for slopes in arcsec, wavefronts.",
+    metavar="E/ADU",
+    help="Electrons per ADU.",
+    show_default="1, frames in electrons",
+    section=_CAMERA,
 )
-@click.option(
-    "--subaperture-size", type=float, metavar="M", help="Side of a sub-aperture in the telescope's pupil."
+@option("--read-noise-e", type=float, metavar="E", help="Read noise.", section=_CAMERA)
+@PIXEL_SCALE
+@SUBAPERTURE
+@DIAMETER
+@option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
+@option(
+    "--picture", metavar="PNG", help="Picture of frame and grid to write.", show_default="beside the output"
 )
-@click.option("--diameter", type=float, metavar="M", help="Diameter of the telescope's pupil.")
-@click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
-@click.option(
+@option(
     "--overwrite",
     is_flag=True,
     help="Replace the layout and settings of an existing configuration; its calibration stays.",
@@ -137,7 +150,7 @@ def command(
     picture: str | None,
     geometry: str,
     grid: str | None,
-    pitch: float | None,
+    pitch_px: float | None,
     pixels: int | None,
     window: str | None,
     illuminated_fraction: float | None,
@@ -148,22 +161,23 @@ def command(
     dark: str | None,
     flat: str | None,
     bad_pixels: str | None,
-    gain: float | None,
-    read_noise: float | None,
+    gain_e_per_adu: float | None,
+    read_noise_e: float | None,
     mask_hot_pixels: bool,
-    pixel_scale: float | None,
-    subaperture_size: float | None,
-    diameter: float | None,
+    pixel_scale_arcsec: float | None,
+    subaperture_m: float | None,
+    diameter_m: float | None,
     key: str | None,
     overwrite: bool,
 ) -> None:
     """Find the sub-apertures in a frame and write a configuration.
 
     FRAME is a file with spots, from one frame to many of the same field (the first 200 are averaged). Square
-    and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are lit.
+    and hexagonal lenslet arrays are found without hints: pitch, angle, offset, and which lenslets are
+    illuminated.
     Spots of quad cells (2 x 2 pixels) overlap and cannot be found; --grid gives the array. A picture shows
     the frame with the windows that were found: look at it. --illuminated-fraction, --pupil, --exclude correct
-    which are lit.
+    it.
 
     A configuration with settings but no layout, as `faintspot tune` writes it without frames, keeps them.
     Else the settings written beside the layout are a start: a centre of gravity under a weight that follows
@@ -174,7 +188,7 @@ def command(
     \b
     Examples:
       faintspot layout flat_wavefront.fits -o faintspot.toml
-      faintspot layout cube.npz --dark dark.fits --gain 1.9 --pixels 16
+      faintspot layout cube.npz --dark dark.fits --gain-e-per-adu 1.9 --pixels 16
       faintspot layout eye.fits --pupil 512,498,320,40 --exclude 0-3,57
       faintspot layout quad_cells.fits --grid 40x40 --dark dark.fits
     """
@@ -184,18 +198,23 @@ def command(
         raise InputError(f"{output}: exists already; --overwrite replaces its layout and settings")
     options = {
         "geometry": geometry,
-        "pitch_px": pitch,
+        "pitch_px": pitch_px,
         "pixels": layout_options.window(pixels, window),
         "illuminated_fraction": illuminated_fraction,
         "pupil": layout_options.numbers("--pupil", pupil, (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
         "roi": layout_options.numbers("--roi", roi, (4,), "X0,Y0,X1,Y1 in pixels"),
         "move_windows": move_windows,
     }
-    optics = layout_options.optics(target, pixel_scale, subaperture_size, diameter)
+    optics = layout_options.optics(target, pixel_scale_arcsec, subaperture_m, diameter_m)
     with_picture = can_make("picture", "web", "matplotlib", asked=picture is not None)
     with open_frames(frames, key=key) as source:
         calibration = layout_options.calibration(
-            target, dark=dark, flat=flat, bad_pixels=bad_pixels, gain_e_per_adu=gain, read_noise_e=read_noise
+            target,
+            dark=dark,
+            flat=flat,
+            bad_pixels=bad_pixels,
+            gain_e_per_adu=gain_e_per_adu,
+            read_noise_e=read_noise_e,
         )
         mean = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
@@ -209,7 +228,7 @@ def command(
         layout = replace(found.layout[kept], **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
-    unit = "ADU" if gain is None and calibration.gain_e_per_adu == 1.0 else "e-"
+    unit = "ADU" if gain_e_per_adu is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
     if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
         likely = float(f"{(calibration.read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
@@ -235,7 +254,9 @@ def command(
     for line in [*lines, *_describe_settings(settings, layout, seen, unit), *notes]:
         click.echo(line)
     if unit == "ADU":
-        click.echo("  gain unknown: these settings do not depend on it, standard errors do; --gain gives it")
+        click.echo(
+            "  gain unknown (--gain-e-per-adu): these settings do not depend on it, standard errors do"
+        )
     if drawn:
         click.echo(f"  {drawn}")
     arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", suggested_slopes()]
@@ -267,7 +288,7 @@ def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, 
     if seen.response < 1:
         lines.append(
             f"  the flux of single frames is too low for full slopes: they show {seen.response:.2f} of the "
-            "displacements; `faintspot tune --frames` says what is possible"
+            "displacements; `faintspot tune --recording` says what is possible"
         )
     return lines
 
@@ -282,7 +303,7 @@ def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
     ]
     lines += layout_options.largest_window_note(layout)
     if found.lenslets.doubt:
-        lines.append(f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch, --pupil)")
+        lines.append(f"  doubtful: {found.lenslets.doubt} (see the picture; try --pitch-px, --pupil)")
     if len(found.cut):
         lines.append(
             f"  {len(found.cut)} lit lenslets at the frame's edge left out, their windows do not fit: "

@@ -14,7 +14,7 @@ from faintspot.sensor.known_grid import KnownGrid, find_illuminated
 from faintspot.sensor.layout import Layout
 
 _QUAD_CELL = 2  # pixels on a side
-_ONLY_WITHOUT = {"geometry": "--geometry", "pitch_px": "--pitch", "move_windows": "--move-windows"}
+_ONLY_WITHOUT = {"geometry": "--geometry", "pitch_px": "--pitch-px", "move_windows": "--move-windows"}
 
 
 def illuminated(

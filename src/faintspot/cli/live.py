@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from faintspot.base.extras import require, require_linux
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import ENGINE_NAME
 
@@ -26,26 +27,27 @@ _NICENESS = 5  # the engine comes first
 @click.command(short_help="Show a running engine, or a recording, as a web page.")
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
 @ENGINE_NAME
-@click.option(
+@option(
     "--bind",
     default="127.0.0.1",
-    show_default=True,
     metavar="ADDRESS",
     help="Address of this machine to listen on.",
 )
-@click.option(
+@option(
     "--port",
     type=click.IntRange(0, 65535),
     default=8642,
-    show_default=True,
     help="Port of the page; 0: any that is free.",
 )
-@click.option("--private", is_flag=True, help="Watching needs the token also on this machine.")
-@click.option(
-    "--folder",
+@option("--private", is_flag=True, help="Watching needs the token also on this machine.")
+@option(
+    "--output",
+    "-o",
+    "folder",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     default=".",
-    help="For recordings that the page begins. Default: this one.",
+    help="Folder for recordings that the page begins.",
+    metavar="FOLDER",
 )
 def command(recording: Path | None, name: str, bind: str, port: int, private: bool, folder: Path) -> None:
     """Serve a web page of the running engine NAME until Ctrl-C.

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from faintspot.cli.commands import Group, option
+from faintspot.cli.loop_tune import tune
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 
@@ -24,44 +26,49 @@ _needs_loop = needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
 
 def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of every experiment."""
-    for option in (
-        click.option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
-        click.option(
-            "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use: tcp://HOST:PORT."
+    for each in (
+        option("--overwrite", is_flag=True, help="Replace another experiment in the folder."),
+        option(
+            "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use instead: tls://HOST:PORT."
         ),
-        click.option(
+        option(
             "--workers",
             type=click.IntRange(0),
             metavar="N",
-            help="Processes on this machine. Default: all processors. 0: this process.",
+            help="Processes on this machine; 0: this process alone.",
+            show_default="all processors",
         ),
-        click.option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
-        click.option(
+        option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
+        option(
             "--output",
             "-o",
             metavar="FOLDER",
-            help="Where results go. Default: the configuration's name, or name-quick.",
+            help="Where results go.",
+            show_default="NAME, or NAME-quick",
         ),
         click.argument("configuration", metavar="[CONFIG]", default="canary"),
     ):
-        command = option(command)
+        command = each(command)
     return command
 
 
-@click.group(name="loop", short_help="Measure what a method gains in a closed adaptive-optics loop.")
+@click.group(name="loop", cls=Group, short_help="Compare methods in a simulated closed loop.")
 def command() -> None:
-    """Measure what a method gains in a closed adaptive-optics loop, in simulation.
+    """Compare methods in a simulated closed loop, and recommend one.
 
     Telescope, turbulence, Shack-Hartmann sensor, camera, mirror and control are simulated; slopes come from
-    the same pipeline as everywhere. CONFIG is a TOML file or the name of a shipped configuration; default:
-    canary. Needs the extra `loop`. Interrupted and started again, the commands go on where they stopped.
+    the same pipeline as everywhere. CONFIG is a TOML file or the name of a shipped configuration. Needs the
+    extra `loop`. An interrupted command continues where it stopped.
 
     \b
     Examples:
-      faintspot loop run --quick
-      faintspot loop magnitude camera_3e --arms brightest,smoothed,tv
+      faintspot loop tune diffraction_limit
+      faintspot loop magnitude camera_3e --methods brightest,smoothed,tv
       faintspot loop show canary > mine.toml
     """
+
+
+command.add_command(tune)
 
 
 @command.command(name="list", short_help="List the shipped configurations.")
@@ -90,10 +97,10 @@ def show(name: str) -> None:
 
 
 @_needs_loop
-@command.command(short_help="Observe with and without denoising in turn.")
+@command.command(short_help="Observe alternately with and without denoising.")
 @_experiment_options
 def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **where: Any) -> None:
-    """Observe with and without TV denoising in turn, as on the sky.
+    """Observe alternately with and without TV denoising, as on the sky.
 
     Four sets: two at full multiplication gain of the camera and two at 75 %; in each, a measurement without
     denoising, then 8 or 20 strengths rising from 0 to 2 electrons, repeated, while the turbulence drifts.
@@ -118,23 +125,26 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
 @_needs_loop
 @command.command(short_help="Measure the Strehl ratio against the star's magnitude.")
 @_experiment_options
-@click.option("--arms", metavar="NAMES", help="Methods to compare, with commas. Default: all that suit.")
-@click.option(
-    "--photons", metavar="NUMBERS", help="Photo-electrons of a sub-aperture in a frame, with commas."
+@option("--methods", metavar="NAMES", help="Methods to compare, with commas.", show_default="all that suit")
+@option(
+    "--flux-e",
+    metavar="NUMBERS",
+    help="Fluxes with commas, photo-electrons per sub-aperture and frame.",
+    show_default="four times to an eighth of the configuration's",
 )
 def magnitude(
     configuration: str,
     output: str | None,
     quick: bool,
     overwrite: bool,
-    arms: str | None,
-    photons: str | None,
+    methods: str | None,
+    flux_e: str | None,
     **where: Any,
 ) -> None:
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
-    Each method is tuned at each flux, its settings and the loop gain together, on air that is not scored.
-    Methods: every estimator by its name (`faintspot estimators` lists them); after the name may follow
+    Each method is tuned at each flux, its settings and the loop gain together, on other turbulence. Methods:
+    every estimator by its name (`faintspot estimators` lists them); after the name may follow
     _predicted (its prior is what the loop predicts), _weighted (slopes count by their standard errors) and
     _uncorrected (slopes are not divided by the centroid gain), and then the control: +modal, +polc or +kalman
     in place of the integrator.
@@ -142,8 +152,8 @@ def magnitude(
     \b
     Examples:
       faintspot loop magnitude --quick
-      faintspot loop magnitude diffraction_limit --arms map_predicted,map+kalman --photons 20
-      faintspot loop magnitude camera_3e --arms brightest,smoothed,tv,ml --photons 60,200,640
+      faintspot loop magnitude diffraction_limit --methods map_predicted,map+kalman --flux-e 20
+      faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
     from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.loop_verdict import magnitude_summary
@@ -151,8 +161,8 @@ def magnitude(
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
-    fluxes = None if photons is None else [_number(text) for text in _listed(photons)]
-    names = None if arms is None else _arms(arms)
+    fluxes = None if flux_e is None else [_number(text) for text in _listed(flux_e)]
+    names = None if methods is None else _methods(methods)
     with _worker_pool(**where) as place:
         result = run_magnitude(loop, folder, names, fluxes, quick=quick, place=place, overwrite=overwrite)
     click.echo(magnitude_summary(result))
@@ -160,13 +170,13 @@ def magnitude(
 
 
 @_needs_loop
-@command.command(short_help="Say what limits the Strehl ratio, by switching terms off.")
+@command.command(short_help="Measure what limits the Strehl ratio.")
 @_experiment_options
-@click.option("--arms", metavar="NAMES", help="Methods, with commas. Default: brightest,smoothed,tv.")
+@option("--methods", metavar="NAMES", help="Methods, with commas.", show_default="brightest,smoothed,tv")
 def budget(
-    configuration: str, output: str | None, quick: bool, overwrite: bool, arms: str | None, **where: Any
+    configuration: str, output: str | None, quick: bool, overwrite: bool, methods: str | None, **where: Any
 ) -> None:
-    """Say what limits the Strehl ratio, by switching terms of the error off.
+    """Measure what limits the Strehl ratio, by switching off one term of the error after another.
 
     At the configuration's own flux, each method is tuned and then runs without photon and read noise, without
     delay of the loop, without what the mirror cannot correct, with its actual centroid gain, and with the
@@ -182,7 +192,7 @@ def budget(
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
-    names = None if arms is None else _arms(arms)
+    names = None if methods is None else _methods(methods)
     with _worker_pool(**where) as place:
         result = run_budget(loop, folder, names, quick=quick, place=place, overwrite=overwrite)
     click.echo(budget_summary(result))
@@ -192,28 +202,20 @@ def budget(
 @needs("loop", "hcipy")
 @command.command(short_help="Write what a real-time engine needs, [control] included.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
-@click.option(
-    "--folder",
-    "-o",
-    default=".",
-    show_default=True,
-    metavar="FOLDER",
-    help="Folder for faintspot.toml and matrices.",
-)
-@click.option(
+@option("--output", "-o", default=".", metavar="FOLDER", help="Folder for faintspot.toml and matrices.")
+@option(
     "--control",
     type=click.Choice(["integrator", "modal", "polc", "kalman"]),
     default="integrator",
-    show_default=True,
-    help="All but the integrator learn from the simulated loop for up to a minute.",
+    help="Control; all but the integrator learn from the simulated loop for up to a minute.",
 )
-@click.option("--rate", type=float, metavar="HZ", help="Frames a second. Default: the configuration's.")
-def engine(configuration: str, folder: str, control: str, rate: float | None) -> None:
+@option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate.", show_default="CONFIG")
+def engine(configuration: str, output: str, control: str, frame_rate_hz: float | None) -> None:
     """Write faintspot.toml with which `faintspot realtime run --close-loop` closes this loop.
 
     Layout, calibration, PSF and [control] with interaction matrix, reference slopes and centroid gain, from
     the simulation. Estimator, settings and whatever else faintspot.toml says already stay, such as what
-    `faintspot tune --loop` has chosen; without an estimator it gets the 20 brightest pixels.
+    `faintspot loop tune` has chosen; without an estimator it gets the 20 brightest pixels.
 
     \b
     Examples:
@@ -224,9 +226,9 @@ def engine(configuration: str, folder: str, control: str, rate: float | None) ->
     from faintspot.ao_loop.engine_files import write_engine_files
 
     loop = load_loop(configuration)
-    if rate is not None:
-        loop = loop.replace("control", frame_rate_hz=rate)
-    path = write_engine_files(loop, folder, control)
+    if frame_rate_hz is not None:
+        loop = loop.replace("control", frame_rate_hz=frame_rate_hz)
+    path = write_engine_files(loop, output, control)
     click.echo(f"{path} written; next: faintspot realtime run --config {shlex.quote(str(path))} --close-loop")
 
 
@@ -247,8 +249,8 @@ def _listed(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
 
 
-def _arms(text: str) -> list[str]:
-    """Return the arms that are asked for; say of those that could be told a prediction that they are not."""
+def _methods(text: str) -> list[str]:
+    """Return the methods that are asked for; name those that could use the loop's prediction but do not."""
     from faintspot.experiments.loop_arms import arm_kind
 
     names = _listed(text)
@@ -267,7 +269,7 @@ def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"--photons: expected numbers with commas, got {text!r}") from None
+        raise InputError(f"--flux-e: expected numbers with commas, got {text!r}") from None
 
 
 def _report(folder: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import click
 
 from faintspot.cli import (
@@ -9,24 +11,38 @@ from faintspot.cli import (
     realtime_calibrate,
     realtime_camera,
     realtime_control,
+    realtime_control_loop,
+    realtime_demo,
     realtime_estimators,
     realtime_learn,
-    realtime_loop,
     realtime_record,
     realtime_run,
     realtime_sources,
     realtime_telescope,
 )
+from faintspot.cli.commands import Group
 from faintspot.cli.needs import needs_linux
 
 
-@click.group("realtime")
+class _RealTime(Group):
+    """Lists its commands by what they are for."""
+
+    sections: ClassVar = {
+        "Engine": ("run", "status", "top", "get", "set", "interleave", "control", "stop"),
+        "Estimators": ("load", "swap", "unload"),
+        "Sources of frames": ("camera", "replay", "bridge", "telescope", "demo"),
+        "Calibration and control": ("calibrate", "learn"),
+        "Telemetry": ("record", "export", "advise"),
+    }
+
+
+@click.group("realtime", cls=_RealTime)
 def command() -> None:
-    """Run the slope computation in real time: pixels stream in, slopes stream out (Linux).
+    """Measure frames as they arrive and publish slopes and commands (Linux).
 
     \b
     In three terminals:
-      faintspot realtime camera --config faintspot.toml --rate 500
+      faintspot realtime camera --config faintspot.toml --frame-rate-hz 500
       faintspot realtime run --config faintspot.toml
       faintspot realtime top
     """
@@ -38,15 +54,14 @@ for each in (
     realtime_sources.replay,
     realtime_sources.bridge,
     realtime_telescope.telescope,
-    realtime_telescope.telescope_set,
-    realtime_telescope.telescope_status,
+    realtime_demo.demo,
     realtime_control.status,
     realtime_control.top,
     realtime_control.get,
     realtime_control.set_settings,
     realtime_control.interleave,
     realtime_control.stop_engine,
-    realtime_loop.loop,
+    realtime_control_loop.control,
     realtime_calibrate.calibrate,
     realtime_estimators.load,
     realtime_estimators.swap,

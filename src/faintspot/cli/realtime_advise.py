@@ -9,6 +9,7 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require_linux
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.shared_options import ENGINE_NAME, configuration_option
@@ -22,14 +23,13 @@ if TYPE_CHECKING:
 @click.command("advise", short_help="Measure flux, noise, turbulence and centroid gain from telemetry.")
 @configuration_option("Configuration of the engine.")
 @ENGINE_NAME
-@click.option(
+@option(
     "--seconds",
     type=click.FloatRange(1),
     default=10.0,
-    show_default=True,
     help="Seconds of telemetry to look at.",
 )
-@click.option(
+@option(
     "--from",
     "store",
     type=click.Path(path_type=Path),

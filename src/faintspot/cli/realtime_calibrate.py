@@ -8,6 +8,7 @@ import click
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.files import derived
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import configuration_option, name_option
 
@@ -16,47 +17,43 @@ from faintspot.cli.shared_options import configuration_option, name_option
 @click.command("calibrate", short_help="Measure interaction matrix and reference slopes.")
 @configuration_option("Configuration that gets [control].")
 @name_option("Name of the engine and the streams.")
-@click.option(
-    "--commands",
+@option(
+    "--actuators",
     type=click.IntRange(1),
     metavar="N",
-    help="Commands of the mirror. Default: as before, or as simulated.",
+    help="Actuators of the mirror.",
+    show_default="as before, or as simulated",
 )
-@click.option(
+@option(
     "--amplitude",
     type=float,
     default=50.0,
-    show_default=True,
     help="Amplitude of a poke, in the mirror's unit.",
 )
-@click.option(
+@option(
     "--error",
     type=click.FloatRange(0, 1, min_open=True),
     default=0.05,
-    show_default=True,
     help="Relative error of an actuator's slopes that half of the actuators must reach.",
 )
-@click.option("--rounds", type=click.IntRange(4), default=100, show_default=True, help="Most rounds.")
-@click.option(
+@option("--rounds", type=click.IntRange(4), default=100, help="Most rounds.")
+@option(
     "--settle-frames",
     type=click.IntRange(1),
     default=3,
-    show_default=True,
     help="Frames until a command acts.",
 )
-@click.option(
-    "--frames", type=click.IntRange(2), default=2, show_default=True, help="Frames averaged for each poke."
-)
-@click.option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
+@option("--frames-per-poke", type=click.IntRange(2), default=2, help="Frames averaged for each poke.")
+@option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
 def calibrate(
     config: str,
     name: str,
-    commands: int | None,
+    actuators: int | None,
     amplitude: float,
     error: float,
     rounds: int,
     settle_frames: int,
-    frames: int,
+    frames_per_poke: int,
     keep_reference: bool,
 ) -> None:
     """Poke the mirror up and down and measure what the slopes do, for [control] of the configuration.
@@ -87,9 +84,9 @@ def calibrate(
     stroke = None if former is None else former.options.largest_command
     if stroke is not None and amplitude > stroke:
         raise InputError(f"--amplitude {amplitude:g}: expected at most largest_command, {stroke:g}")
-    number = commands or _known_commands(former, name)
+    number = actuators or _known_commands(former, name)
     with (
-        StreamedMirror(name, number, settle_frames=settle_frames, frames=frames) as mirror,
+        StreamedMirror(name, number, settle_frames=settle_frames, frames=frames_per_poke) as mirror,
         progress_bar("pokes", "rounds") as advance,
     ):
         total: Any = None
@@ -122,7 +119,7 @@ def _known_commands(former: Any, name: str) -> int:
     try:
         return int(request(socket_path(name, TELESCOPE), "status")["commands"]["length"])
     except InputError:
-        raise InputError("--commands: expected the number of the mirror's commands, got none") from None
+        raise InputError("--actuators: expected the number of actuators of the mirror, got none") from None
 
 
 def _in_words(found: Any) -> list[str]:

@@ -11,46 +11,110 @@ from typing import Any
 
 import click
 
+from faintspot.cli.commands import SectionedCommand, option
 from faintspot.cli.shared_options import configuration_option, name_option
 
+_SPOTS, _DETECTOR, _KNOWN = "Spots", "Detector", "the configuration's"
 
-@click.command("camera", short_help="Simulate a camera that publishes frames row by row.")
+
+@click.command(
+    "camera", cls=SectionedCommand, short_help="Simulate a camera that publishes frames row by row."
+)
 @configuration_option("Configuration; its layout says where the spots are.")
 @name_option("Name of the pixel ring, in shared memory.")
-@click.option("--rate", type=float, metavar="HZ", default=500.0, show_default=True, help="Frames a second.")
-@click.option("--flux-e", type=float, default=200.0, show_default=True, help="Per sub-aperture and frame.")
-@click.option(
+@option("--frame-rate-hz", type=float, metavar="HZ", default=500.0, help="Frame rate.")
+@option(
+    "--flux-e",
+    type=float,
+    metavar="E",
+    default=200.0,
+    help="Electrons per sub-aperture and frame.",
+    section=_SPOTS,
+)
+@option(
     "--profile",
     type=click.Choice(["diffraction", "gaussian"]),
     default="diffraction",
-    show_default=True,
     help="Shape of the spots.",
+    section=_SPOTS,
 )
-@click.option(
-    "--size", type=float, default=1.0, show_default=True, help="Width of the spots; 1 is Nyquist sampling."
+@option(
+    "--size",
+    type=float,
+    metavar="SIZE",
+    default=1.0,
+    help="Width of the spots; 1 is Nyquist sampling.",
+    section=_SPOTS,
 )
-@click.option("--motion-px", type=float, default=0.3, show_default=True, help="Standard deviation per axis.")
-@click.option("--motion-time", type=float, metavar="S", default=0.01, show_default=True, help="Correlation.")
-@click.option("--read-noise-e", type=float, help="At the output. Default: the configuration's, else 1.")
-@click.option("--background-e", type=float, default=0.0, show_default=True, help="Per pixel and frame.")
-@click.option("--dark-e", type=float, default=0.0, show_default=True, help="Per pixel and frame.")
-@click.option("--em-gain", type=float, help="1: no multiplication. Default: the configuration's.")
-@click.option("--gain", type=float, metavar="E/ADU", help="Electrons per ADU. Default: the configuration's.")
-@click.option("--offset-adu", type=float, help="Level of every pixel. Default: the configuration's dark.")
-@click.option("--bits", type=int, help="Bits of the converter, for whole ADU. Default: continuous values.")
-@click.option(
+@option("--motion-px", type=float, metavar="PX", default=0.3, help="Rms motion per axis.", section=_SPOTS)
+@option(
+    "--motion-time-s",
+    type=float,
+    metavar="S",
+    default=0.01,
+    help="Correlation time of the motion.",
+    section=_SPOTS,
+)
+@option(
+    "--read-noise-e",
+    type=float,
+    metavar="E",
+    help="Read noise at the output.",
+    show_default="the configuration's, else 1",
+    section=_DETECTOR,
+)
+@option(
+    "--background-e", type=float, metavar="E", default=0.0, help="Sky per pixel and frame.", section=_DETECTOR
+)
+@option(
+    "--dark-e",
+    type=float,
+    metavar="E",
+    default=0.0,
+    help="Dark current per pixel and frame.",
+    section=_DETECTOR,
+)
+@option(
+    "--em-gain", type=float, metavar="G", help="EM gain; 1: none.", show_default=_KNOWN, section=_DETECTOR
+)
+@option(
+    "--gain-e-per-adu",
+    type=float,
+    metavar="E/ADU",
+    help="Electrons per ADU.",
+    show_default=_KNOWN,
+    section=_DETECTOR,
+)
+@option(
+    "--offset-adu",
+    type=float,
+    metavar="ADU",
+    help="Level of every pixel.",
+    show_default="the configuration's dark",
+    section=_DETECTOR,
+)
+@option(
+    "--bits",
+    type=int,
+    help="Bits of the converter, for whole ADU.",
+    show_default="continuous values",
+    section=_DETECTOR,
+)
+@option(
     "--readout-fraction",
     type=float,
+    metavar="PART",
     default=0.8,
-    show_default=True,
     help="Read-out, as a part of the frame time.",
 )
-@click.option("--rows-per-block", type=int, default=4, show_default=True, help="Rows published together.")
-@click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
-@click.option("--distinct", type=int, default=200, show_default=True, help="Frames simulated, then repeated.")
-@click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
-@click.option("--seed", type=click.IntRange(0), help="Seed of the simulation. Default: another each time.")
-def camera(config: str, name: str, rate: float, frames: int | None, slots: int, **options: Any) -> None:
+@option("--rows-per-block", type=int, default=4, help="Rows published together.")
+@option("--slots", type=int, default=4, help="Frames in the ring.")
+@option("--distinct", type=int, default=200, help="Frames simulated, then repeated.")
+@option("--frames", type=int, help="Stop after this number of frames.", show_default="at Ctrl-C")
+@option("--seed", type=click.IntRange(0), help="Seed of the simulation.", show_default="another each time")
+def camera(
+    config: str, name: str, frame_rate_hz: float, frames: int | None, slots: int, **options: Any
+) -> None:
     """Simulate a camera that publishes frames row by row, for `faintspot realtime run`.
 
     Spots move about the centres of the sub-apertures; rows become readable one block after the other at the
@@ -59,7 +123,7 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
 
     \b
     Example:
-      faintspot realtime camera --config faintspot.toml --rate 1000 --flux-e 50 --read-noise-e 0.5
+      faintspot realtime camera --config faintspot.toml --frame-rate-hz 1000 --flux-e 50 --read-noise-e 0.5
     """
     import numpy as np
 
@@ -81,7 +145,7 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
         dark_e=options["dark_e"],
         background_e=options["background_e"],
         em_gain=given("em_gain", known.em_gain),
-        gain_e_per_adu=given("gain", known.gain_e_per_adu),
+        gain_e_per_adu=given("gain_e_per_adu", known.gain_e_per_adu),
         offset_adu=given("offset_adu", dark),
         bits=options["bits"],
     )
@@ -90,12 +154,12 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
         source = Camera(
             layout,
             ring,
-            frame_rate_hz=rate,
+            frame_rate_hz=frame_rate_hz,
             flux_e=options["flux_e"],
             detector=detector,
             profile=options["profile"],
             size=options["size"],
-            motion=SpotMotion(options["motion_px"], options["motion_time"]),
+            motion=SpotMotion(options["motion_px"], options["motion_time_s"]),
             readout_fraction=options["readout_fraction"],
             rows_per_block=options["rows_per_block"],
             n_distinct=options["distinct"],
@@ -103,8 +167,8 @@ def camera(config: str, name: str, rate: float, frames: int | None, slots: int, 
         )
         rows, columns = layout.frame_shape
         click.echo(
-            f"{name}: {rows} x {columns} pixels ({dtype}), {len(layout)} sub-apertures, {rate:g} frames/s; "
-            "Ctrl-C stops"
+            f"{name}: {rows} x {columns} pixels ({dtype}), {len(layout)} sub-apertures, "
+            f"{frame_rate_hz:g} frames/s; Ctrl-C stops"
         )
         with stop_on_signal() as stop:
             report = source.run(frames, stop)

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from faintspot.cli.commands import option
 from faintspot.cli.engine_requests import asked_at_length
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.shared_options import ENGINE_NAME
@@ -18,9 +19,9 @@ _REFRESH_S = 0.5
 
 @click.command("status")
 @ENGINE_NAME
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def status(name: str, as_json: bool) -> None:
-    """Say what a running engine has seen and how fast it is."""
+    """Show counters, latencies and the loop of a running engine."""
     reply = _asked(name, "status")
     click.echo(json.dumps(reply, indent=1) if as_json else summary(reply))
 
@@ -39,7 +40,9 @@ def get(name: str, settings: tuple[str, ...]) -> None:
 
 @click.command("set", short_help="Change settings of a running engine, between two frames.")
 @ENGINE_NAME
-@click.option("--subapertures", metavar="LIST", help="Which, such as 4,5,10-20. Default: all.")
+@option(
+    "--subapertures", metavar="LIST", help="Sub-apertures to change, such as 4,5,10-20.", show_default="all"
+)
 @click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
 def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) -> None:
     """Change settings of a running engine between two frames, all at once or not at all.
@@ -59,18 +62,18 @@ def set_settings(name: str, subapertures: str | None, changes: tuple[str, ...]) 
     click.echo(since(reply["frame"]))
 
 
-@click.command("interleave", short_help="Have settings take turns in a running engine.")
+@click.command("interleave", short_help="Alternate between settings in a running engine.")
 @ENGINE_NAME
-@click.argument("arms")
-@click.option("--every", type=click.IntRange(1), default=50, show_default=True, help="Frames of each turn.")
-def interleave(name: str, arms: str, every: int) -> None:
-    """Have settings take turns in a running engine: ARMS as of run --interleave; "set" ends it.
+@click.argument("methods")
+@option("--every", type=click.IntRange(1), default=50, help="Frames for each in turn.")
+def interleave(name: str, methods: str, every: int) -> None:
+    """Alternate between settings in a running engine: METHODS as of run --interleave; "set" ends it.
 
     \b
     Example:
       faintspot realtime interleave none,tv --every 100
     """
-    reply = asked_at_length(name, "interleave", arms=arms, every=every)
+    reply = asked_at_length(name, "interleave", arms=methods, every=every)
     click.echo(since(reply["frame"]))
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import click
 
 from faintspot.base.errors import InputError
+from faintspot.cli.commands import option
 from faintspot.cli.engine_requests import asked_at_length
 from faintspot.cli.realtime_control import since
 from faintspot.cli.shared_options import ENGINE_NAME
 
 _FILE = click.argument("file", metavar="FILE", type=click.Path(dir_okay=False, resolve_path=True))
-_USE = click.option("--use", is_flag=True, help="Measure with it from now on, as set estimator=NAME does.")
+_USE = option("--use", is_flag=True, help="Measure with it from now on, as set estimator=NAME does.")
 
 
 @click.command("load", short_help="Load an estimator from a Python file into a running engine.")

@@ -8,6 +8,7 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import configuration_option
 
@@ -15,23 +16,21 @@ from faintspot.cli.shared_options import configuration_option
 @needs("realtime", "zarr")
 @click.command("learn", short_help="Have a controller learn from a recording of the closed loop.")
 @click.argument("store", type=click.Path(path_type=Path), metavar="STORE")
-@configuration_option("Its [control].")
-@click.option(
+@configuration_option("Configuration with [control].")
+@option(
     "--control",
     "kind",
     type=click.Choice(["modal", "polc", "kalman"]),
     default="kalman",
-    show_default=True,
-    help="What learns.",
+    help="Controller that learns.",
 )
-@click.option(
+@option(
     "--winds",
     type=click.Choice(["learnt", "none"]),
     default="learnt",
-    show_default=True,
     help="Measure the winds, or take them from all directions alike.",
 )
-@click.option(
+@option(
     "--layer",
     "layers",
     type=(float, float, float),

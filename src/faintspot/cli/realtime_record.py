@@ -9,6 +9,7 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.shared_options import ENGINE_NAME
 
@@ -16,11 +17,10 @@ if TYPE_CHECKING:
     from faintspot.realtime.recorder import RecordingReport
 
 _MODES = click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"])
-_AO_MODE = click.option(
+_AO_MODE = option(
     "--ao-mode",
     type=_MODES,
     default="SCAO",
-    show_default=True,
     help="What an AOT file says the sensor serves.",
 )
 
@@ -29,8 +29,8 @@ _AO_MODE = click.option(
 @click.command("record", short_help="Record the telemetry of a running engine.")
 @click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
 @ENGINE_NAME
-@click.option("--frames", type=click.IntRange(1), help="Stop after so many.")
-@click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
+@option("--frames", type=click.IntRange(1), help="Stop after so many.")
+@option("--seconds", type=click.FloatRange(0, min_open=True), help="Stop after so long.")
 @_AO_MODE
 def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_mode: str) -> None:
     """Record slopes, fluxes, times, images and changes of settings of a running engine until Ctrl-C.

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from faintspot.cli.commands import option
 from faintspot.cli.live import page_beside
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
@@ -22,47 +23,47 @@ from faintspot.realtime.private_socket import socket_path
 @click.command("run", short_help="Measure frames as they arrive and publish their slopes.")
 @configuration_option("Configuration.")
 @name_option("Name of the pixel ring, the streams and the engine.")
-@click.option(
-    "--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE."
-)
-@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Worker threads.")
-@click.option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
-@click.option(
+@option("--stream", metavar="NAME", help="Take whole frames from a stream: pyshmem's, isio:NAME or dao:FILE.")
+@option("--threads", type=click.IntRange(1), default=1, help="Worker threads.")
+@option("--cpus", metavar="LIST", help="Processors to run on, such as 2,3 or 4-7.")
+@option(
     "--priority",
     type=click.IntRange(0, 99),
     default=0,
-    help="Priority of SCHED_FIFO, with locked memory. Default: the ordinary scheduler.",
+    help="Priority of SCHED_FIFO, with locked memory.",
+    show_default="the ordinary scheduler",
 )
-@click.option(
+@option(
     "--interleave",
-    metavar="ARMS",
-    help="Settings, and controllers, that take turns, such as none,tv or ml+integrator,map+kalman.",
+    metavar="METHODS",
+    help="Alternate between settings, and controllers, such as none,tv or ml+integrator,map+kalman.",
 )
-@click.option("--every", type=click.IntRange(1), default=50, show_default=True, help="Frames of each turn.")
-@click.option(
-    "--deadline",
+@option("--every", type=click.IntRange(1), default=50, help="Frames for each in turn.")
+@option(
+    "--deadline-us",
+    metavar="US",
     type=click.FloatRange(0, min_open=True),
     default=1000.0,
-    show_default=True,
-    help="Slopes count as late so long after the last row, us.",
+    help="Latency limit after the last row, above which slopes count as late.",
 )
-@click.option(
+@option(
     "--images-every",
     type=click.IntRange(0),
     default=100,
-    show_default=True,
-    help="Telemetry keeps the images of one frame in so many; 0: of none.",
+    help="Telemetry keeps the images of every N-th frame; 0: of none.",
 )
-@click.option("--close-loop", is_flag=True, help="Close the loop with the first frame; see loop.")
-@click.option("--no-control", is_flag=True, help="Make no commands, whatever [control] says.")
-@click.option(
-    "--mean-flux",
+@option("--close-loop", is_flag=True, help="Close the loop with the first frame; see control.")
+@option("--no-control", is_flag=True, help="Compute no commands, although the configuration has [control].")
+@option(
+    "--flux-frames",
     type=click.FloatRange(1),
     metavar="FRAMES",
-    help="Tell estimators the flux of every sub-aperture, averaged over so many frames.",
+    help="Give estimators the flux of every sub-aperture, averaged over this number of frames.",
 )
-@click.option("--frames", type=click.IntRange(1), help="Stop after so many. Default: at Ctrl-C.")
-@click.option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
+@option(
+    "--frames", type=click.IntRange(1), help="Stop after this number of frames.", show_default="at Ctrl-C"
+)
+@option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
 def run(
     config: str,
     name: str,
@@ -72,11 +73,11 @@ def run(
     priority: int,
     interleave: str | None,
     every: int,
-    deadline: float,
+    deadline_us: float,
     images_every: int,
     close_loop: bool,
     no_control: bool,
-    mean_flux: float | None,
+    flux_frames: float | None,
     frames: int | None,
     live: bool,
 ) -> None:
@@ -118,10 +119,10 @@ def run(
         cpus=processors,
         source=None if stream is None else _followed(stream, name),
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
-        deadline_s=deadline * 1e-6,
+        deadline_s=deadline_us * 1e-6,
         images_every=images_every,
         control=control,
-        mean_flux=mean_flux,
+        mean_flux=flux_frames,
     )
     if engine.loop is not None and close_loop:
         engine.loop.close()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from faintspot.base.errors import InputError
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.realtime_camera import stop_on_signal
@@ -23,30 +24,33 @@ _HEAD_START_S = 0.5
 _DEFAULT_RATE_HZ = 500.0
 _ENDS_S = 5.0  # a thread looks at whether to stop many times a second
 _RING = name_option("Name of the pixel ring.")
-_SLOTS = click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
+_SLOTS = option("--slots", type=int, default=4, help="Frames in the ring.")
 
 
 @click.command("replay", short_help="Publish recorded frames as a camera would.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
 @_RING
-@click.option(
-    "--rate",
+@option(
+    "--frame-rate-hz",
     type=float,
     metavar="HZ",
-    help="Frames a second, measured in time or not. Default: up to 500, as the engine measures them.",
+    help="Fixed frame rate; frames that the engine misses are counted.",
+    show_default="up to 500, as the engine measures them",
 )
-@click.option("--repeat", is_flag=True, help="Begin again at the end, until Ctrl-C.")
-@click.option(
-    "--rows-per-block", type=int, metavar="K", help="Row by row, K at a time. Default: whole frames."
+@option("--repeat", is_flag=True, help="Begin again at the end, until Ctrl-C.")
+@option(
+    "--rows-per-block", type=int, metavar="K", help="Row by row, K at a time.", show_default="whole frames"
 )
-@click.option("--first", type=int, default=0, show_default=True, help="First frame, counted from 0.")
-@click.option("--frames", "count", type=int, metavar="N", help="How many from there on. Default: all.")
-@click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@option("--first", type=int, default=0, help="First frame, counted from 0.")
+@option(
+    "--frames", "count", type=int, metavar="N", help="Number of frames from there on.", show_default="all"
+)
+@option("--key", metavar="NAME", help="Which array to read of files that hold several.")
 @_SLOTS
 def replay(
     frames: tuple[str, ...],
     name: str,
-    rate: float | None,
+    frame_rate_hz: float | None,
     repeat: bool,
     rows_per_block: int | None,
     first: int,
@@ -60,22 +64,23 @@ def replay(
     `faintspot slopes`; they are read ahead in blocks. A frame's number is its place in the sequence.
 
     By default every frame is measured: replay waits for an engine, publishes up to 500 frames/s, waits where
-    the engine is slower, and ends when the engine ends. With --rate or --repeat (500 frames/s) frames start
-    on a fixed schedule, half a second after the ring is there, and those that the engine misses are counted.
+    the engine is slower, and ends when the engine ends. With --frame-rate-hz or --repeat (500 frames/s) they
+    start on a fixed schedule, half a second after the ring is there, and those that the engine misses are
+    counted.
     With --rows-per-block rows arrive at the pace of a read-out that takes 80 % of the frame time. Ctrl-C
     ends it.
 
     \b
     Examples:
-      faintspot realtime replay night1.fits night2.fits.gz --rate 300
-      faintspot realtime replay cube.npy --rate 1000 --rows-per-block 4 --first 500 --frames 1000 --repeat
+      faintspot realtime replay night1.fits night2.fits.gz --frame-rate-hz 300
+      faintspot realtime replay cube.npy --frame-rate-hz 1000 --rows-per-block 4 --frames 1000 --repeat
     """
     from faintspot.io import open_frames
     from faintspot.realtime.pixel_ring import PixelRing
     from faintspot.realtime.replay import Replay, ring_type
     from faintspot.realtime.scheduling import quick_switching
 
-    waits = rate is None and not repeat
+    waits = frame_rate_hz is None and not repeat
     with (
         stop_on_signal() as stop,
         quick_switching(),
@@ -84,7 +89,7 @@ def replay(
         Replay(
             source,
             ring,
-            frame_rate_hz=_DEFAULT_RATE_HZ if rate is None else rate,
+            frame_rate_hz=_DEFAULT_RATE_HZ if frame_rate_hz is None else frame_rate_hz,
             first=first,
             n_frames=count,
             repeat=repeat,
@@ -95,7 +100,9 @@ def replay(
         rows, columns = source.shape
         often = "repeatedly" if repeat else "once"
         played = count or source.n_frames - first
-        pace = "every one measured by an engine" if waits else f"{rate or _DEFAULT_RATE_HZ:g} frames/s"
+        pace = (
+            "every one measured by an engine" if waits else f"{frame_rate_hz or _DEFAULT_RATE_HZ:g} frames/s"
+        )
         click.echo(
             f"{name}: {rows} x {columns} pixels ({source.dtype} as {ring.dtype}), {played} frames of "
             f"{source.description} {often}, {pace}; Ctrl-C stops"
@@ -118,13 +125,13 @@ def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable
 
 
 @needs("realtime", "pyshmem")
-@click.command("bridge", short_help="Frames of other software in, slopes and commands out to it.")
+@click.command("bridge", short_help="Connect the engine with other software's streams.")
 @click.argument("stream", required=False)
-@click.option("--from", "source", metavar="STREAM", help="Frames: a pyshmem stream, isio:NAME or dao:FILE.")
-@click.option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
-@click.option("--commands", metavar="STREAM", help="Publish the commands so, too.")
+@option("--from", "source", metavar="STREAM", help="Frames: a pyshmem stream, isio:NAME or dao:FILE.")
+@option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
+@option("--commands-to", "commands", metavar="STREAM", help="Publish the commands as isio:NAME or dao:FILE.")
 @name_option("Name of the pixel ring and of the engine's streams.")
-@click.option("--frames", type=int, metavar="N", help="Stop after that many came in. Default: at Ctrl-C.")
+@option("--frames", type=int, metavar="N", help="Stop after this number of frames.", show_default="at Ctrl-C")
 @_SLOTS
 def bridge(
     stream: str | None,
@@ -137,7 +144,7 @@ def bridge(
 ) -> None:
     """Connect `faintspot realtime run` with other software's streams in shared memory.
 
-    Frames of STREAM (or --from) go into the pixel ring NAME; with --to and --commands the engine's slopes
+    Frames of STREAM (or --from) go into the pixel ring NAME; with --to and --commands-to the engine's slopes
     (all x, then all y, px) and commands come out. Streams are pyshmem's (frames only), isio:NAME of
     ImageStreamIO (milk, cacao) in $MILK_SHM_DIR, /milk/shm or /tmp, or dao:FILE.
 

@@ -1,4 +1,4 @@
-"""faintspot realtime telescope, telescope-set, telescope-status: a simulated telescope."""
+"""faintspot realtime telescope run, set, status: a simulated telescope."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from faintspot.cli.commands import Group, option
 from faintspot.cli.realtime_camera import stop_on_signal
 from faintspot.cli.shared_options import name_option
 from faintspot.realtime.control import request
@@ -16,43 +17,52 @@ from faintspot.realtime.private_socket import TELESCOPE, socket_path
 _NAME = name_option("Name of the telescope.")
 
 
-@click.command("telescope", short_help="Simulate a telescope whose mirror follows a command stream.")
+@click.group("telescope", cls=Group, short_help="Simulate a telescope whose mirror follows a command stream.")
+def telescope() -> None:
+    """Simulate a telescope whose mirror follows a command stream."""
+
+
+@telescope.command("run", short_help="Run the simulated telescope until Ctrl-C.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
 @name_option("Name of the pixel ring and the streams.")
-@click.option("--rate", type=float, metavar="HZ", help="Frames a second. Default: the configuration's.")
-@click.option(
+@option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate.", show_default="CONFIG")
+@option(
     "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."
 )
-@click.option(
+@option(
     "--control",
     default="integrator",
-    show_default=True,
     metavar="KIND",
     help="Control that --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
 )
-@click.option(
+@option(
     "--readout-fraction",
     type=float,
     default=0.8,
-    show_default=True,
     help="Read-out, as a part of the frame time.",
 )
-@click.option(
-    "--rows-per-block", type=int, metavar="K", help="Rows published together. Default: a sub-aperture's."
+@option(
+    "--rows-per-block",
+    type=int,
+    metavar="K",
+    help="Rows published together.",
+    show_default="a sub-aperture's",
 )
-@click.option("--slots", type=int, default=4, show_default=True, help="Frames in the ring.")
-@click.option("--frames", type=int, metavar="N", help="Stop after that many. Default: at Ctrl-C.")
-@click.option("--seed", type=click.IntRange(0), help="Seed of air and noise. Default: the configuration's.")
-@click.option(
+@option("--slots", type=int, default=4, help="Frames in the ring.")
+@option("--frames", type=int, metavar="N", help="Stop after this number of frames.", show_default="at Ctrl-C")
+@option(
+    "--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="the configuration's"
+)
+@option(
     "--realisation",
     type=click.IntRange(0),
     default=0,
-    help="Number of the realisation; each has other air and noise.",
+    help="Number of the realisation; each has other turbulence and noise.",
 )
-def telescope(
+def run(
     configuration: str,
     name: str,
-    rate: float | None,
+    frame_rate_hz: float | None,
     write_config: str | None,
     control: str,
     frames: int | None,
@@ -62,14 +72,14 @@ def telescope(
 
     CONFIG is a TOML file or the name of a shipped configuration, as of `faintspot loop`; default: canary.
     Rows go into the pixel ring NAME. When an exposure begins, the mirror takes the newest commands of the
-    pyshmem stream NAME_commands, nm; whole frames are published as NAME_frames, and what nobody at a
-    telescope knows, the Strehl ratio first, as NAME_truth. Needs the extras `loop` and `realtime`.
+    pyshmem stream NAME_commands [nm]; whole frames are published as NAME_frames, and the true Strehl ratio
+    and wavefront error as NAME_truth. Needs the extras `loop` and `realtime`.
 
     \b
     In three terminals:
-      faintspot realtime telescope canary --rate 250 --write-config bench
+      faintspot realtime telescope run canary --frame-rate-hz 250 --write-config bench
       faintspot realtime run --config bench/faintspot.toml
-      faintspot realtime telescope-set photons=50 seeing_arcsec=1.2
+      faintspot realtime telescope set photons=50 seeing_arcsec=1.2
     """
     from faintspot.ao_loop.configuration import load_loop
     from faintspot.ao_loop.engine_files import write_engine_files
@@ -78,8 +88,8 @@ def telescope(
     from faintspot.realtime.telescope import LENGTHY, SimulatedTelescope, commands_of
 
     observed = load_loop(configuration)
-    if rate is not None:
-        observed = observed.replace("control", frame_rate_hz=rate)
+    if frame_rate_hz is not None:
+        observed = observed.replace("control", frame_rate_hz=frame_rate_hz)
     if write_config is not None:
         click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
     say = partial(click.echo, err=True)
@@ -100,11 +110,11 @@ def telescope(
     )
 
 
-@click.command("telescope-set", short_help="Change star or air of a simulated telescope.")
+@telescope.command("set", short_help="Change the star or the turbulence.")
 @_NAME
 @click.argument("changes", nargs=-1, required=True, metavar="NAME=VALUE...")
 def telescope_set(name: str, changes: tuple[str, ...]) -> None:
-    """Change star or air of a simulated telescope from its next exposure on.
+    """Change the star or the turbulence from the next exposure on.
 
     \b
     photons        photo-electrons of a fully lit sub-aperture in a frame, or
@@ -115,7 +125,7 @@ def telescope_set(name: str, changes: tuple[str, ...]) -> None:
 
     \b
     Example:
-      faintspot realtime telescope-set magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
+      faintspot realtime telescope set magnitude=11 seeing_arcsec=1.2 wind_factor=1.5
     """
     from faintspot.config.written_changes import parse_changes
 
@@ -125,11 +135,11 @@ def telescope_set(name: str, changes: tuple[str, ...]) -> None:
     click.echo(f"{first}: {_in_words(conditions)}")
 
 
-@click.command("telescope-status", short_help="Say what a simulated telescope sees.")
+@telescope.command("status", short_help="Show what the telescope sees, and whether it keeps its pace.")
 @_NAME
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 def telescope_status(name: str, as_json: bool) -> None:
-    """Say what a simulated telescope sees, and whether it keeps its pace."""
+    """Show what the telescope sees, and whether it keeps its pace."""
     reply = request(socket_path(name, TELESCOPE), "status")
     if as_json:
         click.echo(json.dumps(reply, indent=1))

@@ -9,6 +9,7 @@ import click
 from faintspot.ao_loop.files import holds_loop_results
 from faintspot.base.errors import InputError
 from faintspot.base.files import derived
+from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.experiments.store import kind_of_store
 from faintspot.io.locations import split_location
@@ -17,14 +18,14 @@ from faintspot.io.zarr_store import holds_telemetry
 
 @needs("web", "matplotlib", "jinja2")
 @click.command(short_help="Make a web page of pictures and tables from slopes, a study, a loop or telemetry.")
-@click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER_ARM]")
-@click.option(
-    "--output", "-o", metavar="HTML", help="Page to write. Default: the first file's name with .html."
+@click.argument("slopes", nargs=-1, required=True, metavar="SLOPES [OTHER]")
+@option(
+    "--output", "-o", metavar="HTML", help="Page to write.", show_default="the first file's name with .html"
 )
-@click.option(
-    "--frames", multiple=True, metavar="FILE", help="The frames, if they are no longer where they were."
+@option(
+    "--recording", multiple=True, metavar="FILE", help="The frames, if they are no longer where they were."
 )
-def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]) -> None:
+def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, ...]) -> None:
     """Make a web page of pictures and tables from slopes, a study or a closed loop.
 
     SLOPES is what `faintspot slopes` wrote; with a second one of the same frames (say, without denoising) the
@@ -54,7 +55,7 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
         raise InputError(
             f"{output}: the folder {Path(output).parent} does not exist: create it or choose another"
         )
-    for name in frames:
+    for name in recording:
         split_location(name)  # refuses what is not there
     if len(paths) == 1 and holds_loop_results(paths[0]):
         from faintspot.experiments.loop_page import write_loop_report
@@ -70,7 +71,7 @@ def command(slopes: tuple[str, ...], output: str | None, frames: tuple[str, ...]
 
         html = report_of_telemetry(paths[0])
     else:
-        html = report_of_stored(paths, frames=[Path(path) for path in frames] or None)
+        html = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
     target = output or str(derived(paths[0], ".html"))
     write_report(target, html)
     click.echo(f"{target}: open it in a browser")

@@ -9,11 +9,13 @@ import click
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
+from faintspot.cli.commands import option
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.shared_options import REFERENCE, configuration_option
 from faintspot.config.presets import PRESETS
 from faintspot.config.written_changes import parse_changes
 from faintspot.io.formats import slope_format
+from faintspot.io.locations import split_location
 from faintspot.io.slopes_format import UNITS
 from faintspot.recorded import Summary, measure_recorded
 
@@ -21,46 +23,49 @@ from faintspot.recorded import Summary, measure_recorded
 @click.command(short_help="Turn recorded frames into slopes.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
 @configuration_option("Layout, settings, calibration.")
-@click.option(
+@option(
     "--output",
     "-o",
     metavar="FILE",
     default="slopes.zarr",
-    show_default=True,
     help="What to write, by its ending: .zarr, .fits, .fits.gz, .npz or .csv.",
 )
-@click.option(
-    "--estimator", metavar="NAME", help="Instead of that in the configuration; see faintspot estimators."
-)
-@click.option(
+@option("--estimator", metavar="NAME", help="Instead of that in the configuration; see faintspot estimators.")
+@option(
     "--set", "changes", metavar="NAME=VALUE", multiple=True, help="An option of the estimator; several times."
 )
-@click.option("--no-denoise", is_flag=True, help="Switch the denoising off: the other arm of a comparison.")
-@click.option(
-    "--preset", type=click.Choice(PRESETS), help="How much work to do. Default: as the configuration says."
+@option("--no-denoise", is_flag=True, help="Switch the denoising off: the other arm of a comparison.")
+@option(
+    "--preset",
+    type=click.Choice(PRESETS),
+    help="How much work to do.",
+    show_default="as the configuration says",
 )
-@click.option(
-    "--device", default="cpu", show_default=True, help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`)."
-)
-@click.option(
+@option("--device", default="cpu", help="cpu, or cuda: an NVIDIA GPU (the extra `gpu`).")
+@option(
     "--unit",
     type=click.Choice(UNITS),
     default="px",
-    help="Unit of positions in the output; arcsec needs layout --pixel-scale. Default: px.",
+    help="Unit of positions in the output; arcsec needs layout --pixel-scale-arcsec.",
+    show_default="px",
 )
-@click.option(
+@option(
     "--mean-flux",
     is_flag=True,
     help="Take the flux of spots as their mean over the recording, not that of each frame: for steady, "
     "faint stars.",
 )
 @REFERENCE
-@click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
-@click.option("--threads", type=click.IntRange(1), help="Most threads to use. Default: all processors.")
-@click.option(
-    "--block", type=click.IntRange(1), metavar="FRAMES", help="Frames in memory at a time. Default: 32 MB."
+@option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@option("--threads", type=click.IntRange(1), help="Most threads to use.", show_default="all processors")
+@option(
+    "--block",
+    type=click.IntRange(1),
+    metavar="FRAMES",
+    help="Frames in memory at a time.",
+    show_default="32 MB",
 )
-@click.option("--overwrite", is_flag=True, help="Replace an output of another run.")
+@option("--overwrite", is_flag=True, help="Replace an output of another run.")
 def command(
     frames: tuple[str, ...],
     config: str,
@@ -100,6 +105,8 @@ def command(
       faintspot slopes cube.npz --key frames -o slopes.csv
     """
     _check_format(output)
+    for name in frames:
+        split_location(name)  # refuses what is not there
     with progress_bar("slopes") as advance:
         summary = measure_recorded(
             frames,

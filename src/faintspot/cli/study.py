@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from faintspot.base.files import derived, write_atomically
+from faintspot.cli.commands import Group, option
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 
@@ -20,26 +21,27 @@ if TYPE_CHECKING:
 
 def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say where and how a study runs."""
-    for option in (
-        click.option("--overwrite", is_flag=True, help="Replace the store of another study."),
-        click.option(
+    for each in (
+        option("--overwrite", is_flag=True, help="Replace the store of another study."),
+        option(
             "--workers",
             type=click.IntRange(0),
             metavar="N",
-            help="Processes on this machine. Default: all processors. 0: this process alone.",
+            help="Processes on this machine; 0: this process alone.",
+            show_default="all processors",
         ),
-        click.option(
+        option(
             "--scheduler",
             metavar="ADDRESS",
             help="Running Dask scheduler to use instead: tls://HOST:PORT. Whoever reaches it can run code as "
             "you: see docs/study.md.",
         ),
     ):
-        command = option(command)
+        command = each(command)
     return command
 
 
-@click.group(name="study", short_help="Measure how large the slope error is.")
+@click.group(cls=Group, name="study", short_help="Measure how large the slope error is.")
 def command() -> None:
     """Measure how large the slope error is, by Monte-Carlo simulation.
 
@@ -58,8 +60,8 @@ def command() -> None:
 @needs("study", "xarray", "zarr")
 @command.command(short_help="Run a study of your own.")
 @click.argument("specification", metavar="TOML")
-@click.option(
-    "--output", "-o", metavar="ZARR", help="Where results go. Default: the TOML file's name with .zarr."
+@option(
+    "--output", "-o", metavar="ZARR", help="Where results go.", show_default="the TOML file's name with .zarr"
 )
 @_run_options
 def run(
@@ -92,15 +94,16 @@ def run(
 
 @needs("study", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Repeat the study of Basden et al. 2015.")
-@click.option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
-@click.option(
+@option("--quick", is_flag=True, help="Fewer cells and realisations: about a minute.")
+@option(
     "--figure", "figures", multiple=True, metavar="NAME", help="Only what this figure needs: fig2 to fig7."
 )
-@click.option(
+@option(
     "--output",
     "-o",
     metavar="ZARR",
-    help="Where results go; the report beside it. Default: paper.zarr, or paper-quick.zarr and the like.",
+    help="Where results go; the report beside it.",
+    show_default="paper.zarr, or paper-quick.zarr and the like",
 )
 @_run_options
 def paper(
@@ -135,14 +138,15 @@ def paper(
 
 @needs("study", "xarray", "zarr", "matplotlib", "jinja2")
 @command.command(short_help="Compare all estimators with each other and with the limit.")
-@click.option("--quick", is_flag=True, help="A few cells of fewer realisations: less than a minute.")
-@click.option(
+@option("--quick", is_flag=True, help="A few cells of fewer realisations: less than a minute.")
+@option(
     "--output",
     "-o",
     metavar="ZARR",
-    help="Where results go; the report beside it. Default: estimators.zarr, or estimators-quick.zarr.",
+    help="Where results go; the report beside it.",
+    show_default="estimators.zarr, or estimators-quick.zarr",
 )
-@click.option("--table", metavar="MD", help="Also write the tables as a Markdown file.")
+@option("--table", metavar="MD", help="Also write the tables as a Markdown file.")
 @_run_options
 def estimators(
     quick: bool,

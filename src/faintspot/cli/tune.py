@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-from click.core import ParameterSource
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
-from faintspot.cli import tune_loop
+from faintspot.cli.commands import SectionedCommand, option
 from faintspot.cli.layout_options import grid_shape
 from faintspot.cli.needs import suggested_slopes
 from faintspot.cli.progress import progress_bar
@@ -40,90 +39,80 @@ if TYPE_CHECKING:
     from faintspot.experiments.question import Question
 
 _MOST_FRAMES, _MOST_PIXELS = 200, 1 << 26
+_GIVEN = "Sources"
 _MOST_NAMES = 3  # of files that are repeated in the suggested command
 
-# Name, type, metavar and help of every option that is also a key of the camera file.
-_VALUES: tuple[tuple[str, Any, str | None, str], ...] = (
-    (
-        "read_noise_e",
-        float,
-        "E",
-        "Read noise, electrons at the camera's output (before the EM gain is divided out).",
+# Section; name, type, metavar, help and default of every option that is also a key of the camera file.
+_VALUES: dict[str, tuple[tuple[str, Any, str | None, str, str], ...]] = {
+    "Camera": (
+        ("read_noise_e", float, "E", "Read noise at the camera's output, before the EM gain.", ""),
+        ("gain_e_per_adu", float, "E/ADU", "Electrons per ADU.", "1, or measured in the frames"),
+        ("em_gain", float, "G", "Gain of the multiplication register of an EMCCD.", "1, none"),
+        ("background_e", float, "E", "Electrons of sky and dark current per pixel and frame.", "0"),
+        ("pixels", int, "N", "Side of a sub-aperture's window.", ""),
+        ("pixel_scale_arcsec", float, "ARCSEC", "Side of a pixel on the sky.", ""),
+        ("quantum_efficiency", float, "Q", "Quantum efficiency.", f"{DEFAULT_QUANTUM_EFFICIENCY:g}"),
     ),
-    ("gain_e_per_adu", float, "E/ADU", "Electrons per ADU. Default: 1, or measured in the frames."),
-    ("em_gain", float, "G", "Gain of the multiplication register of an EMCCD. Default: 1, none."),
-    ("background_e", float, "E", "Photo-electrons of sky and dark current per pixel and frame. Default: 0."),
-    ("pixels", int, "N", "Side of a sub-aperture's window."),
-    ("fwhm_px", float, "PX", "Width (FWHM) of the optical spot."),
-    ("profile", click.Choice(PROFILES), None, "Shape of the spot. Default: diffraction (sinc^2)."),
-    ("lenslet_m", float, "M", "Side of a sub-aperture at the telescope's entrance."),
-    ("wavelength_nm", float, "NM", "Wavelength of the sensor."),
-    ("pixel_scale_arcsec", float, "ARCSEC", "Side of a pixel on the sky."),
-    ("r0_m", float, "M", "Fried parameter at 500 nm: tells whether spots are speckled."),
-    ("magnitude", float, "MAG", "Of the guide star; needs --lenslet-m and --frame-rate-hz."),
-    ("flux_e", float, "E", "Or its flux: detected photons per sub-aperture and frame."),
-    ("band", click.Choice(list(ZERO_POINTS)), None, f"Of the magnitude. Default: {DEFAULT_BAND}."),
-    (
-        "zero_point",
-        float,
-        "PHOTONS",
-        "Photons/s/m^2 of magnitude 0 in the sensor's band. Default: of --band.",
+    "Spots": (
+        ("fwhm_px", float, "PX", "Width (FWHM) of the optical spot.", ""),
+        ("profile", click.Choice(PROFILES), None, "Shape of the spot.", "diffraction (sinc^2)"),
+        ("search_range_px", float, "PX", "Largest slope.", "from the frames, or FWHM / 2"),
+        ("subaperture_m", float, "M", "Side of a sub-aperture in the telescope's pupil.", ""),
+        ("wavelength_nm", float, "NM", "Wavelength of the sensor.", ""),
+        ("r0_m", float, "M", "Fried parameter at 500 nm: decides whether spots are speckled.", ""),
     ),
-    ("frame_rate_hz", float, "HZ", "Frames per second."),
-    ("throughput", float, "T", f"Of atmosphere, telescope and optics. Default: {DEFAULT_THROUGHPUT:g}."),
-    ("quantum_efficiency", float, "Q", f"Default: {DEFAULT_QUANTUM_EFFICIENCY:g}."),
-    (
-        "search_range_px",
-        float,
-        "PX",
-        "Spots are within plus and minus this. Default: from the frames, or FWHM / 2.",
+    "Guide star": (
+        ("magnitude", float, "MAG", "Magnitude; needs --subaperture-m and --frame-rate-hz.", ""),
+        ("flux_e", float, "E", "Flux instead: photo-electrons per sub-aperture and frame.", ""),
+        ("band", click.Choice(list(ZERO_POINTS)), None, "Band of the magnitude.", DEFAULT_BAND),
+        ("zero_point", float, "PHOTONS", "Photons/s/m^2 of magnitude 0 in the band.", "that of --band"),
+        ("frame_rate_hz", float, "HZ", "Frame rate.", ""),
+        ("throughput", float, "T", "Of atmosphere, telescope and optics.", f"{DEFAULT_THROUGHPUT:g}"),
+        (
+            "budget",
+            str,
+            "R",
+            "Slope error allowed, such as 0.1 (px), 0.05arcsec: asks for the limiting magnitude.",
+            "",
+        ),
     ),
-    (
-        "budget",
-        str,
-        "R",
-        "Slope error allowed, such as 0.1 (px), 0.05arcsec: asks for the limiting magnitude.",
-    ),
-)
+}
 
 
 def _values(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `_VALUES`."""
-    for name, kind, metavar, text in reversed(_VALUES):
-        flags = [f"--{name.replace('_', '-')}", *(["--photons"] if name == "flux_e" else [])]
-        command = click.option(*flags, name, type=kind, metavar=metavar, help=text)(command)
+    for section, values in reversed(_VALUES.items()):
+        for name, kind, metavar, text, default in reversed(values):
+            shown = {"show_default": default} if default else {}
+            flag = f"--{name.replace('_', '-')}"
+            command = option(flag, name, type=kind, metavar=metavar, help=text, section=section, **shown)(
+                command
+            )
     return command
 
 
-@click.command(short_help="Say which estimator and settings suit a camera and a star.")
-@click.option("--camera", metavar="TOML", help="File of what is known; options count more.")
-@click.option("--frames", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest in.")
-@click.option("--dark", multiple=True, metavar="FILE", help="Frames without flux.")
-@click.option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@click.command(cls=SectionedCommand, short_help="Recommend an estimator and settings.")
+@option("--camera", metavar="TOML", help="File of the values below; options take precedence.", section=_GIVEN)
+@option(
+    "--recording", multiple=True, metavar="FILE", help="Recorded frames, to measure the rest.", section=_GIVEN
+)
+@option("--dark", multiple=True, metavar="FILE", help="Dark frames.", section=_GIVEN)
+@option("--key", metavar="NAME", help="Which array to read of files that hold several.", section=_GIVEN)
+@option("--layout", "layout_file", metavar="TOML", help="Configuration with the layout.", section=_GIVEN)
+@option(
+    "--grid",
+    metavar="ROWSxCOLUMNS",
+    help="Rows and columns of lenslets instead of a layout, such as 7x7.",
+    section=_GIVEN,
+)
 @_values
-@click.option(
-    "--grid", metavar="ROWSxCOLUMNS", help="Rows and columns of lenslets, such as 7x7, for the layout."
-)
-@click.option("--layout", "layout_file", metavar="TOML", help="Configuration with the layout.")
-@click.option(
-    "--output",
-    "-o",
-    metavar="TOML",
-    default="faintspot.toml",
-    show_default=True,
-    help="Configuration to write.",
-)
-@click.option("--picture", metavar="PNG", help="The plot. Default: beside the output, with -tune.png.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Seed of the simulation.")
-@click.option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
-@tune_loop.loop_options
-@click.pass_context
+@option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
+@option("--picture", metavar="PNG", help="Plot to write.", show_default="beside the output, with -tune.png")
+@option("--seed", type=click.IntRange(0), default=1, help="Seed of the simulation.")
+@option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
 def command(
-    context: click.Context,
-    /,
-    loop: str | None,
     camera: str | None,
-    frames: tuple[str, ...],
+    recording: tuple[str, ...],
     dark: tuple[str, ...],
     key: str | None,
     grid: str | None,
@@ -134,31 +123,22 @@ def command(
     overwrite: bool,
     **options: Any,
 ) -> None:
-    """Say which estimator and settings suit a camera and a star.
+    """Recommend an estimator and settings for a camera and a star.
 
     Simulates spots as the camera sees them and tries every estimator on them, those of installed packages
-    included. Prints the slope error of each, says how many magnitudes it saves, draws it
-    against the star's magnitude, and writes a configuration with the best one's settings.
+    included. Prints the slope error of each, says how many magnitudes it saves, draws it against the star's
+    magnitude, and writes a configuration with the best one's settings. Values that are not given are measured
+    in the recording.
 
-    What is not known is left out; recorded frames (and darks) tell most of it.
-
-    With --loop it is the closed loop that counts: estimators and control are tuned in quick simulations of it
-    and compared by their Strehl ratio, limiting magnitude and the fraction of the sky that they open, with a
-    fixed window and an integrator as the baseline. A few minutes; interrupted, the same command goes on.
+    Spots are independent from frame to frame here (open loop). In a closed loop they stay near their
+    references, which favours other estimators: `faintspot loop tune` compares them there.
 
     \b
     Examples:
       faintspot tune --camera camera.toml --budget 0.1
       faintspot tune --read-noise-e 3 --pixels 16 --fwhm-px 1.8 --flux-e 100
-      faintspot tune --frames cube.fits --dark dark.fits --magnitude 11 --lenslet-m 0.5 --frame-rate-hz 500
-      faintspot tune --loop diffraction_limit
-      faintspot tune --loop mine.toml --magnitudes 8,14 --strehl 0.3
+      faintspot tune --recording cube.fits --dark dark.fits --flux-e 60
     """
-    _check_kind(context)
-    if loop is not None:
-        tune_loop.tune_for_loop(loop, context.params)
-        return
-    options = {name: value for name, value in options.items() if name not in tune_loop.NAMES}
     target = Path(output)
     check_target(target, overwrite)
     drawing = picture_file(target, picture)
@@ -166,7 +146,7 @@ def command(
     known = _sensor(grid, layout_file, target, given)
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
     with progress_bar("tuning", "steps") as advance:
-        question = _question(frames, dark, key, given)
+        question = _question(recording, dark, key, given)
         from faintspot.experiments.tuning import tune
 
         answer = tune(question, rng=np.random.default_rng(seed), progress=advance)
@@ -180,7 +160,7 @@ def command(
     click.echo("This rests on")
     for line in wrapped(answer_text.foundations(answer), console, "  "):
         click.echo(line)
-    _write(answer, target, drawing, frames)
+    _write(answer, target, drawing, recording)
 
 
 def answer_table(answer: Answer) -> Table:
@@ -213,21 +193,6 @@ def answer_table(answer: Answer) -> Table:
     )
     table.caption_justify = "left"
     return table
-
-
-def _check_kind(context: click.Context) -> None:
-    """Refuse options of the other kind of question."""
-    given = {
-        name for name in context.params if context.get_parameter_source(name) == ParameterSource.COMMANDLINE
-    }
-    if "loop" in given:
-        wrong = given - {"loop", *tune_loop.NAMES, *tune_loop.SHARED}
-        why = "without --loop: what is known of the loop is in its configuration"
-    else:
-        wrong, why = given & set(tune_loop.NAMES), "with --loop"
-    flags = [option.opts[0] for option in context.command.params if option.name in wrong]
-    if flags:
-        raise InputError(f"{', '.join(sorted(flags))}: expected only {why}")
 
 
 def _given(camera: str | None, options: dict[str, Any]) -> dict[str, Any]:
@@ -277,7 +242,7 @@ def _question(
     from faintspot.experiments.recorded import question_from_frames
 
     if dark and not frames:
-        raise InputError("--dark: expected --frames as well")
+        raise InputError("--dark: expected --recording as well")
     try:
         if not frames:
             return Question(**given)

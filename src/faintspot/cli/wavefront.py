@@ -10,7 +10,9 @@ import click
 
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
+from faintspot.cli.commands import SectionedCommand, option
 from faintspot.cli.needs import can_make
+from faintspot.cli.shared_options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
 from faintspot.pipeline.slopes import Slopes
 from faintspot.recorded.stored_run import open_run
 from faintspot.sensor.layout import Layout
@@ -19,35 +21,34 @@ from faintspot.wavefront.files import check_ending
 from faintspot.wavefront.words import mode_table, remarks, rms_table
 
 
-@click.command(short_help="Fit Zernike modes to slopes, and draw the wavefront.")
+@click.command(cls=SectionedCommand, short_help="Fit Zernike modes to slopes, and draw the wavefront.")
 @click.argument("slopes", metavar="SLOPES")
-@click.option(
+@option(
     "--output",
     "-o",
     metavar="FILE",
     multiple=True,
-    help="Also write it: .csv, .json or .fits; several times.",
+    help="File to write, .csv, .json or .fits; may be repeated.",
 )
-@click.option("--picture", metavar="PNG", help="Where to draw it. Default: beside the slopes.")
-@click.option(
+@option("--picture", metavar="PNG", help="Picture to write.", show_default="beside the slopes")
+@option(
     "--modes",
     type=click.IntRange(2),
     metavar="N",
-    help="How many, from tip and tilt on. Default: by the sensor.",
+    help="Number of modes, from tip and tilt on.",
+    show_default="by the sensor",
 )
-@click.option(
-    "--pixel-scale", type=float, metavar="ARCSEC", help="Side of a pixel on the sky, instead of the layout's."
-)
-@click.option("--subaperture-size", type=float, metavar="M", help="Side of a sub-aperture in the pupil.")
-@click.option("--diameter", type=float, metavar="M", help="Diameter of the telescope's pupil.")
+@PIXEL_SCALE
+@SUBAPERTURE
+@DIAMETER
 def command(
     slopes: str,
     output: tuple[str, ...],
     picture: str | None,
     modes: int | None,
-    pixel_scale: float | None,
-    subaperture_size: float | None,
-    diameter: float | None,
+    pixel_scale_arcsec: float | None,
+    subaperture_m: float | None,
+    diameter_m: float | None,
 ) -> None:
     """Fit Zernike modes (Noll's order) to slopes, and draw the wavefront.
 
@@ -58,7 +59,7 @@ def command(
     \b
     Examples:
       faintspot wavefront slopes.zarr
-      faintspot wavefront slopes.zarr --pixel-scale 0.38 --diameter 4.2 -o wavefront.json
+      faintspot wavefront slopes.zarr --pixel-scale-arcsec 0.38 --diameter-m 4.2 -o wavefront.json
     """
     for name in output:
         check_ending(Path(name))
@@ -68,7 +69,11 @@ def command(
     run = open_run(Path(slopes))
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
-    given = {"pixel_scale_arcsec": pixel_scale, "subaperture_m": subaperture_size, "diameter_m": diameter}
+    given = {
+        "pixel_scale_arcsec": pixel_scale_arcsec,
+        "subaperture_m": subaperture_m,
+        "diameter_m": diameter_m,
+    }
     scales: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     layout = replace(run.layout, **scales)
     try:

@@ -41,6 +41,7 @@ class Need(enum.Enum):
 
 
 _MAKERS = {
+    Need.READ_NOISE: "; read_noise_e in [calibration] gives it (faintspot layout --read-noise-e)",
     Need.PSF: "; faintspot.learn_psf makes one",
     Need.SCORE: "; faintspot.train_estimator makes one",
 }

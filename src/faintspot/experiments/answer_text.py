@@ -123,7 +123,7 @@ def foundations(answer: Answer) -> list[str]:
         lines.append(
             f"{spots} of an assumed profile ({question.profile}, --profile), which matched filter, "
             "likelihood and trained score know exactly: wrong, it costs them most of their lead; with "
-            "--frames the real spots are learnt"
+            "--recording the real spots are learnt"
         )
     else:
         lines.append(f"{spots} with the learnt PSF, which matched filter and likelihood know exactly")

@@ -109,7 +109,7 @@ def about_the_sky(answer: LoopAnswer) -> list[str]:
     radius = answer.question.radius
     if radius is None:
         return [
-            "sky coverage: not known, as all turbulence is on the ground (--radius: how far a star serves)"
+            "sky coverage: not known, as all turbulence is on the ground (--radius-arcsec gives its reach)"
         ]
     given = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
     best, parts = answer.best.name, []

@@ -41,7 +41,7 @@ _SMALLEST_RANGE_PX = 1.0
 _POSITIVE: tuple[str, ...] = (
     "gain_e_per_adu",
     "fwhm_px",
-    "lenslet_m",
+    "subaperture_m",
     "wavelength_nm",
     "pixel_scale_arcsec",
     "r0_m",
@@ -79,10 +79,10 @@ class Question:
         As in `faintspot.Calibration`.
     fwhm_px : float, optional
         Full width at half maximum of the optical spot, without the pixels' own blur. Default: 0.886
-        lambda / d, from `lenslet_m`, `wavelength_nm` and `pixel_scale_arcsec`; or the PSF's.
+        lambda / d, from `subaperture_m`, `wavelength_nm` and `pixel_scale_arcsec`; or the PSF's.
     profile : {"diffraction", "gaussian"}
         Whether the spot is that of a square lenslet, sinc^2, or has no wings.
-    lenslet_m, wavelength_nm, pixel_scale_arcsec : float, optional
+    subaperture_m, wavelength_nm, pixel_scale_arcsec : float, optional
         Side of a sub-aperture at the telescope's entrance; wavelength of the sensor; side of a pixel on the
         sky.
     r0_m : float, optional
@@ -93,7 +93,7 @@ class Question:
     flux_e : float, optional
         Flux of the star: detected photons (photo-electrons) per sub-aperture and frame.
     magnitude : float, optional
-        Instead of `flux_e`; needs `lenslet_m` and `frame_rate_hz`.
+        Instead of `flux_e`; needs `subaperture_m` and `frame_rate_hz`.
     band, zero_point, throughput, quantum_efficiency
         See `faintspot.simulate.Photometry`.
     frame_rate_hz : float, optional
@@ -123,7 +123,7 @@ class Question:
     --------
     >>> from faintspot.experiments import Question
     >>> question = Question(
-    ...     read_noise_e=3.0, pixels=8, fwhm_px=1.8, lenslet_m=0.6, frame_rate_hz=150.0, magnitude=11.0
+    ...     read_noise_e=3.0, pixels=8, fwhm_px=1.8, subaperture_m=0.6, frame_rate_hz=150.0, magnitude=11.0
     ... )
     >>> round(question.star_flux_e)
     368
@@ -136,7 +136,7 @@ class Question:
     background_e: float = 0.0
     fwhm_px: Any = None
     profile: str = "diffraction"
-    lenslet_m: Any = None
+    subaperture_m: Any = None
     wavelength_nm: Any = None
     pixel_scale_arcsec: Any = None
     r0_m: Any = None
@@ -191,7 +191,7 @@ class Question:
         """Side of the sub-aperture over r0 at the sensor's wavelength, 0 where that makes no speckles."""
         if self.r0_m is None or self.psf is not None:
             return 0.0
-        ratio = float(self.lenslet_m / (self.r0_m * (self.wavelength_nm / SEEING_WAVELENGTH_NM) ** 1.2))
+        ratio = float(self.subaperture_m / (self.r0_m * (self.wavelength_nm / SEEING_WAVELENGTH_NM) ** 1.2))
         return ratio if ratio > SPECKLED_ABOVE else 0.0
 
     @property
@@ -223,10 +223,10 @@ class Question:
     @property
     def photometry(self) -> Photometry | None:
         """Relation of magnitude and electrons; None where sub-aperture or frame rate are not known."""
-        if self.lenslet_m is None or self.frame_rate_hz is None:
+        if self.subaperture_m is None or self.frame_rate_hz is None:
             return None
         return Photometry(
-            self.lenslet_m**2,
+            self.subaperture_m**2,
             1.0 / self.frame_rate_hz,
             self.band,
             self.zero_point,
@@ -297,24 +297,24 @@ class Question:
             # The PSF includes the pixel, which widens it; exact for Gaussian spots.
             self._put("fwhm_px", math.sqrt(max(float(widths.prod()) - PIXEL_BLUR_PX2, 0.01)))
         if self.fwhm_px is None:
-            known = [self.lenslet_m, self.wavelength_nm, self.pixel_scale_arcsec]
+            known = [self.subaperture_m, self.wavelength_nm, self.pixel_scale_arcsec]
             if any(value is None for value in known):
                 raise InputError(
-                    "spot: expected fwhm_px, or lenslet_m, wavelength_nm and pixel_scale_arcsec together"
+                    "spot: expected fwhm_px, or subaperture_m, wavelength_nm and pixel_scale_arcsec together"
                 )
-            width = self.wavelength_nm * 1e-9 / self.lenslet_m / (self.pixel_scale_arcsec * _ARCSEC)
+            width = self.wavelength_nm * 1e-9 / self.subaperture_m / (self.pixel_scale_arcsec * _ARCSEC)
             self._put("fwhm_px", width * FWHM_OF_SIZE_1_PX["diffraction"] / 2)
             self._put("profile", "diffraction")
         low, high = 0.3, float(min(self.shape))
         if not low <= self.fwhm_px <= high:
             raise InputError(
                 f"fwhm_px = {self.fwhm_px:.4g}: expected {low:g} to {high:g} px, the side of a window; "
-                "check lenslet_m, wavelength_nm and pixel_scale_arcsec, or pixels"
+                "check subaperture_m, wavelength_nm and pixel_scale_arcsec, or pixels"
             )
         if self.r0_m is None:
             return
-        if self.lenslet_m is None or self.wavelength_nm is None:
-            raise InputError("r0_m: with it, expected lenslet_m and wavelength_nm as well")
+        if self.subaperture_m is None or self.wavelength_nm is None:
+            raise InputError("r0_m: with it, expected subaperture_m and wavelength_nm as well")
         ratio = self.d_over_r0
         if ratio > LARGEST_D_OVER_R0:
             raise InputError(
@@ -337,7 +337,7 @@ class Question:
         if self.magnitude is not None:
             number_between("magnitude", self.magnitude, -30, 40)
             for name, what in (
-                ("lenslet_m", "the side of a sub-aperture (m)"),
+                ("subaperture_m", "the side of a sub-aperture (m)"),
                 ("frame_rate_hz", "frames per s"),
             ):
                 if getattr(self, name) is None:
@@ -349,7 +349,7 @@ class Question:
         if not 0.1 <= flux <= 1e7:
             raise InputError(
                 f"star: expected 0.1 to 1e7 electrons per sub-aperture and frame, got {flux:.3g}; check "
-                + ("flux_e" if self.magnitude is None else "magnitude, lenslet_m and frame_rate_hz")
+                + ("flux_e" if self.magnitude is None else "magnitude, subaperture_m and frame_rate_hz")
             )
 
     def _range(self) -> float:
@@ -365,7 +365,7 @@ _LAYOUT = "layout"
 
 TABLES = {
     "camera": ("read_noise_e", "gain_e_per_adu", "em_gain", "background_e", "pixels"),
-    "spot": ("fwhm_px", "profile", "lenslet_m", "wavelength_nm", "pixel_scale_arcsec", "r0_m"),
+    "spot": ("fwhm_px", "profile", "subaperture_m", "wavelength_nm", "pixel_scale_arcsec", "r0_m"),
     "star": (
         "magnitude",
         "flux_e",

@@ -138,7 +138,7 @@ def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
     if scale is None:
         raise InputError(
             "unit = 'arcsec': expected slopes whose layout has pixel_scale_arcsec "
-            "(faintspot layout --pixel-scale)"
+            "(faintspot layout --pixel-scale-arcsec)"
         )
     return float(scale)
 

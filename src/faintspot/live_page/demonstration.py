@@ -158,7 +158,7 @@ class LiveDemonstration:
             seed = ["--seed", str(self.seed)]
             turns = ["--interleave", ",".join(self.arms.values()), "--every", str(self.turn_frames)]
             images = ["--images-every", str(_IMAGES_EVERY)]
-            processes.start(_TELESCOPE, ["realtime", "telescope", str(loop), *name, *seed])
+            processes.start(_TELESCOPE, ["realtime", "telescope", "run", str(loop), *name, *seed])
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
             say("telescope and engine start; the first time the engine compiles its code for a minute")
 

@@ -64,7 +64,7 @@ def remarks(wavefront: Wavefront) -> list[str]:
     if wavefront.unit != "nm":
         lines.append(
             "In pixels times sub-apertures: for nm the layout needs pixel_scale_arcsec, and subaperture_m or "
-            "diameter_m (faintspot layout --pixel-scale, --subaperture-size, --diameter)."
+            "diameter_m (faintspot layout --pixel-scale-arcsec, --subaperture-m, --diameter-m)."
         )
     if wavefront.errors_from == "slopes":
         noise = "Noise comes from the slopes' standard errors."

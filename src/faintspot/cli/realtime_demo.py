@@ -1,11 +1,10 @@
-"""faintspot demo --live: telescope, engine and page together."""
+"""faintspot realtime demo: telescope, engine and page together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from rich import box
@@ -13,77 +12,48 @@ from rich.console import Console
 from rich.table import Table
 
 from faintspot.base.errors import MissingExtraError
-from faintspot.base.extras import present, require_linux
+from faintspot.base.extras import present
+from faintspot.cli.commands import option
 from faintspot.cli.realtime_camera import stop_on_signal
+from faintspot.cli.shared_options import name_option
 
 if TYPE_CHECKING:
     from faintspot.experiments.statistics import Estimate
     from faintspot.live_page.demonstration import ArmShown, Shown
 
-NAMES = ("seconds", "rate", "photons", "name", "port")
-"""Options that only --live has."""
-SHARED = ("output", "seed")
-"""Options that both demonstrations have."""
 _NEEDED = {"realtime": ("pyshmem",), "live": ("tornado", "zarr"), "loop": ("hcipy",)}
 
 
-def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that only --live has."""
-    for option in (
-        click.option(
-            "--port",
-            type=click.IntRange(0, 65535),
-            default=8642,
-            show_default=True,
-            help="Live: port of the page; 0: any that is free.",
-        ),
-        click.option(
-            "--name", default="faintspot", show_default=True, help="Live: name of the engine and its streams."
-        ),
-        click.option(
-            "--photons",
-            type=float,
-            default=100.0,
-            show_default=True,
-            help="Live: photons per sub-aperture and frame.",
-        ),
-        click.option(
-            "--rate",
-            type=float,
-            metavar="HZ",
-            default=100.0,
-            show_default=True,
-            help="Live: frames per second.",
-        ),
-        click.option(
-            "--seconds",
-            type=click.FloatRange(0, min_open=True),
-            default=60.0,
-            show_default=True,
-            help="Live: how long the loop is closed; then there is a table.",
-        ),
-        click.option("--live", is_flag=True, help="Run telescope, real-time engine and its page instead."),
-    ):
-        command = option(command)
-    return command
+@click.command("demo", short_help="Run a simulated telescope, the engine and its page together.")
+@name_option("Name of the engine and its streams.")
+@option("--output", "-o", metavar="FOLDER", default="faintspot-demo", help="Folder for what it makes.")
+@option(
+    "--flux-e", type=float, metavar="E", default=100.0, help="Photo-electrons per sub-aperture and frame."
+)
+@option("--frame-rate-hz", type=float, metavar="HZ", default=100.0, help="Frame rate.")
+@option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    metavar="S",
+    default=60.0,
+    help="Time for which the loop is closed; then there is a table.",
+)
+@option("--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free.")
+@option("--seed", type=click.IntRange(0), default=2015, help="Seed of the simulation.")
+def demo(
+    name: str, output: str, flux_e: float, frame_rate_hz: float, seconds: float, port: int, seed: int
+) -> None:
+    """Run a simulated telescope, the real-time engine and its web page together.
 
-
-def show_live(options: dict[str, Any]) -> None:
-    """Run the demonstration and print its table."""
-    require_linux("demo --live")
+    The loop is closed on a faint star, methods alternate, and a table at the end gives the Strehl ratio of
+    each. Needs the extras `realtime`, `live` and `loop`.
+    """
     _check_extras()
     from faintspot.live_page.demonstration import LiveDemonstration
 
-    plan = LiveDemonstration(
-        Path(options["output"]),
-        options["photons"],
-        options["rate"],
-        options["name"],
-        options["port"],
-        options["seed"],
-    )
+    plan = LiveDemonstration(Path(output), flux_e, frame_rate_hz, name, port, seed)
     with stop_on_signal() as stop:
-        shown = plan.run(stop, options["seconds"], click.echo)
+        shown = plan.run(stop, seconds, click.echo)
     arms = shown.by_arm()
     if arms:
         Console().print(arms_table(arms))
@@ -94,7 +64,7 @@ def show_live(options: dict[str, Any]) -> None:
 def arms_table(arms: list[ArmShown]) -> Table:
     """Return what every arm has done as a table."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("arm", no_wrap=True)
+    table.add_column("method", no_wrap=True)
     for heading in ("Strehl ratio", f"over {arms[0].strehl.arm}", "p50", "p99", "frames"):
         table.add_column(heading, justify="right", no_wrap=True)
     for arm in arms:
@@ -121,7 +91,7 @@ def _check_extras() -> None:
     missing = {extra: packages for extra, packages in missing.items() if packages}
     if missing:
         packages = " and ".join(package for each in missing.values() for package in each)
-        raise MissingExtraError(packages, ",".join(missing), "faintspot demo --live")
+        raise MissingExtraError(packages, ",".join(missing), "faintspot realtime demo")
 
 
 def in_words(shown: Shown) -> list[str]:
@@ -145,7 +115,7 @@ def in_words(shown: Shown) -> list[str]:
     if loop["opened_because"]:
         lines.append(f"the loop was opened: {loop['opened_because']}")
     if not shown.by_arm():
-        lines.append("ended before every arm had its turn")
+        lines.append("ended before every method had its turn")
     return lines
 
 

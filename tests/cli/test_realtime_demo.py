@@ -1,4 +1,4 @@
-"""faintspot demo --live: it shows a loop, ends what it has started, and says what the arms were worth."""
+"""faintspot realtime demo: it shows a loop, ends what it has started, and says what the arms were worth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytest.importorskip("tornado")
 pytest.importorskip("zarr")
 
 from faintspot.base.errors import InputError
-from faintspot.cli.demo_live import arms_table, in_words
+from faintspot.cli.realtime_demo import arms_table, in_words
 from faintspot.live_page.demonstration import Shown
 from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_segment import FOLDER
@@ -44,7 +44,7 @@ def frames_measured(name: str) -> int:
 
 def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     """Interrupted, it gives a table of what it has seen, and leaves nothing behind."""
-    arguments = ("demo", "--live", "--rate", 50, "--seconds", 240, "--port", 0, "--name", name)
+    arguments = ("realtime", "demo", "--frame-rate-hz", 50, "--seconds", 240, "--port", 0, "--name", name)
     process = command_line(*arguments, cwd=tmp_path)
     too_late = threading.Timer(PATIENCE_S, process.kill)
     too_late.start()
@@ -113,26 +113,24 @@ def test_what_was_not_seen_is_said() -> None:
     assert in_words(Shown(["a"], 2)) == ["ended before there was a loop"]
     early = shown(2)
     assert early.by_arm() == []
-    assert in_words(early)[-1] == "ended before every arm had its turn"
+    assert in_words(early)[-1] == "ended before every method had its turn"
     nothing = Shown(["a"], 2)
     assert np.isnan([nothing.open_strehl, nothing.on_time]).all()
 
 
 def test_refusals(folder: Path, run: Commands, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    run.refused("demo", "--rate", 50, naming=("--rate: expected only with --live",))
-    run.refused("demo", "--live", "--frames", 50, naming=("--frames: expected only without --live",))
     for wrong, naming in (
-        (("--photons", 0), "photons_per_subaperture"),
+        (("--flux-e", 0), "photons_per_subaperture"),
         (("-o", "faintspot.toml"), "faintspot.toml: "),
     ):
-        refused = run("demo", "--live", *wrong, "--name", name)
+        refused = run("realtime", "demo", *wrong, "--name", name)
         assert refused.code == 2
         assert naming in refused.error
     with ControlServer(socket_path(name), {"status": lambda fields: {"counters": {}}}):
-        run.refused("demo", "--live", "--name", name, naming=("expected one that no engine has",))
-    monkeypatch.setattr("faintspot.cli.demo_live.present", lambda package: package == "zarr")
+        run.refused("realtime", "demo", "--name", name, naming=("expected one that no engine has",))
+    monkeypatch.setattr("faintspot.cli.realtime_demo.present", lambda package: package == "zarr")
     wanted = (
         "needs pyshmem and tornado and hcipy: install it with pip install 'faintspot[realtime,live,loop]'"
     )
-    run.refused("demo", "--live", naming=(wanted,))
+    run.refused("realtime", "demo", naming=(wanted,))
     assert [path.name for path in folder.iterdir()] == ["faintspot.toml"]

@@ -1,4 +1,4 @@
-"""faintspot realtime loop, and what status says of a loop, with an engine in the process of the test."""
+"""faintspot realtime control, and what status says of a loop, with an engine in the process of the test."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from faintspot.cli.realtime_control import summary
-from faintspot.cli.realtime_loop import loop
+from faintspot.cli.realtime_control_loop import control
 from faintspot.cli.realtime_run import run
 from faintspot.control.configuration import Control
 from faintspot.realtime.commands import commands_of
@@ -30,7 +30,7 @@ MATRIX = np.random.default_rng(1).standard_normal((2 * len(LAYOUT), 10))
 
 
 def said(*arguments: str) -> str:
-    result = CliRunner().invoke(loop, arguments, standalone_mode=False)
+    result = CliRunner().invoke(control, arguments, standalone_mode=False)
     return result.output if result.exception is None else str(result.exception)
 
 

@@ -1,9 +1,8 @@
-"""faintspot tune --loop: which estimator and control, for a closed loop."""
+"""faintspot loop tune: which estimator and control, for a closed loop."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from faintspot.base.errors import InputError
+from faintspot.cli.commands import option
+from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
 from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
 
@@ -20,74 +21,96 @@ if TYPE_CHECKING:
     from faintspot.experiments.loop_answer import LoopAnswer
     from faintspot.experiments.loop_question import LoopQuestion
 
-NAMES = ("magnitudes", "arms", "strehl", "radius", "minutes", "workers", "folder")
-"""Options that only --loop has."""
-SHARED = ("magnitude", "flux_e", "output", "picture", "overwrite")
-"""Options that both kinds of question have."""
 
+@needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
+@click.command("tune", short_help="Recommend an estimator and a control for a closed loop.")
+@click.argument("configuration", metavar="CONFIG")
+@option("--magnitude", type=float, metavar="MAG", help="Magnitude of the guide star.", show_default="CONFIG")
+@option(
+    "--flux-e",
+    type=float,
+    metavar="E",
+    help="Flux of the guide star instead: photo-electrons per sub-aperture and frame.",
+)
+@option(
+    "--magnitudes",
+    metavar="FIRST,LAST",
+    help="Range of stars to simulate.",
+    show_default="four times to an eighth of the star's flux",
+)
+@option(
+    "--methods",
+    metavar="NAMES",
+    help="Candidates, with commas, as for `loop magnitude`.",
+    show_default="all that suit",
+)
+@option(
+    "--strehl",
+    type=float,
+    metavar="S",
+    help="Strehl ratio that the limiting magnitudes are for.",
+    show_default="half of that of a bright star",
+)
+@option(
+    "--radius-arcsec",
+    type=float,
+    metavar="ARCSEC",
+    help="Distance up to which a star serves, for the sky coverage.",
+    show_default="the isoplanatic angle",
+)
+@option(
+    "--minutes", type=float, metavar="M", help="Begin no further candidate after this time.", show_default="5"
+)
+@option(
+    "--workers",
+    type=click.IntRange(0),
+    help="Processes on this machine; 0: this process alone.",
+    show_default="all processors",
+)
+@option(
+    "--results", metavar="FOLDER", help="Folder of finished work, to continue from.", show_default="NAME-tune"
+)
+@option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
+@option("--picture", metavar="PNG", help="Plot to write.", show_default="beside the output, with -tune.png")
+@option("--overwrite", is_flag=True, help="Replace the settings of an existing configuration.")
+def tune(
+    configuration: str, results: str | None, output: str, picture: str | None, overwrite: bool, **options: Any
+) -> None:
+    """Recommend an estimator and a control for a closed loop.
 
-def loop_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that only --loop has."""
-    for option in (
-        click.option("--folder", metavar="FOLDER", help="Loop: where finished work is. Default: NAME-tune."),
-        click.option("--workers", type=click.IntRange(0), metavar="N", help="Loop: processes. Default: all."),
-        click.option(
-            "--minutes",
-            type=float,
-            metavar="M",
-            help="Loop: begin no further candidate after so long. Default: 5.",
-        ),
-        click.option(
-            "--radius",
-            type=float,
-            metavar="ARCSEC",
-            help="Loop: how far a star serves. Default: the isoplanatic angle.",
-        ),
-        click.option(
-            "--strehl",
-            type=float,
-            metavar="S",
-            help="Loop: that limiting magnitudes are for. Default: half of that of a bright star.",
-        ),
-        click.option(
-            "--arms", metavar="NAMES", help="Loop: candidates, with commas, as for `loop magnitude`."
-        ),
-        click.option("--magnitudes", metavar="FIRST,LAST", help="Loop: range of stars to answer for."),
-        click.option(
-            "--loop",
-            "loop",
-            metavar="CONFIG",
-            help="Answer for this closed loop (TOML, or a name of `faintspot loop list`) by Strehl ratio.",
-        ),
-    ):
-        command = option(command)
-    return command
+    Estimators and control are tuned in quick simulations of the loop and compared by their Strehl ratio,
+    limiting magnitude and sky coverage, with a fixed window and an integrator as the baseline. A few minutes;
+    interrupted, the same command continues.
 
-
-def tune_for_loop(config: str, options: dict[str, Any]) -> None:
-    """Answer for a closed loop: print, draw and write it."""
-    target = Path(options["output"])
-    check_target(target, options["overwrite"])
-    picture = picture_file(target, options["picture"])
-    question = _question(config, options)
+    \b
+    Examples:
+      faintspot loop tune diffraction_limit
+      faintspot loop tune mine.toml --magnitudes 8,14 --strehl 0.3
+    """
+    target = Path(output)
+    check_target(target, overwrite)
+    drawing = picture_file(target, picture)
+    question = _question(configuration, options)
     from faintspot.ao_loop.engine_files import CONFIGURATION as ENGINE_FILE
     from faintspot.experiments.loop_tuning import tune_loop
     from faintspot.experiments.running import WorkerPool
 
-    folder = options["folder"] or f"{question.configuration.name}-tune"
+    folder = results or f"{question.configuration.name}-tune"
     with progress_bar("loop") as advance:
         place = WorkerPool(options["workers"], progress=advance)
-        answer = tune_loop(question, folder, place=place, overwrite=options["overwrite"])
+        answer = tune_loop(question, folder, place=place, overwrite=overwrite)
     show(answer)
     loop = answer.save(target)
     click.echo(f"{target}: written, and {loop}, the loop with this star and gain")
-    if picture is not None:
+    if drawing is not None:
         from faintspot.experiments.answer_figures import loop_figure
 
-        write_picture(loop_figure(answer), picture)
+        write_picture(loop_figure(answer), drawing)
     best, photons = answer.best.name, f"{answer.photons[answer.at_star]:g}"
-    command = shlex.join(["faintspot", "loop", "magnitude", str(loop), "--arms", f"brightest,window,{best}"])
-    click.echo(f"Next, a long search and long runs: {command} --photons {photons}")
+    command = shlex.join(
+        ["faintspot", "loop", "magnitude", str(loop), "--methods", f"brightest,window,{best}"]
+    )
+    click.echo(f"Next, a long search and long runs: {command} --flux-e {photons}")
     if target.name == ENGINE_FILE:
         folder, control = str(target.parent), answer.best.kind.control
         command = shlex.join(["faintspot", "loop", "engine", str(loop), "-o", folder, "--control", control])
@@ -178,18 +201,18 @@ def _question(config: str, options: dict[str, Any]) -> LoopQuestion:
 
     loop = load_loop(config)
     if options["magnitude"] is not None and options["flux_e"] is not None:
-        raise InputError("--magnitude, --photons: expected one of them, got both")
+        raise InputError("--magnitude, --flux-e: expected one of them, got both")
     if options["magnitude"] is not None:
         loop = loop.replace("camera", magnitude=options["magnitude"], photons_per_subaperture=None)
     if options["flux_e"] is not None:
         loop = loop.replace("camera", photons_per_subaperture=options["flux_e"], magnitude=None)
-    arms, minutes = options["arms"], options["minutes"]
+    methods, minutes = options["methods"], options["minutes"]
     return LoopQuestion(
         loop,
         magnitudes=_range(options["magnitudes"]),
-        arms=None if arms is None else [name.strip() for name in arms.split(",") if name.strip()],
+        arms=None if methods is None else [name.strip() for name in methods.split(",") if name.strip()],
         strehl=options["strehl"],
-        radius_arcsec=options["radius"],
+        radius_arcsec=options["radius_arcsec"],
         **({} if minutes is None else {"minutes": minutes}),
     )
 
