@@ -9,7 +9,7 @@ with the learnt PSF and a prior on the position. The truth is each estimator's o
 frame. Printed are the slope error R, the photon efficiency against the Cramer-Rao bound with the PSF from
 bright frames, and for the last three the actual over the stated standard error.
 
-    python examples/learnt_psf.py bench.npz --gain 2.1
+    python examples/learnt_psf.py bench.npz --gain-e-per-adu 2.1
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("frames", nargs="+")
-    parser.add_argument("--gain", type=float, default=1.0, help="electrons per ADU")
+    parser.add_argument("--gain-e-per-adu", dest="gain", type=float, default=1.0, help="electrons per ADU")
     parser.add_argument("--dark", type=float, help="ADU; default: the light between the spots")
     parser.add_argument("--bin", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=3, help="thinned copies of each frame")

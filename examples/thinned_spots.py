@@ -8,7 +8,7 @@ reference position" would win. The truth is the mean of all frames, moved alike 
 number of kept pixels and without denoising. Number of kept pixels and strength are chosen on one half of the
 frames and scored on the other.
 
-    python examples/thinned_spots.py bench.npz --gain 2.1
+    python examples/thinned_spots.py bench.npz --gain-e-per-adu 2.1
 """
 
 from __future__ import annotations
@@ -71,10 +71,12 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("frames", nargs="+")
-    parser.add_argument("--gain", type=float, default=1.0, help="electrons per ADU")
+    parser.add_argument("--gain-e-per-adu", dest="gain", type=float, default=1.0, help="electrons per ADU")
     parser.add_argument("--dark", type=float, help="ADU; default: 1st percentile of the mean frame")
     parser.add_argument("--bin", type=int, default=2)
-    parser.add_argument("--read-noise", type=float, nargs="+", default=[0.1, 3.0], help="electrons")
+    parser.add_argument(
+        "--read-noise-e", dest="read_noise", type=float, nargs="+", default=[0.1, 3.0], help="electrons"
+    )
     arguments = parser.parse_args()
     with open_frames(arguments.frames) as source:
         raw = source.block(0, source.n_frames).astype(np.float64)

@@ -50,4 +50,4 @@ for magnitude in (12.0, 14.0, 16.0):
 
 # %%
 # `answer.save("faintspot.toml")` writes what `faintspot slopes` and `SlopePipeline.from_file` read. For a
-# closed loop, where a slope error is only part of the story, ask `faintspot tune --loop`.
+# closed loop, where a slope error is only part of the story, ask `faintspot loop tune`.

@@ -90,7 +90,7 @@ class EngineRequests:
         return {"text": _since(reply.get("frame"))}
 
     def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:
-        """As `faintspot realtime loop`: "action" open, close, flat or gain, with "gain"."""
+        """As `faintspot realtime control`: "action" open, close, flat or gain, with "gain"."""
         fields = {name: asked[name] for name in ("action", "gain") if asked.get(name) is not None}
         loop = self._ask("loop", **fields)["loop"]
         gain = "" if loop.get("gain") is None else f", gain {loop['gain']:g}"
