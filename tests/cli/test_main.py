@@ -49,6 +49,7 @@ def test_version(run: Commands) -> None:
 @pytest.mark.parametrize(
     ("arguments", "naming"),
     [
+        (["layuot"], ("layuot", "'layout'")),
         (["nix"], ("nix", "faintspot --help")),
         (["--nix"], ("--nix", "faintspot --help")),
         (["layout", "a.fits", "--nix"], ("--nix", "faintspot layout --help")),
@@ -76,9 +77,21 @@ def test_what_ends_a_command(
         raise error
 
     monkeypatch.setattr(module, "measure_recorded", fail)
+    (folder / "a.npy").touch()
     result = run("slopes", "a.npy")
     assert result.code == code
     assert result.error.startswith(text)
+
+
+def test_help_is_in_sections_with_defaults(run: Commands) -> None:
+    text = run.ok("tune", "--help").out
+    places = [
+        text.index(f"\n{heading}:") for heading in ("Sources", "Camera", "Spots", "Guide star", "Options")
+    ]
+    assert places == sorted(places)
+    assert "[default: 0.9]" in text
+    assert "at least 0]" in text
+    assert "INTEGER" not in text + run.ok("realtime", "run", "--help").out
 
 
 def test_module_runs() -> None:
@@ -93,7 +106,7 @@ def test_errors_of_a_process_of_its_own(tmp_path: Path) -> None:
     assert process.returncode == 2
     assert out == ""
     assert err.count("\n") == 1
-    assert err.startswith("faintspot: error: faintspot.toml: no such file; `faintspot layout")
+    assert "nix.fits" in err
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -38,9 +38,9 @@ def test_one_and_two_arms(measured: Path, run: Commands) -> None:
 
 def test_frames_that_have_moved(measured: Path, run: Commands) -> None:
     (measured / "a.npy").rename(measured / "b.npy")
-    run.ok("report", "slopes.zarr", "-o", "with.html", "--frames", "b.npy")
+    run.ok("report", "slopes.zarr", "-o", "with.html", "--recording", "b.npy")
     assert is_page(measured / "with.html")
-    run.refused("report", "slopes.zarr", "--frames", "nix.npy", naming=("nix.npy",))
+    run.refused("report", "slopes.zarr", "--recording", "nix.npy", naming=("nix.npy",))
 
 
 def test_bad_stores(measured: Path, run: Commands) -> None:

@@ -139,10 +139,15 @@ def test_mistakes_are_named_in_one_line(
     ],
 )
 def test_mistakes_about_a_loop_are_named_in_one_line(
-    run: Commands, arguments: tuple[str, ...], naming: tuple[str, ...], folder: Path
+    run: Commands,
+    arguments: tuple[str, ...],
+    naming: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     run.refused("loop", "tune", *arguments, naming=naming)
-    assert not (folder / "faintspot.toml").exists()
+    assert not (tmp_path / "faintspot.toml").exists()
 
 
 def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,5 +179,5 @@ def test_for_a_loop(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     LAYOUT.save("faintspot.toml")
     assert SlopePipeline.from_file("faintspot.toml").settings.estimator.name == "window"
     assert (tmp_path / "faintspot-loop.toml").is_file()
-    run.refused("tune", "--loop", "canary", naming=("faintspot.toml", "--overwrite"))
-    run.ok("tune", "--loop", "canary", "--overwrite")
+    run.refused("loop", "tune", "canary", naming=("faintspot.toml", "--overwrite"))
+    run.ok("loop", "tune", "canary", "--overwrite")
