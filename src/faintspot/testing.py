@@ -1,4 +1,4 @@
-"""Tests that every estimator passes, for those who write one: inherit `EstimatorTests` in a test module.
+"""Tests that every estimator must pass, for authors of estimators: inherit `EstimatorTests` in a test module.
 
 ::
 
@@ -38,19 +38,19 @@ SPOT_FWHM_PX = 2.0
 
 
 class EstimatorTests:
-    """What is asked of an estimator; `make` is to be overridden, the rest where an estimator needs it."""
+    """Tests of an estimator; override `make`, and other methods and attributes if the estimator needs it."""
 
     centre_tolerance_px = 2e-3
-    """How far from its centre a symmetric spot without noise may be found: float32 and tables leave this."""
+    """Largest error at the centre for a symmetric noise-free spot, due to float32 and tables."""
     error_ratio = (0.8, 1.25)
-    """Stated standard error over the actual one, of bright spots near the centre."""
+    """Allowed range of the stated over the actual standard error, for bright spots near the centre."""
 
     def make(self) -> Estimator:
         """Return the estimator with options that suit 16 x 16 px, spots of 2 px and 1 e- of read noise."""
         raise NotImplementedError
 
     def score(self) -> Score | None:
-        """Return the score that it applies, if it does."""
+        """Return the score that the estimator applies, or None."""
         return None
 
     # The sensor -------------------------------------------------------------------------------------
@@ -68,7 +68,7 @@ class EstimatorTests:
         )
 
     def frame(self, n: int = N, noise: bool = True, reach_px: float = 0.5, seed: int = 1) -> tuple[Any, Any]:
-        """Return a frame of n spots, and their positions (n, 2)."""
+        """Return a frame of n spots and their positions (n, 2)."""
         rng = np.random.default_rng(seed)
         truth = rng.uniform(-reach_px, reach_px, (n, 2))
         flux = FLUX_E * spots(truth, shape=(SIDE, SIDE), profile="gaussian", size=SPOT_FWHM_PX / 2)
@@ -109,7 +109,7 @@ class EstimatorTests:
         alone = self.pipeline(7)(frame[: 7 * SIDE])
         np.testing.assert_array_equal(alone.x, whole.x[:7])
         narrow = self.pipeline(width=4)(frame)
-        # Sums are rounded in another order where a row is one vector.
+        # Sums are rounded in a different order if a row is one vector.
         np.testing.assert_allclose(narrow.vector, whole.vector, atol=2e-4)
 
     def test_standard_errors_are_those_of_the_slopes(self) -> None:
@@ -117,11 +117,11 @@ class EstimatorTests:
         slopes = self.pipeline(800)(frame)
         stated = np.concatenate([slopes.standard_error_x, slopes.standard_error_y])
         if not np.isfinite(stated).any():
-            return  # it states none
+            return  # it states no standard errors
         actual = slopes.vector - np.concatenate([truth[:, 0], truth[:, 1]])
         good = np.isfinite(stated) & (np.abs(actual) < 1.0)
         low, high = self.error_ratio
-        # 1600 errors: their scatter is known to 2 %; a gain that is not 1 adds to it.
+        # With 1600 errors, their scatter is known to 2 %; a centroid gain other than 1 adds to it.
         gain = np.polyfit(np.concatenate([truth[:, 0], truth[:, 1]])[good], slopes.vector[good], 1)[0]
         left = slopes.vector[good] - gain * np.concatenate([truth[:, 0], truth[:, 1]])[good]
         assert low < np.sqrt(np.mean(stated[good] ** 2)) / left.std() < high
@@ -162,7 +162,7 @@ class EstimatorTests:
 
 
 def hostile_frames() -> list[NDArray[np.float32]]:
-    """Return frames of N windows that no camera should give."""
+    """Return frames of N windows with values that no camera should deliver."""
     rng = np.random.default_rng(2)
     shape = (N * SIDE, SIDE)
     noise = rng.normal(0.0, 10.0, shape)
@@ -176,6 +176,6 @@ def hostile_frames() -> list[NDArray[np.float32]]:
 
 
 def assert_same(one: Slopes, several: Slopes, frame: int) -> None:
-    """Assert that the slopes of a frame are those of one frame, bit for bit."""
+    """Assert that the slopes of a frame measured among several equal those measured alone, bit for bit."""
     for name in ("x", "y", "flux", "flags", "standard_error_x", "standard_error_y"):
         np.testing.assert_array_equal(getattr(one, name), getattr(several, name)[frame], err_msg=name)

@@ -1,1 +1,1 @@
-"""What is done to a stack of sub-aperture images, as plain functions."""
+"""Functions that process stacks of sub-aperture images."""

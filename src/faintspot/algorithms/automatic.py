@@ -1,20 +1,20 @@
-"""Strength, number of kept pixels and smoothing width from what is known of the flux and the camera.
+"""Denoising strength, number of kept pixels and smoothing width computed from flux and camera.
 
-Where the formulae come from, how their constants were found and how well they do: docs/automatic.md. With
+The origin of the formulae, the fit of their constants and their accuracy are given in docs/automatic.md. With
 
     N = pixels of the window, r = range of positions, side = sqrt(N),
     A = noise-equivalent area of the spot, px^2 (1 / sum of f^2, f = fraction of the flux in a pixel),
     v = read_noise^2 + excess * background, variance of a dark pixel, e-^2,
-    C = flux / (A * (sqrt(v) + tail)), contrast of the core to a dark pixel's noise (`tail`: background
-        electrons are few and large, so that their noise has higher peaks than sqrt(v) says),
+    C = flux / (A * (sqrt(v) + tail)), contrast of the core to the noise of a dark pixel (`tail`: background
+      electrons are few and large, so that their noise has higher peaks than sqrt(v) suggests),
     D = flux / sqrt(A v), signal to noise of a matched filter,
     q = flux / (excess * A), photons in a pixel of the core,
 
-the kept pixels are those whose expected signal exceeds c noises (of a Gaussian spot A / 2 * ln(C / c), of a
-sinc^2 not more than its main lobe until C is high); the strength is the noise that denoising can take away:
-that of the dark pixels, less the degrees of freedom that it leaves, and the photon noise outside the core.
-Where the spot is lost in the noise (C small), everything falls back to an estimate that stays near the
-middle of the window; where the noise is larger than the range of positions, to no denoising.
+the kept pixels are those whose expected signal exceeds c standard deviations of the noise: A / 2 * ln(C / c)
+for a Gaussian spot; for a sinc^2 at most its main lobe, until C is high. The strength is the noise that
+denoising can remove: the noise of the dark pixels, less the degrees of freedom that remain, and the photon
+noise outside the core. If the spot is lost in the noise (small C), the result is an estimate that stays near
+the centre of the window; if the noise exceeds the range of positions, the image is not denoised.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ PROFILES = ("diffraction", "gaussian")
 
 SMALLEST_FWHM_PX = 0.05
 _LARGEST = 1e9
-_SMALLEST_VARIANCE = 1e-4  # e-^2, where there is neither read noise nor background
-# Noise-equivalent area / FWHM^2, A being (3 size)^2 of both; FWHM is 1.772 size and 2 size (px).
+_SMALLEST_VARIANCE = 1e-4  # e-^2, if there is neither read noise nor background
+# Noise-equivalent area / FWHM^2; A is (3 size)^2 for both profiles, FWHM is 1.772 size and 2 size (px).
 _AREA_OF_SQUARED_FWHM = {"diffraction": 2.866, "gaussian": 2.25}
 
 
@@ -52,47 +52,47 @@ def automatic_strength(
 ) -> NDArray[np.float64]:
     """Return the strength of TV denoising (`noise_std`), e-; 0 where denoising does not help.
 
-    sqrt(a^2 v C^(-2 d) (1 - M / N) + w exp(-z A / N) excess flux / N), at most the noise of a mean pixel: the
-    noise of dark pixels, less what the M degrees of freedom of the denoised image keep of it, and the photon
-    noise of the light outside the core (none of a Gaussian spot).
+    sqrt(a^2 v C^(-2 d) (1 - M / N) + w exp(-z A / N) excess flux / N), at most the noise of a mean pixel.
+    The first term is the noise of dark pixels, less the part kept by the M degrees of freedom of the
+    denoised image; the second is the photon noise outside the core (zero for a Gaussian spot).
 
-    All arguments but `profile` broadcast against each other, so that each sub-aperture may have its own.
+    All arguments except `profile` broadcast, so that each sub-aperture may have its own values.
 
     Parameters
     ----------
     flux_e : float or array
-        Photo-electrons of one spot that fall within its window in one frame.
+        Photo-electrons of one spot within its window in one frame.
     read_noise_e : float or array
         Standard deviation of the read noise in photo-electrons (for an EMCCD: divided by its gain).
     pixels : int or array
-        Number of pixels of the window (16 x 16: 256), which is taken to be square.
+        Number of pixels of the window (256 for 16 x 16), which is assumed to be square.
     spot_fwhm_px : float or array
-        Full width at half maximum of the optical spot (without the pixels' own blur), px, at least 0.05;
-        of an elongated one the geometric mean of both axes.
+        Full width at half maximum of the optical spot (without the blur of the pixels) [px], at least 0.05;
+        for an elongated spot the geometric mean of both axes.
     elongation : float or array
-        Width along the long axis over that along the short one, at least 1.
+        Ratio of the widths along the long and the short axis, at least 1.
     excess_noise : float or array
-        Factor on the photon noise's variance: 2 for an EMCCD at high gain.
+        Factor on the variance of the photon noise: 2 for an EMCCD at high gain.
     background_e : float or array
-        Mean photo-electrons per pixel whose mean is taken off and whose noise stays.
+        Background per pixel [photo-electrons], whose mean is subtracted and whose noise remains.
     position_range_px : float or array
-        Positions are within plus and minus this of the window's middle on each axis.
+        Maximum distance of positions from the centre of the window on each axis.
     profile : {"diffraction", "gaussian"}
-        Whether the spot has the wings of a square lenslet's sinc^2 or none.
+        Spot with the wings of a square lenslet's sinc^2, or Gaussian spot without wings.
 
     Returns
     -------
     float64 array
-        Of the arguments' common shape.
+        Strength, in the common shape of the arguments.
 
     Raises
     ------
     InputError
-        For values that are not finite or out of range, shapes that do not broadcast, an unknown profile.
+        If values are not finite or out of range, shapes do not broadcast, or the profile is unknown.
 
     Notes
     -----
-    Source: own Monte-Carlo study, docs/automatic.md; the form follows A. G. Basden et al. 2015 (MNRAS;
+    Source: authors' Monte-Carlo study, docs/automatic.md; the form follows A. G. Basden et al. 2015 (MNRAS;
     arXiv:1503.06043), where the strength is the noise of the image.
     """
     sensor = _sensor(
@@ -136,21 +136,21 @@ def automatic_smoothing(
     position_range_px: ArrayLike = 1.0,
     profile: str = "diffraction",
 ) -> NDArray[np.float64]:
-    """Return the standard deviation of Gaussian smoothing, px; 0 where smoothing does not help.
+    """Return the standard deviation of Gaussian smoothing [px]; 0 where smoothing does not help.
 
     b (A / 9)^p (1 + g (3 / C)^h) (1 + photon noise of the core / v)^s: about half a pixel, more for faint
     spots.
 
-    Parameters and errors as `automatic_strength`.
+    Parameters and errors are those of `automatic_strength`.
 
     Returns
     -------
     float64 array
-        Of the arguments' common shape.
+        Width, in the common shape of the arguments.
 
     Notes
     -----
-    Source: own Monte-Carlo study, docs/automatic.md.
+    Source: authors' Monte-Carlo study, docs/automatic.md.
     """
     sensor = _sensor(
         flux_e,
@@ -189,28 +189,29 @@ def automatic_kept_pixels(
     profile: str = "diffraction",
     method: str = "tv",
 ) -> NDArray[np.int64]:
-    """Return how many brightest pixels to keep (`keep_brightest`, rule "subtract_next").
+    """Return the number of brightest pixels to keep (`keep_brightest`, rule "subtract_next").
 
-    Pixels whose expected signal exceeds c noises: A * m * ln(1 + C / c), for "diffraction" at most the main
-    lobe until C is high; not more than fit between the farthest position and the window's edge. Where the
-    spot is lost in noise, N exp(-b (D^2 r^2 / N)^p): many pixels hold the estimate near the middle.
+    Pixels are kept if their expected signal exceeds c standard deviations: A * m * ln(1 + C / c) pixels.
+    For "diffraction" they are limited to the main lobe until C is high. They must fit between the farthest
+    position and the edge of the window. If the spot is lost in noise, N exp(-b (D^2 r^2 / N)^p) pixels are
+    kept: many pixels hold the estimate near the centre.
 
-    Parameters and errors as `automatic_strength`, and
+    Parameters and errors are those of `automatic_strength`, and
 
     Parameters
     ----------
     method : {"tv", "none", "smoothed"}
-        What is done before: TV denoising of `automatic_strength`, nothing, or Gaussian smoothing of
+        Preceding step: TV denoising with `automatic_strength`, none, or Gaussian smoothing with
         `automatic_smoothing`.
 
     Returns
     -------
     int64 array
-        Of the arguments' common shape, from 1 to pixels - 1.
+        Number of pixels from 1 to pixels - 1, in the common shape of the arguments.
 
     Notes
     -----
-    Source: own Monte-Carlo study, docs/automatic.md.
+    Source: authors' Monte-Carlo study, docs/automatic.md.
     """
     one_of("method", method, METHODS)
     sensor = _sensor(
@@ -246,7 +247,7 @@ class _Sensor(NamedTuple):
     flux: Any
     excess: Any
     variance: Any  # of a dark pixel
-    counted: Any  # the part of it that is the background's
+    counted: Any  # the part of it due to the background
     pixels: Any
     area: Any
     elongation: Any
@@ -265,12 +266,12 @@ class _Sensor(NamedTuple):
 
     @property
     def core_photon_variance(self) -> Any:
-        """Photon noise of a pixel of the core over the variance of a dark pixel."""
+        """Photon noise of a pixel of the core, divided by the variance of a dark pixel."""
         return self.excess * self.flux / (self.area * self.variance)
 
     @property
     def prior_signal(self) -> Any:
-        """Return D^2 r^2 / N: how far spots move, over the noise of the whole window's centre of gravity."""
+        """D^2 r^2 / N: range of the spots over the noise of the centre of gravity of the whole window."""
         return self.matched_squared * self.range_px**2 / self.pixels
 
     def contrast(self, constants: Kept) -> Any:
@@ -280,7 +281,7 @@ class _Sensor(NamedTuple):
 
 
 def _checked(name: str, value: Any, low: float, low_open: bool = False) -> Any:
-    """Return a number or array within the range; plain numbers take the short way (for real time)."""
+    """Return a number or array within the range; plain numbers use a fast path (for real time)."""
     if type(value) in (float, int) and low < value <= _LARGEST:
         return np.float64(value)
     return numbers_between(name, value, low, _LARGEST, low_open=low_open)[()]
@@ -297,7 +298,7 @@ def _sensor(
     position_range_px: Any,
     profile: str,
 ) -> _Sensor:
-    """Check the arguments."""
+    """Check the arguments and convert them to electrons and pixels."""
     one_of("profile", profile, PROFILES)
     flux = _checked("flux_e", flux_e, 0.0)
     read_noise = _checked("read_noise_e", read_noise_e, 0.0)
@@ -323,14 +324,14 @@ def _sensor(
 
 
 def _lost(sensor: _Sensor, constants: Kept) -> Any:
-    """Return where the spot's core does not stand out of the noise of the window's dark pixels."""
+    """Return where the core of the spot does not stand out of the noise of the dark pixels."""
     contrast = sensor.contrast(constants) * (sensor.area / 9.0) ** constants.lost_area
     limit = constants.lost * (sensor.pixels / 256.0) ** constants.lost_window
     return contrast * sensor.range_px**constants.lost_range < limit
 
 
 def _lost_and_off(sensor: _Sensor, constants: Kept) -> tuple[Any, Any]:
-    """Return where the spot is lost, and where it is best not to denoise."""
+    """Return where the spot is lost, and where denoising is better omitted."""
     lost = _lost(sensor, constants)
     off = lost & (sensor.prior_signal < constants.off_lost)
     signal = _signal_with_photons(sensor) * sensor.range_px**2 / sensor.area
@@ -338,12 +339,12 @@ def _lost_and_off(sensor: _Sensor, constants: Kept) -> tuple[Any, Any]:
 
 
 def _signal_with_photons(sensor: _Sensor) -> Any:
-    """D^2, the photon noise of the spot itself included."""
+    """Return D^2 including the photon noise of the spot itself."""
     return sensor.matched_squared / (1 + FEW.photons * sensor.core_photon_variance)
 
 
 def _found(sensor: _Sensor, constants: Kept) -> Any:
-    """Kept pixels of a spot that stands out of the noise."""
+    """Return the number of pixels to keep for a spot that stands out of the noise."""
     threshold = constants.threshold * (1 + sensor.core_photon_variance) ** -constants.threshold_photons
     window = np.log1p(sensor.pixels / sensor.area) / 3.4  # 3.4: size 1 in 16 x 16 px
     signal = sensor.contrast(constants) / (threshold * window**constants.threshold_window)
@@ -363,7 +364,7 @@ def _found(sensor: _Sensor, constants: Kept) -> Any:
 
 
 def _few_photons(sensor: _Sensor) -> Any:
-    """More pixels where each photon stands out and there are few: all count, wherever they fall."""
+    """Increase the number of pixels if photons are few and each stands out: then all of them contribute."""
     base = FEW.gaussian if sensor.gaussian else FEW.diffraction
     rarity = np.exp(-sensor.core_photons / FEW.rarity)
     seen = 1 / (1 + sensor.variance / FEW.variance)
@@ -379,6 +380,6 @@ def _kept_without_denoising(sensor: _Sensor) -> Any:
 
 
 def _whole(kept: Any, sensor: _Sensor) -> NDArray[np.int64]:
-    """Return whole numbers that leave at least one pixel for the background."""
+    """Round to whole numbers that leave at least one pixel for the background."""
     whole: NDArray[np.int64] = np.minimum(np.maximum(np.rint(kept), 1), sensor.pixels - 1).astype(np.int64)
     return whole

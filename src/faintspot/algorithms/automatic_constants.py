@@ -1,4 +1,4 @@
-"""Constants of the automatic settings, fitted to simulated spots; docs/automatic.md says how.
+"""Constants of the automatic settings, fitted to simulated spots as described in docs/automatic.md.
 
 Symbols are those of faintspot.algorithms.automatic.
 """
@@ -9,49 +9,51 @@ from typing import NamedTuple
 
 
 class Kept(NamedTuple):
-    """Constants of the number of kept pixels after one method."""
+    """Constants of the number of kept pixels after one preceding step."""
 
-    threshold: float  # c, noises of a dark pixel
-    threshold_photons: float  # c falls with the core's photon noise to this power
-    threshold_window: float  # c rises with ln(1 + N / A) to this power: larger windows, higher noise peaks
-    tail: float  # of the background's noise in C, per electron
+    threshold: float  # c, in standard deviations of a dark pixel
+    threshold_photons: float  # exponent with which c falls with the photon noise of the core
+    threshold_window: (
+        float  # exponent of ln(1 + N / A) with which c rises: larger windows have higher noise peaks
+    )
+    tail: float  # weight of the background's noise in C, per electron
     gaussian: float  # pixels per area and ln(1 + C / c); 1/2 is the level set of a Gaussian
-    gaussian_px: float  # added to the area: the pixels' own width
-    core: float  # the same two of a sinc^2's core
+    gaussian_px: float  # added to the area, for the width of the pixels
+    core: float  # as `gaussian`, for the core of a sinc^2
     core_px: float
-    lobe: float  # largest number of a sinc^2's core: lobe * A + lobe_px
+    lobe: float  # limit for the core of a sinc^2: lobe * A + lobe_px
     lobe_px: float
-    wings: float  # the same as `core` of its side lobes, from C / c = wings_from
+    wings: float  # as `core`, for the side lobes, from C / c = wings_from
     wings_px: float
     wings_from: float
-    edge: float  # limit of k where the kept region reaches the window's edge
+    edge: float  # limit of k where the kept region reaches the edge of the window
     edge_exponent: float
-    lost: float  # C under which the spot is lost in noise, and how it goes with A, r and N
+    lost: float  # C below which the spot is lost in noise, and its dependence on A, r and N
     lost_area: float
     lost_range: float
     lost_window: float
-    shrink: float  # b, exponent and dependence on A of k where the spot is lost
+    shrink: float  # b, its exponent, and the dependence of k on A for a lost spot
     shrink_exponent: float
     shrink_area: float
-    off_lost: float  # D^2 r^2 / N under which a lost spot is not denoised
-    off: float  # (range / error of a single spot)^2 under which it is best not to denoise
-    off_photons: float  # q under which it is best not to denoise
+    off_lost: float  # D^2 r^2 / N below which a lost spot is not denoised
+    off: float  # (range / error of a single spot)^2 below which an image is not denoised
+    off_photons: float  # q below which an image is not denoised
 
 
 class Strength(NamedTuple):
-    """Constants of the strength."""
+    """Constants of the denoising strength."""
 
     diffraction: float  # a
     gaussian: float
     decline: float  # d
-    tail: float  # of the background's noise, per electron
+    tail: float  # weight of the background's noise, per electron
     core_freedom: float  # degrees of freedom left by denoising, per A
-    noise_freedom: float  # and, where the spot is faint, by noise taken for light: up to D = noise_freedom_at
+    noise_freedom: float  # the same due to noise taken for flux, for faint spots: up to D = noise_freedom_at
     noise_freedom_at: float
     noise_freedom_exponent: float
-    wings: float  # of a sinc^2: part of the flux's noise that is removed; none of a Gaussian's
-    wings_window: float  # falls with A / N: in a small window most light is in the core
-    lost: float  # of sqrt(v), where the spot is lost
+    wings: float  # part of the flux's noise that is removed for a sinc^2; zero for a Gaussian
+    wings_window: float  # decrease with A / N: in a small window most flux is in the core
+    lost: float  # in units of sqrt(v), if the spot is lost
 
 
 class Smoothing(NamedTuple):

@@ -17,33 +17,33 @@ RULES = ("subtract_next", "threshold", "subtract_kth")
 
 
 def most_kept(pixels: int, rule: str) -> int:
-    """Largest number of pixels that can be kept of `pixels`: "subtract_next" needs one more to subtract."""
+    """Return the largest number of pixels that can be kept; "subtract_next" needs one more to subtract."""
     return pixels - 1 if rule == "subtract_next" else pixels
 
 
 def threshold_rank(keep: NDArray[np.int64], rule: str) -> NDArray[np.int64]:
-    """Rank (1 = largest) of the pixel whose value is the threshold."""
+    """Return the rank (1 = largest) of the pixel whose value is the threshold."""
     return keep + 1 if rule == "subtract_next" else keep
 
 
 def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtract_next") -> NDArray[Any]:
-    """Subtract the background that the `keep` brightest pixels of each image leave behind.
+    """Subtract the background from the `keep` brightest pixels of each image and set the others to zero.
 
     Parameters
     ----------
     images : (..., ny, nx) array
-        Computed in float32 when float32 (or float16), else in float64.
+        Images; computed in float32 if they are float32 or float16, otherwise in float64.
     keep : int or array of int
         Number of pixels k to keep, 1 to ny * nx (one less for "subtract_next"); scalar or broadcastable to
         the leading shape.
     rule : {"subtract_next", "threshold", "subtract_kth"}
-        With t the threshold of the image g:
+        With t the threshold of image g:
 
-        - "subtract_next" [1]_: t = the (k+1)-th largest value, result max(g - t, 0). Exactly k pixels stay
-          unless values tie with t, which become zero like it.
-        - "threshold": t = the k-th largest value, pixels below t become zero, the others stay as they are.
-          Of pixels that tie with t all stay, so that more than k may.
-        - "subtract_kth": t = the k-th largest value, result max(g - t, 0); the k-th pixel becomes zero.
+        - "subtract_next" [1]_: t is the (k+1)-th largest value, the result max(g - t, 0). Exactly k pixels
+          remain, unless some of them equal t; these become zero, too.
+        - "threshold": t is the k-th largest value; pixels below t become zero, the others are unchanged. All
+          pixels equal to t remain, so that there may be more than k.
+        - "subtract_kth": t is the k-th largest value, the result max(g - t, 0); the k-th pixel becomes zero.
 
     Returns
     -------
@@ -52,8 +52,8 @@ def brightest_pixels(images: ArrayLike, keep: ArrayLike, *, rule: str = "subtrac
     Raises
     ------
     InputError
-        For images that are not real, finite and at least two-dimensional, a `keep` out of range or of a
-        shape that does not broadcast, an unknown rule.
+        If images are not real, finite and at least two-dimensional, `keep` is out of range or its shape does
+        not broadcast, or the rule is unknown.
 
     References
     ----------

@@ -19,19 +19,19 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
     Parameters
     ----------
     images : (..., ny, nx) array
-        Computed in float32 when float32 (or float16), else in float64.
+        Images; computed in float32 if they are float32 or float16, otherwise in float64.
 
     Returns
     -------
     (..., 2) array
-        x (along columns) and y (along rows) in pixels from the image's centre: pixel i of n is at
-        ``i - (n - 1) / 2``. An image whose sum is not positive, or so small beside its values that no
-        position can be told, gives (0, 0), never NaN.
+        x (along columns) and y (along rows) in pixels from the image centre: pixel i of n is at
+        ``i - (n - 1) / 2``. The result is (0, 0), never NaN, if the sum of the image is not positive or too
+        small relative to its values to define a position.
 
     Raises
     ------
     InputError
-        For images that are not real, finite and at least two-dimensional.
+        If images are not real, finite and at least two-dimensional.
 
     Examples
     --------
@@ -54,16 +54,16 @@ def centre_of_gravity(images: ArrayLike) -> NDArray[Any]:
 
 
 def _scaled_up(flat: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return images (n, pixels) with those whose values are tiny multiplied by a power of two.
+    """Return images (n, pixels) in which those with tiny values are multiplied by a power of two.
 
-    The kernel multiplies by the reciprocal of a sum, which overflows where the sum is not a normal number.
+    The kernel multiplies by the reciprocal of a sum, which overflows if the sum is subnormal.
     """
     limits = np.finfo(flat.dtype)
     largest = np.abs(flat).max(axis=1)
     tiny = (largest > 0) & (largest < limits.tiny / limits.eps)
     if not tiny.any():
         return flat
-    # Of a number that is not normal, all digits are kept.
+    # A subnormal number keeps all its digits.
     power = -int(np.log2(limits.tiny)) // 2 + int(limits.nmant)
     scaled = flat.copy()
     scaled[tiny] *= flat.dtype.type(2.0) ** power

@@ -1,4 +1,4 @@
-"""How much noise a pixel has, and which strength to give the denoiser."""
+"""Noise of the pixels, and the denoising strength suggested by it."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ from numpy.typing import ArrayLike, NDArray
 from faintspot.base.checks import image_stack, number_between, numbers_between
 from faintspot.base.errors import InputError
 
-_MAD_TO_STD = 1.4826  # of a normal distribution
+_MAD_TO_STD = 1.4826  # for a normal distribution
 
 
 def suggested_strength(
     read_noise_e: ArrayLike, flux_e: ArrayLike, pixels: int, *, excess_noise: float = 1.0
 ) -> NDArray[np.float64]:
-    """Return a strength (`noise_std`) that works: sqrt(read_noise^2 + 0.25 * excess_noise * flux / pixels).
+    """Return a suitable strength (`noise_std`): sqrt(read_noise^2 + 0.25 * excess_noise * flux / pixels).
 
-    The full photon noise, flux / pixels, would smooth the spot itself; a quarter of it was found best in
-    Monte-Carlo studies at 0.1 e- of read noise. At 1 e- and more and low flux, 0.85 of the result is better.
-    Where the spot's size is known, `faintspot.algorithms.automatic.automatic_strength` is nearer the best.
+    The full photon noise, flux / pixels, would smooth the spot itself; a quarter of it was best in
+    Monte-Carlo simulations at 0.1 e- of read noise. At 1 e- and more and low flux, 0.85 of the result is
+    better. If the size of the spot is known, `faintspot.algorithms.automatic.automatic_strength` is closer
+    to the optimum.
 
     Parameters
     ----------
     read_noise_e : float or array
         Standard deviation of the read noise in electrons (for an EMCCD: divided by its gain).
     flux_e : float or array
-        Electrons of one sub-aperture in one frame.
+        Flux of one sub-aperture in one frame [electrons].
     pixels : int
         Number of pixels of a sub-aperture.
     excess_noise : float
-        Factor on the photon noise's variance: 2 for an EMCCD at high gain.
+        Factor on the variance of the photon noise: 2 for an EMCCD at high gain.
 
     Raises
     ------
     InputError
-        For negative or NaN values.
+        If a value is negative or NaN.
     """
     read_noise = numbers_between("read_noise_e", read_noise_e, 0.0)
     flux = numbers_between("flux_e", flux_e, 0.0)
@@ -49,25 +50,25 @@ def suggested_strength(
 def pixel_noise(images: ArrayLike) -> float:
     """Estimate the standard deviation of the noise of pixels far from the spots.
 
-    Looks at the first and last row of every image, where spots are faintest. With several frames of the same
-    sub-apertures, the median absolute difference of a pixel in successive frames; with one, that of
-    neighbours in a row, which light from a spot's wings makes too large. Both as a normal distribution's
-    standard deviation.
+    The first and last rows of every image are used, where spots are faintest. With several frames of the
+    same sub-apertures, the estimate is the median absolute difference of a pixel in successive frames,
+    scaled to the standard deviation of a normal distribution. With one frame, it is that of neighbours in a
+    row, which the wings of spots increase.
 
     Parameters
     ----------
     images : (..., ny, nx) array
-        With four dimensions, the first one counts frames.
+        Images; with four dimensions, the first one is the frame.
 
     Returns
     -------
     float
-        In the unit of the images.
+        Standard deviation in the unit of the images.
 
     Raises
     ------
     InputError
-        For images that are not finite or narrower than two pixels.
+        If images are not finite or narrower than two pixels.
     """
     stack: NDArray[Any] = image_stack("images", images)
     if stack.shape[-1] < 2:

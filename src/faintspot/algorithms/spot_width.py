@@ -1,4 +1,4 @@
-"""How wide and bright spots are, from images in which they may be too faint to be seen one by one."""
+"""Width and flux of spots, from images in which single spots may be too faint to detect."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _AREA_OF_SQUARED_FWHM = np.pi / (2 * np.log(2))  # noise-equivalent area of a Ga
 
 
 class SeenSpots(NamedTuple):
-    """Full width at half maximum (px, pixels' blur included) and rms flux of spots, in the images' unit."""
+    """FWHM [px], including the blur of the pixels, and rms flux of spots in the unit of the images."""
 
     fwhm_x_px: float
     fwhm_y_px: float
@@ -23,16 +23,17 @@ class SeenSpots(NamedTuple):
 
 
 def seen_spots(images: ArrayLike) -> SeenSpots:
-    """Measure the width and the flux of spots wherever they are in their images.
+    """Measure the width and the flux of spots at unknown positions in their images.
 
-    The mean autocorrelation of the images does not depend on the spots' positions. Noise adds to it only at
-    lag 0; that value is extrapolated as of a Gaussian from lags 1 and 2. The lag at which half of it is left
-    is 1 / sqrt(2) of the full width at half maximum of a Gaussian spot. The flux is that of the same spot.
+    The mean autocorrelation of the images does not depend on the positions of the spots. Noise contributes
+    only at lag 0; the value there is extrapolated from lags 1 and 2 with a Gaussian. The lag at half
+    maximum is 1 / sqrt(2) of the full width at half maximum of a Gaussian spot. The flux is that of the
+    same spot.
 
     Parameters
     ----------
     images : (..., ny, nx) array
-        In any unit, of spots of one width; hundreds where they are lost in the noise.
+        Images in any unit, with spots of equal width; hundreds of them if spots are lost in the noise.
 
     Returns
     -------
@@ -41,7 +42,7 @@ def seen_spots(images: ArrayLike) -> SeenSpots:
     Raises
     ------
     InputError
-        When the images are not finite, smaller than 4 x 4, or show no spots.
+        If images are not finite, smaller than 4 x 4, or show no spots.
     """
     stack: NDArray[np.float64] = image_stack("images", images).astype(np.float64)
     if min(stack.shape[-2:]) < 4:
@@ -54,7 +55,7 @@ def seen_spots(images: ArrayLike) -> SeenSpots:
 
 
 def _along(images: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the width along the last axis, and the mean sum of squares of a spot without noise."""
+    """Return the width along the last axis, and the mean sum of squares of a noise-free spot."""
     side = images.shape[-1]
     correlation = np.array([np.vdot(images[..., : side - lag], images[..., lag:]) for lag in range(side)])
     width = 0.0

@@ -35,13 +35,13 @@ class Denoised(NamedTuple):
     images: NDArray[Any]
     """(..., ny, nx) denoised images, in the dtype of the computation."""
     iterations: NDArray[np.int64]
-    """Iterations made; 0 where none was needed."""
+    """Number of iterations made; 0 where none was needed."""
     multiplier: NDArray[np.float64]
-    """lambda: the penalised (ROF) problem of this weight has the same solution. inf where infeasible."""
+    """Weight lambda of the penalised (ROF) problem with the same solution; inf if infeasible."""
     converged: NDArray[np.bool_]
-    """Whether the tolerance was reached (true where no iteration was needed)."""
+    """Whether the tolerance was reached (also true where no iteration was needed)."""
     infeasible: NDArray[np.bool_]
-    """Whether the strength is too strong: the image is its mean then, or the strength was lowered."""
+    """Whether the strength exceeds the limit; the result is then the mean, or uses a lower strength."""
 
 
 @overload
@@ -79,55 +79,56 @@ def tv_denoise(
     lower_strength: bool = False,
     full_output: bool = False,
 ) -> NDArray[Any] | Denoised:
-    r"""Remove the noise of each image by total-variation minimisation under a noise constraint.
+    r"""Denoise each image by total-variation minimisation under a noise constraint.
 
-    Minimises the isotropic total variation TV(u) (forward differences, Neumann edges) subject to
-    ``||u - g||^2 = ny * nx * noise_std^2``, each image on its own.
+    Minimise the isotropic total variation TV(u) (forward differences, Neumann edges) subject to
+    ``||u - g||^2 = ny * nx * noise_std^2``, independently for each image.
 
     Parameters
     ----------
     images : (..., ny, nx) array
-        Images g, at least 2 x 2 pixels. float32 (and float16) images are computed in float32, all others in
-        float64; the computation is the same.
+        Images g, at least 2 x 2 pixels. float32 (and float16) images are processed in float32, all others in
+        float64, with the same algorithm.
     noise_std : float or array
         Standard deviation of the noise to remove, in the unit of the images; scalar or broadcastable to the
         leading shape. Not a weight: the weight of the equivalent penalised problem
         ``min ||u - g||^2 / 2 + lambda TV(u)`` is returned as `multiplier`. (scikit-image's
         ``denoise_tv_chambolle(weight=w)`` solves that with lambda = w.)
     algorithm : {"fgp", "chambolle"}
-        "fgp": accelerated projected gradient on the dual [2]_. "chambolle": the fixed point of [1]_, which
-        [3]_ uses; same solution, 6 to 8 times more iterations. Both renew the multiplier in every iteration
-        as in [1]_, section 4.
+        "fgp": accelerated projected gradient on the dual [2]_. "chambolle": the fixed-point iteration of
+        [1]_, used by [3]_; it has the same solution and needs 6 to 8 times more iterations. Both update the
+        multiplier in every iteration as in [1]_, section 4.
     tolerance : float, optional
         Stop an image when one iteration changes the solution by less than this fraction of its own standard
-        deviation, ``lambda ||div p - div p_previous|| <= tolerance * ||u - mean(u)||``; looked at every 24
-        iterations and at the last one. 0 never stops early. Default 0.02: 24 iterations nearly always, which
-        is within 1 % of the converged slope error where the usual number of pixels is kept, but not with
-        most of a window: docs/fast.md. Tolerances of different algorithms and packages are not
-        comparable: "chambolle" moves less in an iteration and stops farther from the solution.
+        deviation, ``lambda ||div p - div p_previous|| <= tolerance * ||u - mean(u)||``; tested every 24
+        iterations and at the last one. 0 never stops early. The default 0.02 nearly always gives 24
+        iterations. The slope error is then within 1 % of the converged one if the usual number of pixels is
+        kept, but not if most of a window is kept: docs/fast.md. Tolerances of different algorithms and
+        packages are not comparable: "chambolle" changes less in an iteration and stops farther from the
+        solution.
     max_iterations : int, optional
-        At most so many iterations for each image. Default 200.
+        Maximum number of iterations for each image. Default: 200.
     preset : {"accurate", "fast"}
-        "fast": 8 iterations and no test (other numbers may be given).
+        "fast": 8 iterations without a test of the tolerance (`tolerance` and `max_iterations` override it).
     lower_strength : bool
-        Lower a strength that is too strong for an image, above 0.9 of the image's own rms, to 0.6 of it, as
-        `SlopePipeline` does: nearer the rms, too little of a spot is left.
+        Lower a strength above 0.9 of an image's own rms to 0.6 of it, as `SlopePipeline` does; closer to the
+        rms, too little of the spot remains.
     full_output : bool
-        Return a `Denoised`: the images and, for each, iterations, multiplier, converged and infeasible.
+        Return a `Denoised` with the images, iterations, multiplier, converged and infeasible.
 
     Returns
     -------
     ndarray or Denoised
-        u, of the shape of `images`. The constraint holds to rounding error after any number of iterations.
-        A constant image and noise_std = 0 return the image itself; where ``rms(g - mean(g)) <= noise_std``
-        no u obeys the constraint with less variation than the constant mean(g), which is returned unless
-        strengths are lowered.
+        u, in the shape of `images`. The constraint holds to rounding error after any number of iterations.
+        For a constant image or noise_std = 0 the image itself is returned. If ``rms(g - mean(g)) <=
+        noise_std``, the constant mean(g) is returned, since no u obeys the constraint with less variation,
+        unless `lower_strength` is set.
 
     Raises
     ------
     InputError
-        For images that are not real, finite and at least two-dimensional, a negative or NaN noise_std, one
-        that does not broadcast, an unknown algorithm.
+        If images are not real, finite and at least two-dimensional, noise_std is negative, NaN or does not
+        broadcast, or the algorithm is unknown.
 
     References
     ----------

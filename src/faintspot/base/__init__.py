@@ -1,1 +1,1 @@
-"""Errors, checks and files that every other package builds on."""
+"""Errors, checks and files used by all other packages."""

@@ -1,7 +1,7 @@
-"""Checks at the door: every public function and every file passes its values through these.
+"""Input checks: values are validated on entry to every public function and on reading every file.
 
-Each check returns the value in the form the code behind it works with, or raises InputError with one
-line that names the value, what it was and what was expected.
+Each check returns the value in the form that the code uses, or raises an InputError with one line that names
+the value, what it was and what was expected.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ LARGEST_FLOAT64 = 1e290
 def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray[Any]:
     """Return `value` as a real numeric array (bool counts as integer); dtype is kept.
 
-    What a masked array (numpy.ma) masks becomes NaN, and integers with it floats.
+    Masked values (numpy.ma) become NaN, and integer arrays with masked values become floats.
 
     Raises
     ------
     InputError
-        When it is not numeric, is complex, is empty or has too few dimensions.
+        If it is not numeric, is complex, is empty or has too few dimensions.
     """
     try:
         array = _masked_as_nan(value) if np.ma.is_masked(value) else np.asarray(value)
@@ -49,7 +49,7 @@ def real_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArray
 
 
 def _masked_as_nan(value: np.ma.MaskedArray[Any, Any]) -> NDArray[Any]:
-    """Return a masked array as floats that hold its values, float32 where that does, and NaN."""
+    """Return a masked array as floats with NaN in masked places; float32 if it is exact."""
     dtype = np.result_type(value.dtype, np.float32)
     filled: NDArray[Any] = np.ma.filled(value.astype(dtype), np.nan)
     return filled
@@ -68,7 +68,7 @@ def finite_array(name: str, value: Any, *, minimum_dimensions: int = 0) -> NDArr
 def image_stack(name: str, value: Any) -> NDArray[np.floating[Any]]:
     """Return `value` as finite float32 or float64 images (..., ny, nx), contiguous.
 
-    float32 and float16 become float32; everything else float64.
+    float32 and float16 images become float32, all others float64.
     """
     array = finite_array(name, value, minimum_dimensions=2)
     dtype = np.float32 if array.dtype.kind == "f" and array.dtype.itemsize <= 4 else np.float64
@@ -90,7 +90,7 @@ def numbers_between(
 ) -> NDArray[Any]:
     """Return `value` (scalar or array) as float64, or int64 when `integer`, within [low, high].
 
-    With `low_open` the value `low` itself is refused.
+    With `low_open`, `low` itself is not allowed.
     """
     array = finite_array(name, value)
     wrong = (array <= low) if low_open else (array < low)
@@ -115,7 +115,7 @@ def number_between(
     integer: bool = False,
     low_open: bool = False,
 ) -> float:
-    """Return one number within the range, as numbers_between does; as float (exact for whole numbers)."""
+    """Return one number within the range, like `numbers_between`; as float (exact for whole numbers)."""
     array = numbers_between(name, value, low, high, integer=integer, low_open=low_open)
     if array.ndim:
         raise InputError(f"{name}: expected one number, got an array of shape {array.shape}")
@@ -123,7 +123,7 @@ def number_between(
 
 
 def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
-    """Return `value` when it is one of the names in `choices`."""
+    """Return `value` if it is one of the names in `choices`."""
     if not isinstance(value, str) or value not in choices:
         raise InputError(
             f"{name} = {value!r}: expected one of {', '.join(repr(choice) for choice in choices)}"
@@ -132,7 +132,7 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
 
 
 def _range_text(low: float, high: float, low_open: bool) -> str:
-    """Say a range in words: 'a number from 0 to 1', 'a number above 0'."""
+    """Return a range in words: 'a number from 0 to 1', 'a number above 0'."""
     start = f"above {low:g}" if low_open else f"from {low:g}"
     if np.isinf(high):
         return f"a number above {low:g}" if low_open else f"a number of at least {low:g}"

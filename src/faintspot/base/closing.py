@@ -15,5 +15,5 @@ class Closing:
         self.close()
 
     def close(self) -> None:
-        """Release what the object holds."""
+        """Release all resources of the object."""
         raise NotImplementedError

@@ -1,11 +1,11 @@
-"""The errors that faintspot raises for what a user gave it, always in one line."""
+"""Exceptions that faintspot raises for invalid input, always with one line of text."""
 
 
 class InputError(ValueError):
-    """A value from outside (argument, file, configuration) that cannot be used.
+    """Argument, file or configuration that cannot be used.
 
-    The message is one line: it names the value, what was expected and where it was found.
-    The command line prints it and exits with code 2.
+    The message is one line that names the value, what was expected and where it was found. The command line
+    prints it and exits with code 2.
 
     Examples
     --------
@@ -17,11 +17,11 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.splitlines()))  # values that it shows may have several
+        super().__init__(" ".join(message.splitlines()))  # values in the message may have several lines
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is absent; the message names the extra that installs it.
+    """Missing optional dependency; the message names the extra that installs it.
 
     Examples
     --------
@@ -35,4 +35,4 @@ class MissingExtraError(ImportError):
 
 
 class CacheWarning(RuntimeWarning):
-    """Compiled kernels cannot be kept on disk; the message says what to set."""
+    """Compiled kernels cannot be cached on disk; the message states what to set."""

@@ -1,4 +1,4 @@
-"""What only some have: optional packages, with the extra that installs them, and Linux."""
+"""Optional requirements: packages, with the extra that installs them, and Linux."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ EXTRAS = {
     "soapy": ("soapy",),
     "pyrtc": ("pyrtc",),
 }
-"""Packages by the extra to name where one is missing; some extras bring those of others along."""
+"""Packages by the extra that messages name when one is missing; some extras include others."""
 SHARED_MEMORY = Path("/dev/shm")
-"""Where Linux keeps named shared memory."""
+"""Folder of named shared memory on Linux."""
 
 
 def present(package: str) -> bool:
-    """Tell whether a package can be imported, without importing it."""
+    """Return whether a package can be imported, without importing it."""
     try:
         return importlib.util.find_spec(package) is not None
     except (ImportError, ValueError):
@@ -35,21 +35,21 @@ def present(package: str) -> bool:
 
 
 def require(extra: str, *packages: str, purpose: str) -> None:
-    """Make sure that packages are installed, before work begins.
+    """Check that packages are installed, before work begins.
 
     Parameters
     ----------
     extra : str
-        What installs all of them.
+        Extra that installs all of them.
     packages : str
         Names to import.
     purpose : str
-        What needs them, the beginning of the message.
+        Feature that needs them, which begins the message.
 
     Raises
     ------
     MissingExtraError
-        When one or more are not.
+        If one or more are not installed.
     """
     missing = [package for package in packages if not present(package)]
     if missing:
@@ -57,17 +57,17 @@ def require(extra: str, *packages: str, purpose: str) -> None:
 
 
 def require_linux(purpose: str) -> None:
-    """Make sure that this is Linux, with its scheduler and shared memory, which real time needs.
+    """Check for Linux, whose scheduler and shared memory real time requires.
 
     Parameters
     ----------
     purpose : str
-        What needs it, the beginning of the message.
+        Feature that needs Linux, which begins the message.
 
     Raises
     ------
     InputError
-        When it is not.
+        If the system is not Linux.
     """
     if not hasattr(os, "sched_setscheduler"):
         raise InputError(f"{purpose} needs Linux")

@@ -1,4 +1,4 @@
-"""Files that are never seen half written, whatever ends the program or the machine."""
+"""Atomic writing of files: a file is never left incomplete if the program or the machine stops."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from typing import Any, BinaryIO
 from faintspot.base.errors import InputError
 
 _ADVICE = {
-    errno.ENOSPC: "the disk is full: free some space and run again, what is finished is kept",
-    errno.EDQUOT: "the disk quota is used up: free some space and run again, what is finished is kept",
+    errno.ENOSPC: "the disk is full: free some space and run again; completed results are kept",
+    errno.EDQUOT: "the disk quota is used up: free some space and run again; completed results are kept",
     errno.EACCES: "no permission to write there: choose another folder",
     errno.EPERM: "no permission to write there: choose another folder",
     errno.EROFS: "the file system is read-only: choose another folder",
 }
-# What a name of ours ends with; anything else behind a dot is part of the name, as in night.1.
+# Known file extensions; any other text after a dot is part of the name, as in night.1.
 _ENDINGS = (".toml", ".npz", ".zarr", ".fits", ".fits.gz", ".csv", ".html", ".json")
 Content = bytes | str | Callable[[BinaryIO], object]
-"""What a file is to contain, a text as UTF-8; or what writes that to a stream."""
+"""Content of a file (text is encoded as UTF-8), or a function that writes it to a stream."""
 
-# Folders that cannot be synchronised: of some file systems, and those that may be written but not read.
+# Folders that cannot be synchronised: on some file systems, and folders that are writable but not readable.
 _CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
 @contextlib.contextmanager
 def output_errors(path: str | Path) -> Iterator[None]:
-    """Turn an OSError while writing into one line that names `path` and says what to do."""
+    """Convert an OSError on writing to a one-line error that names `path` and says what to do."""
     try:
         yield
     except OSError as error:
@@ -41,14 +41,14 @@ def output_errors(path: str | Path) -> Iterator[None]:
 
 
 def check_regular(path: str | Path) -> int:
-    """Return the size of a file in bytes; refuse a pipe or a device, which may never end.
+    """Return the size of a file in bytes; reject a pipe or a device, which may never end.
 
     Raises
     ------
     InputError
-        When it is neither a file nor a folder.
+        If it is neither a file nor a folder.
     OSError
-        When there is no such file, or it is a folder.
+        If the file does not exist, or is a folder.
     """
     found = os.stat(path)
     if stat.S_ISDIR(found.st_mode):
@@ -60,14 +60,14 @@ def check_regular(path: str | Path) -> int:
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
-    """Return the content of a file that should hold `what`, in at most so many bytes.
+    """Return the content of a file that should contain `what`, with at most `most` bytes.
 
     Raises
     ------
     InputError
-        When it is larger, or no regular file.
+        If it is larger, or not a regular file.
     OSError
-        When it cannot be read.
+        If it cannot be read.
     """
     size = check_file_size(path, what, most)
     with Path(path).open("rb") as stream:
@@ -75,33 +75,33 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
 
 
 def check_file_size(path: str | Path, what: str, most: int) -> int:
-    """Return a file's size, refuse one of more than so many bytes; raises what `read_bytes` raises."""
+    """Return the size of a file of at most `most` bytes; errors are those of `read_bytes`."""
     if (size := check_regular(path)) > most:
-        raise InputError(f"{path}: has {size:,} bytes: expected {what} of at most {most:,}")
+        raise InputError(f"{path}: has {size:,} bytes, expected {what} of at most {most:,}")
     return size
 
 
 def derived(path: str | Path, ending: str) -> Path:
-    """Return the file beside `path` that is named after it: its name without its own ending, and `ending`."""
+    """Return a path beside `path` in which `ending` replaces its known extension."""
     path = Path(path)
     own = next((each for each in _ENDINGS if path.name.lower().endswith(each)), "")
     return path.with_name(f"{path.name[: len(path.name) - len(own)]}{ending}")
 
 
 def write_atomically(path: str | Path, content: Content) -> None:
-    """Write a file in one step: a reader sees the old or the new one, also after the power has failed.
+    """Write a file atomically: readers see the old or the new content, also after a power failure.
 
     Parameters
     ----------
     path : path
-        The file; its folder must exist.
+        Path of the file; its folder must exist.
     content : bytes, str or callable
         See `Content`.
 
     Raises
     ------
     InputError
-        When it cannot be written; what was there before is still there.
+        If it cannot be written; the previous content is then still there.
     """
     path = Path(path)
     with output_errors(path):
@@ -114,8 +114,8 @@ def write_atomically(path: str | Path, content: Content) -> None:
 
 
 def replace_file(path: Path, content: Content) -> None:
-    """Do what `write_atomically` does, with an OSError as it comes, for those who name another file in it."""
-    # A name of its own for each writer: two that write the same file must not share it.
+    """Write a file like `write_atomically`, but raise an OSError as it is, for callers that convert it."""
+    # Each writer uses its own temporary name, since two may write the same file.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.new")
     try:
         with temporary.open("wb") as stream:
@@ -133,7 +133,7 @@ def replace_file(path: Path, content: Content) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Wait until the content of a file is on the disk."""
+    """Wait until the content of a file is on disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -142,7 +142,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Wait until the names in a folder are on the disk, where the file system can do that."""
+    """Wait until the names in a folder are on disk, if the file system supports it."""
     try:
         sync_file(path)
     except OSError as error:
@@ -151,12 +151,12 @@ def sync_folder(path: Path) -> None:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what a JSON text holds.
+    """Return the content of a JSON text.
 
     Raises
     ------
     ValueError
-        When it is not JSON, or nested so deeply that Python gives up.
+        If it is not JSON, or is nested too deeply for Python.
     """
     try:
         return json.loads(text)

@@ -1,4 +1,4 @@
-"""Why a sub-aperture's slope is what it is: one bit a reason."""
+"""Flags that describe the state of a sub-aperture's slope: one bit each."""
 
 from __future__ import annotations
 
@@ -6,31 +6,35 @@ from enum import IntFlag
 
 
 class SubapertureFlag(IntFlag):
-    """Bits of `Slopes.flags`. The first two make a slope invalid; the others only inform."""
+    """Bits of `Slopes.flags`. The first two make a slope invalid; the others are information."""
 
     NO_FLUX = 1
-    """Nothing usable is left after the background subtraction; the slope is that of the reference (0)."""
+    """No usable flux after the background subtraction; the slope is 0 (the reference position)."""
     TOO_MANY_BAD_PIXELS = 2
-    """More bad pixels than the settings allow; the slope is that of the reference (0).
+    """Too many bad pixels for the settings; the slope is 0 (the reference position).
 
-    No further reason is given then."""
+    Other flags are not set then.
+    """
     UNLIKE_NEIGHBOURS = 4
-    """The slope is far from those of all neighbours, as that of a wrong spot; other slopes are not.
+    """The slope differs from those of all neighbours, as if the spot were wrongly identified.
 
-    Not where the layout has no pitch."""
+    Not set if the layout has no pitch.
+    """
     SATURATED = 8
     """At least one pixel reached the saturation level."""
     INFEASIBLE_STRENGTH = 16
-    """The strength is too strong for the image, above 0.9 of its own rms: lowered to 0.6 of that."""
+    """The strength exceeds 0.9 of the image's own rms, and was lowered to 0.6 of it."""
     NOT_CONVERGED = 32
-    """The iteration limit came before the tolerance was reached (not where that is 0), or the last steps
-    of an estimator were still long: more of them would move the slope by several standard errors."""
+    """The iteration limit was reached before the tolerance (not for a tolerance of 0). For other estimators,
+    the last steps were still long: more steps would change the slope by several standard errors.
+    """
     OUTLIER_LIKELY = 64
-    """The spot is so faint that more than about 1 % of such slopes are those of noise, not of the spot."""
+    """The spot is so faint that noise causes more than about 1 % of such slopes."""
     AT_SEARCH_LIMIT = 128
-    """The slope ends at `search_range_px`, along x or y, or the window's edge cuts the spot.
+    """The slope reaches `search_range_px` along x or y, or the edge of the window cuts the spot.
 
-    The spot may be beyond."""
+    The spot may be outside.
+    """
 
 
 INVALID = SubapertureFlag.NO_FLUX | SubapertureFlag.TOO_MANY_BAD_PIXELS

@@ -1,4 +1,4 @@
-"""One random generator for each source of randomness, all from the caller's."""
+"""Independent random generators, one for each source of randomness, spawned from the caller's."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from faintspot.base.errors import InputError
 def spawn(rng: Any, count: int) -> list[np.random.Generator]:
     """Return `count` independent generators spawned from `rng`.
 
-    Sources that draw from generators of their own do not change each other's draws when one of them is
-    switched on or off. Spawning does not consume the caller's stream, but spawning again from the same
-    generator gives other children.
+    With separate generators, switching one source of randomness on or off does not change the draws of the
+    others. Spawning does not advance the caller's stream, but a second call gives different children.
 
     Parameters
     ----------
     rng : numpy.random.Generator or None
-        The caller's generator; None takes fresh entropy from the operating system.
+        Parent generator; None uses fresh entropy from the operating system.
     count : int
-        How many generators.
+        Number of generators.
 
     Returns
     -------
@@ -30,7 +29,7 @@ def spawn(rng: Any, count: int) -> list[np.random.Generator]:
     Raises
     ------
     InputError
-        When `rng` is neither None nor a generator that can spawn.
+        If `rng` is neither None nor a generator that can spawn.
     """
     if rng is None:
         rng = np.random.default_rng()

@@ -1,4 +1,4 @@
-"""Public names that are imported at first use, so that importing a package stays fast."""
+"""Public names imported on first use, so that importing a package is fast."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def lazy_attributes(package: str, homes: Mapping[str, str]) -> Callable[[str], A
     Parameters
     ----------
     package : str
-        Its name.
+        Name of the package.
     homes : mapping of str
-        The module where each public name lives; a name may also be a module of the package.
+        Module that defines each public name; a name may also be a module of the package.
     """
 
     def get(name: str) -> Any:
-        """Import a public name from its home at first use."""
+        """Import a public name on first use."""
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home = importlib.import_module(homes[name])

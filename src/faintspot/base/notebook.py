@@ -1,4 +1,4 @@
-"""Small tables and pictures for notebooks, as HTML and SVG, without any other package."""
+"""Small HTML tables and SVG pictures for notebooks, without other packages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def table(title: str, rows: Mapping[str, str]) -> str:
 def windows_picture(
     corners: Sequence[Sequence[int]] | NDArray[Any], window: tuple[int, int], frame_shape: tuple[int, int]
 ) -> str:
-    """Return windows in their frame as SVG; the first row is at the bottom."""
+    """Return the windows in their frame as SVG; the first row is at the bottom."""
     (height, width), (rows, columns) = frame_shape, window
     windows = "".join(
         f'<rect x="{column}" y="{height - row - rows}" width="{columns}" height="{rows}"/>'

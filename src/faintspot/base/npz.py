@@ -1,4 +1,4 @@
-"""NumPy's .npz files: written in one step; read within a limit that is checked beforehand."""
+"""NumPy's .npz files: written atomically, and read within a size limit that is checked first."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from faintspot.base.files import check_regular, write_atomically
 from faintspot.base.sizes import check_bytes
 
 MOST_BYTES = 1 << 29
-"""Memory that the arrays of a file may take together."""
+"""Maximum total memory of the arrays of a file."""
 DAMAGE = (
     OSError,
     EOFError,
@@ -28,14 +28,14 @@ DAMAGE = (
     RuntimeError,
     NotImplementedError,
 )
-"""What the decoders of gzip and zip raise."""
+"""Exceptions of the gzip and zip decoders."""
 
 Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the start of a .npy file, or of a member of a .npz file, says of the array behind it."""
+    """Header of a .npy file, or of a member of a .npz file."""
 
     shape: tuple[int, ...]
     fortran_order: bool
@@ -44,17 +44,17 @@ class Header:
 
     @property
     def data_bytes(self) -> int:
-        """Bytes of the array."""
+        """Size of the array in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 def read_header(name: str, stream: IO[bytes], actual_bytes: int) -> Header:
-    """Read the header of an array that takes `actual_bytes` with it.
+    """Read the header of an array whose file has `actual_bytes` bytes including the header.
 
     Raises
     ------
     InputError
-        When it is none, is of Python objects, or the array is cut.
+        If it is invalid, describes Python objects, or the array is truncated.
     """
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
@@ -64,7 +64,7 @@ def read_header(name: str, stream: IO[bytes], actual_bytes: int) -> Header:
         raise InputError(f"{name}: expected .npy format version 1 or 2, got another") from None
     except DAMAGE:
         raise
-    except Exception as error:  # NumPy evaluates the header as Python, which fails in many ways
+    except Exception as error:  # NumPy evaluates the header as Python, which can fail in many ways
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{name}: expected a NumPy array ({reason})") from None
     header = Header(shape, fortran_order, dtype, stream.tell())
@@ -78,12 +78,12 @@ def read_header(name: str, stream: IO[bytes], actual_bytes: int) -> Header:
 
 
 def open_archive(path: str | Path) -> tuple[zipfile.ZipFile, dict[str, zipfile.ZipInfo]]:
-    """Open a .npz file; return it, and its arrays by name.
+    """Open a .npz file; return it, and its members by array name.
 
     Raises
     ------
     InputError
-        When it is no regular file.
+        If it is not a regular file.
     Exception
         Any of `DAMAGE`.
     """
@@ -94,7 +94,7 @@ def open_archive(path: str | Path) -> tuple[zipfile.ZipFile, dict[str, zipfile.Z
 
 
 def headers_of(path: str | Path, names: Iterable[str] | None = None) -> dict[str, Header]:
-    """Return the headers of the arrays of these names that are there, or of all; raises as `open_archive`."""
+    """Return the headers of the named arrays that exist, or of all; errors are those of `open_archive`."""
     archive, members = open_archive(path)
     with archive:
         headers = {}
@@ -107,14 +107,14 @@ def headers_of(path: str | Path, names: Iterable[str] | None = None) -> dict[str
 def unpacked(
     path: str | Path, what: str, names: Iterable[str] | None = None, most: int = MOST_BYTES
 ) -> dict[str, Any]:
-    """Return the arrays of these names that are there, or all, when they take at most so many bytes.
+    """Return the named arrays that exist, or all, if they need at most `most` bytes.
 
     Raises
     ------
     InputError
-        When they take more.
+        If they need more.
     Exception
-        As `open_archive`; ValueError when an array is damaged.
+        As for `open_archive`; ValueError if an array is damaged.
     """
     headers = headers_of(path, names)
     check_bytes(path, sum(header.data_bytes for header in headers.values()), most, what)
@@ -122,19 +122,19 @@ def unpacked(
     values = {}
     with archive:
         for name in headers:
-            # zip gives no more bytes than the member states, whatever its content inflates to.
+            # zip returns no more bytes than the member states, whatever its data inflate to.
             with archive.open(members[name]) as stream:
                 values[name] = np.lib.format.read_array(stream, allow_pickle=False)
     return values
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays to a compressed file in one step, as `write_atomically` does.
+    """Write arrays to a compressed file atomically, with `write_atomically`.
 
     Raises
     ------
     InputError
-        When it cannot be written.
+        If it cannot be written.
     """
     write_atomically(path, lambda stream: np.savez_compressed(stream, **arrays))
 
@@ -146,12 +146,12 @@ def read_arrays(
     optional: Sequence[str] = (),
     most: int = MOST_BYTES,
 ) -> dict[str, Any]:
-    """Return the arrays of these names, or all, from a file that should hold `what` in at most so many bytes.
+    """Read the named arrays, or all, from a file that should contain `what` in at most `most` bytes.
 
     Raises
     ------
     InputError
-        When it cannot be read, is too large, or an array that is not optional is missing.
+        If it cannot be read, is too large, or a required array is missing.
     """
     try:
         values = unpacked(path, what, names, most)
@@ -159,7 +159,7 @@ def read_arrays(
         raise InputError(f"{path}: no such file") from None
     except InputError:
         raise
-    except Exception:  # a damaged archive raises whatever its decoder meets
+    except Exception:  # a damaged archive can raise any error of its decoder
         raise InputError(f"{path}: expected {what} (.npz), got something else") from None
     for name in names or ():
         if name not in values and name not in optional:
@@ -168,12 +168,12 @@ def read_arrays(
 
 
 def save_fields(path: str | Path, item: object, names: Sequence[str]) -> None:
-    """Write the attributes of these names that are not None with `save_arrays`.
+    """Write the named attributes that are not None, with `save_arrays`.
 
     Raises
     ------
     InputError
-        When the file cannot be written.
+        If the file cannot be written.
     """
     values = {name: getattr(item, name) for name in names}
     save_arrays(path, {name: value for name, value in values.items() if value is not None})
@@ -182,12 +182,12 @@ def save_fields(path: str | Path, item: object, names: Sequence[str]) -> None:
 def load_fields(
     make: Callable[..., Made], path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
 ) -> Made:
-    """Return what is made of the arrays that `save_fields` wrote, see `read_arrays`.
+    """Return the object that `make` constructs from the arrays written by `save_fields`; see `read_arrays`.
 
     Raises
     ------
     InputError
-        As `read_arrays`; what `make` raises, with the file's name.
+        As for `read_arrays`; errors of `make` with the file's name.
     """
     values = read_arrays(path, what, names, optional)
     try:

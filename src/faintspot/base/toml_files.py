@@ -1,4 +1,4 @@
-"""TOML files: read with errors in one line, unknown names refused with the one that was meant."""
+"""TOML files: read with one-line errors; unknown names are rejected with a suggestion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from faintspot.base.errors import InputError
 from faintspot.base.files import read_bytes
 
-_MOST_BYTES = 1 << 22  # a layout of 10,000 sub-apertures takes a tenth of it
+_MOST_BYTES = 1 << 22  # a layout of 10,000 sub-apertures needs a tenth of it
 
 
 def read_text(path: str | Path, *, if_missing: str = "") -> str:
@@ -21,12 +21,12 @@ def read_text(path: str | Path, *, if_missing: str = "") -> str:
     ----------
     path : path
     if_missing : str
-        What to say beside "no such file", as who makes one.
+        Text added to "no such file", for example the command that makes it.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is too large or is not UTF-8.
+        If the file cannot be read, is too large or is not UTF-8.
     """
     try:
         return read_bytes(path, "a TOML file", _MOST_BYTES).decode("utf-8")
@@ -39,23 +39,23 @@ def read_text(path: str | Path, *, if_missing: str = "") -> str:
 
 
 def parse_file(path: str | Path, *, if_missing: str = "") -> dict[str, Any]:
-    """Read a TOML file; parameters and errors as `read_text`, and as `parse_text`."""
+    """Read a TOML file; parameters and errors are those of `read_text` and `parse_text`."""
     return parse_text(read_text(path, if_missing=if_missing), str(path))
 
 
 def parse_text(text: str, where: str) -> dict[str, Any]:
-    """Read TOML text; `where` it was found is named in messages.
+    """Read TOML text; messages name its origin, `where`.
 
     Raises
     ------
     InputError
-        When it is not TOML.
+        If it is not TOML.
     """
     try:
         return tomllib.loads(text)
     except RecursionError:
         raise InputError(f"{where}: not a TOML file: nested too deeply") from None
-    except ValueError as error:  # also of numbers that Python does not read
+    except ValueError as error:  # also raised for numbers that Python cannot read
         raise InputError(f"{where}: not a TOML file: {str(error).splitlines()[0]}") from None
 
 
@@ -67,21 +67,21 @@ def check_keys(
     required: Iterable[str] = (),
     what: str = "key",
 ) -> None:
-    """Refuse a table with a key that nobody knows, or without one that is needed.
+    """Raise an error for a table with an unknown key, or without a required one.
 
     Parameters
     ----------
     prefix : str
-        What messages say before the key, as "settings." or "faintspot.toml: ".
+        Text before the key in messages, such as "settings." or "faintspot.toml: ".
     table : mapping
     known, required : names
     what : str
-        What its keys are: "key", "table".
+        Kind of its keys: "key", "table".
 
     Raises
     ------
     InputError
-        It says which key was probably meant.
+        If a key is unknown or missing; the message suggests the most similar key.
     """
     for key in table:
         check_known(prefix, key, known, what)
@@ -91,12 +91,12 @@ def check_keys(
 
 
 def check_known(prefix: str, name: str, known: Iterable[str], what: str = "key") -> None:
-    """Refuse a name that is not among those that are known, and say which one was probably meant.
+    """Raise an error for an unknown name, and suggest the most similar known one.
 
     Raises
     ------
     InputError
-        As "settings.noise_sdt: unknown key; did you mean noise_std?".
+        Such as "settings.noise_sdt: unknown key; did you mean noise_std?".
     """
     names = list(known)
     if name not in names:
@@ -111,7 +111,7 @@ def checked_table(where: str, value: Any) -> dict[str, Any]:
     Raises
     ------
     InputError
-        When it is something else; it names `where` it is.
+        If it is something else; the message begins with `where`.
     """
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected a table, got {value!r}")

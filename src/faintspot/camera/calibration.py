@@ -188,7 +188,7 @@ class Calibration:
         Raises
         ------
         InputError
-            When a map or a bad pixel does not fit into the frame.
+            If a map or a bad pixel does not fit into the frame.
         """
         for name, array in self._arrays().items():
             if array.shape != frame_shape:
@@ -271,7 +271,7 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     Raises
     ------
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
     """
     if key != "bad_pixels":
         with open_frames([location]) as frames:

@@ -61,7 +61,7 @@ class Detector:
     Raises
     ------
     InputError
-        When a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of its range or of the wrong shape.
 
     Examples
     --------
@@ -129,7 +129,7 @@ class Detector:
         Raises
         ------
         InputError
-            When `mean_e` is negative or not finite, or its images do not have the shape of the detector's
+            If `mean_e` is negative or not finite, or its images do not have the shape of the detector's
             maps or do not contain its hot pixels.
         """
         mean = self._checked_mean(mean_e)
@@ -164,7 +164,7 @@ class Detector:
         Raises
         ------
         InputError
-            When `adu` holds anything but finite numbers.
+            If `adu` holds anything but finite numbers.
         """
         values = finite_array("adu", adu)
         electrons = (values.astype(np.float64) - self.offset_adu) * (self.gain_e_per_adu / self.em_gain)

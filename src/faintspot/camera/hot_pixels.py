@@ -34,7 +34,7 @@ def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.i
     Raises
     ------
     InputError
-        When the frame is not a real two-dimensional array.
+        If the frame is not a real two-dimensional array.
     """
     from scipy.ndimage import median_filter, minimum_filter, rank_filter
 

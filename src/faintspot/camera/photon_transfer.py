@@ -138,7 +138,7 @@ def measure_detector(
     Raises
     ------
     InputError
-        When neither frames nor darks are given, or arrays are not finite or do not fit each other.
+        If neither frames nor darks are given, or arrays are not finite or do not fit each other.
 
     Examples
     --------

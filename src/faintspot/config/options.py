@@ -1,7 +1,7 @@
-"""Options that are declared once: bounds, unit and meaning.
+"""Declared options with bounds, unit and meaning.
 
-Checks, values for each sub-aperture, configuration files, command-line options and the tables of the
-documentation all come from the declaration.
+The declaration is the single source of checks, values per sub-aperture, configuration files, command-line
+options and the tables of the documentation.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ _MIXED = '{}: expected "auto" for the whole sensor or numbers for all sub-apertu
 
 @dataclass(frozen=True)
 class Option:
-    """What an option may be.
+    """Declaration of an option.
 
     Parameters
     ----------
     meaning : str
-        One sentence or two, for documentation and help texts.
+        One or two sentences for documentation and help texts.
     unit : str
-        Such as "px" or "e-"; empty for pure numbers.
+        Unit such as "px" or "e-"; empty for pure numbers.
     low, high : float
         Bounds of a number.
     low_open : bool
-        Whether `low` itself is refused.
+        Whether `low` itself is excluded.
     whole : bool
-        Whether it is a whole number.
+        Whether it must be a whole number.
     choices : tuple of str
-        Names it may be, instead of a number.
+        Allowed names, instead of a number.
     per_subaperture : bool
-        Whether every sub-aperture may have its own.
+        Whether it may differ between sub-apertures.
     automatic : bool
-        Whether it may be "auto": found from flux, camera and spot.
+        Whether it may be "auto": chosen from flux, camera and spot.
     optional : bool
-        Whether it may be None: not needed, or found by itself.
+        Whether it may be None: not used, or chosen automatically.
     """
 
     meaning: str
@@ -60,12 +60,12 @@ class Option:
     optional: bool = False
 
     def checked(self, name: str, value: Any) -> Any:
-        """Return a value whatever its form; scalars become plain Python values, sequences read-only arrays.
+        """Return the checked value; scalars become plain Python values, sequences read-only arrays.
 
         Raises
         ------
         InputError
-            When it is none of what the declaration allows.
+            If the declaration does not allow it.
         """
         if isinstance(value, PerSubaperture) and self.per_subaperture:
             return self._checked_places(name, value)
@@ -85,7 +85,7 @@ class Option:
 
     def _checked_places(self, name: str, value: PerSubaperture) -> PerSubaperture:
         if None in value.others.values():
-            raise InputError(f"{name}: expected a value for each sub-aperture that is named, got none")
+            raise InputError(f"{name}: expected a value for each sub-aperture listed, got none")
         others = {int(index): self.checked(name, item) for index, item in value.others.items()}
         if AUTO in others.values() or (others and value.default == AUTO):
             raise InputError(_MIXED.format(name))
@@ -114,7 +114,7 @@ class Option:
 
 
 def option(default: Any, meaning: str, **bounds: Any) -> Any:
-    """Declare an option of a dataclass that derives from `Options`; `bounds` are those of `Option`.
+    """Declare an option of a dataclass derived from `Options`; `bounds` are the other fields of `Option`.
 
     Examples
     --------
@@ -135,13 +135,13 @@ def option(default: Any, meaning: str, **bounds: Any) -> Any:
 
 @dataclass(frozen=True)
 class PerSubaperture:
-    """A value for every sub-aperture of a sensor of any size: one default, and others in some places."""
+    """Value for each sub-aperture of a sensor of any size: a default, and other values for some of them."""
 
     default: Any
     others: Mapping[int, Any]
 
     def __getitem__(self, index: int) -> Any:
-        """Value of sub-aperture `index`."""
+        """Return the value of sub-aperture `index`."""
         return self.others.get(int(index), self.default)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -150,12 +150,12 @@ class PerSubaperture:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """A frozen dataclass whose fields are declared by `option`, checked when it is made.
+    """Base class of frozen dataclasses whose fields are declared by `option` and checked on creation.
 
     Raises
     ------
     InputError
-        For a value out of range, NaN, of the wrong kind, or arrays of different lengths.
+        If a value is out of range, NaN or of the wrong type, or arrays have different lengths.
     """
 
     def __post_init__(self) -> None:
@@ -172,16 +172,16 @@ class Options:
 
     @classmethod
     def declared(cls) -> dict[str, Option]:
-        """Return the declarations, by name."""
+        """Return the declarations by name."""
         return {item.name: item.metadata["option"] for item in fields(cls) if "option" in item.metadata}
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
-        """Return the default of every option."""
+        """Return the default of each option."""
         return {item.name: item.default for item in fields(cls) if "option" in item.metadata}
 
     def chosen(self) -> dict[str, Any]:
-        """Return the options that are not at their defaults."""
+        """Return the options whose values are not the defaults."""
         defaults = self.defaults()
         return {
             name: getattr(self, name)
@@ -190,7 +190,7 @@ class Options:
         }
 
     def default_of(self, name: str, pixels: int) -> Any:
-        """Return what an option is where it is None, for windows of so many pixels; NaN: not set."""
+        """Return the value used in place of None for windows of `pixels` pixels; NaN if there is none."""
         return math.nan
 
     def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:
@@ -199,7 +199,7 @@ class Options:
         Raises
         ------
         InputError
-            When the values are for another number of sub-apertures.
+            If the values are for another number of sub-apertures.
         """
         value = getattr(self, name)
         if isinstance(value, np.ndarray):
@@ -219,12 +219,12 @@ class Options:
         return np.full(n_subapertures, self.default_of(name, pixels) if value is None else value)
 
     def replaced(self, changes: Mapping[str, Any], where: Any = None) -> Self:
-        """Return the same with some values changed, everywhere or in some sub-apertures (numbers or a mask).
+        """Return a copy with some values changed, everywhere or in some sub-apertures (indices or a mask).
 
         Raises
         ------
         InputError
-            For an unknown name, a bad value, an index out of range.
+            If a name is unknown, a value is invalid, or an index is out of range.
         """
         values = {name: getattr(self, name) for name in self.declared()}
         for name, value in changes.items():
@@ -234,7 +234,7 @@ class Options:
         return type(self)(**values)
 
     def _changed_at(self, name: str, selected: NDArray[np.int64], value: Any) -> Any:
-        """Combine the old value with a new one in the selected places."""
+        """Replace the values of the selected sub-apertures."""
         declared, old = self.declared()[name], getattr(self, name)
         if not declared.per_subaperture:
             raise InputError(f"{name}: expected one value for the whole sensor, not one for `where`")
@@ -257,12 +257,12 @@ class Options:
 
 
 def check_lengths(*parts: Options) -> None:
-    """Refuse arrays of different lengths among the options of one sensor.
+    """Raise an error for arrays of different lengths among the options of one sensor.
 
     Raises
     ------
     InputError
-        When there are such.
+        If there are any.
     """
     lengths = {
         name: len(value)
@@ -276,7 +276,7 @@ def check_lengths(*parts: Options) -> None:
 
 
 def is_auto(value: Any) -> bool:
-    """Say whether an option is to be found by itself."""
+    """Return whether an option is chosen automatically."""
     return isinstance(value, str) and value == AUTO
 
 
@@ -287,7 +287,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _indices(where: int | Sequence[int] | NDArray[Any]) -> NDArray[np.int64]:
-    """Sub-aperture numbers from an int, a sequence of int or a boolean mask."""
+    """Return sub-aperture numbers from an int, a sequence of int or a boolean mask."""
     array = np.atleast_1d(np.asarray(where))
     if array.dtype == np.bool_:
         array = np.flatnonzero(array)

@@ -1,7 +1,8 @@
-"""Presets: how much work an estimator does, where nothing else is said.
+"""Presets: amount of work of an estimator if its own options are not set.
 
-"accurate" goes on until more work changes little. "fast" does a small fixed amount, after which the slope
-error is within 1 % of the converged one at the strength that suits the spots: docs/fast.md says where not.
+"accurate" iterates until further iterations have little effect. "fast" makes a small fixed number of
+iterations. Its slope error is within 1 % of the converged one at the strength that suits the spots;
+exceptions are listed in docs/fast.md.
 """
 
 from __future__ import annotations
@@ -17,5 +18,5 @@ _DENOISING: dict[str, dict[str, Any]] = {
 
 
 def of_denoising(preset: str) -> dict[str, Any]:
-    """Tolerance and iteration limit of the total-variation denoising."""
+    """Return tolerance and iteration limit of the total-variation denoising."""
     return _DENOISING[preset]

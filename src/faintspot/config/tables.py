@@ -1,4 +1,4 @@
-"""Tables of a configuration file (faintspot.toml): read, checked, written; what else it holds stays."""
+"""Tables of a configuration file (faintspot.toml): read, checked and written, preserving other content."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_tables(path: str | Path) -> dict[str, dict[str, Any]]:
     Raises
     ------
     InputError
-        When the file cannot be read, is not TOML, or has an unknown table.
+        If the file cannot be read, is not TOML, or has an unknown table.
     """
     path = Path(path)
     maker = f"`faintspot layout FRAME -o {path.name}` makes one"
@@ -34,12 +34,12 @@ def read_tables(path: str | Path) -> dict[str, dict[str, Any]]:
 
 
 def table_of(path: str | Path, document: Mapping[str, dict[str, Any]], name: str) -> dict[str, Any]:
-    """Return a table that must be there.
+    """Return a required table.
 
     Raises
     ------
     InputError
-        When it is not.
+        If it is missing.
     """
     if name not in document:
         raise InputError(f"{path}: expected a table [{name}], found {', '.join(document) or 'none'}")
@@ -48,7 +48,7 @@ def table_of(path: str | Path, document: Mapping[str, dict[str, Any]], name: str
 
 @contextlib.contextmanager
 def errors_of_table(path: str | Path, name: str) -> Iterator[None]:
-    """Say in errors which file and which table they are about."""
+    """Prefix errors with the file and the table in which they occur."""
     try:
         yield
     except InputError as error:
@@ -58,19 +58,19 @@ def errors_of_table(path: str | Path, name: str) -> Iterator[None]:
 
 
 def check_fields(name: str, kind: type, values: Mapping[str, Any]) -> None:
-    """Refuse a table with keys that are no fields of a dataclass, or without one that has no default.
+    """Raise an error for keys that are not fields of a dataclass, and for missing required fields.
 
     Raises
     ------
     InputError
-        When there are such.
+        If there are any.
     """
     required = [f.name for f in fields(kind) if f.default is MISSING]
     check_keys(f"{name}.", values, [f.name for f in fields(kind)], required=required)
 
 
 def chosen_fields(item: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass that are not at their default."""
+    """Return the fields of a dataclass whose values are not the defaults."""
     values = {}
     for f in fields(item):
         value = getattr(item, f.name)
@@ -81,12 +81,12 @@ def chosen_fields(item: Any) -> dict[str, Any]:
 
 
 def save_tables(path: str | Path, tables: Mapping[str, Mapping[str, Any] | None]) -> None:
-    """Write tables into a configuration file; None takes one away. Other tables and comments stay.
+    """Write tables into a configuration file; None removes a table. Other tables and comments are preserved.
 
     Raises
     ------
     InputError
-        When the file exists and is not TOML, or cannot be written.
+        If the file exists and is not TOML, or cannot be written.
     """
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
@@ -115,12 +115,12 @@ def tables_as_text(tables: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def per_subaperture(where: str, value: Any) -> Any:
-    """Return { default = 2.5, 4 = 3.0 } as a value for some sub-apertures and a default for the others.
+    """Return { default = 2.5, 4 = 3.0 } as values of some sub-apertures and a default for the others.
 
     Raises
     ------
     InputError
-        For a key that is neither.
+        If a key is neither "default" nor a number.
     """
     if not isinstance(value, dict):
         return value
@@ -135,7 +135,7 @@ def per_subaperture(where: str, value: Any) -> Any:
 
 
 def is_map(value: Any) -> bool:
-    """Say whether a value is an image rather than rows of positions."""
+    """Return whether a value is an image rather than rows of positions."""
     return (
         isinstance(value, np.ndarray) and value.ndim == 2 and (value.shape[1] != 2 or value.dtype.kind != "i")
     )
@@ -161,7 +161,7 @@ def _toml_value(value: Any) -> Any:
             inline[str(index)] = item
         return inline
     if isinstance(value, np.ndarray):
-        # Rows are positions in pixels: a millionth is enough, and stays readable.
+        # Rows are positions in pixels: six decimals are sufficient and readable.
         rows = np.round(value, 6).tolist() if value.ndim == 2 else value.tolist()
         array = tomlkit.array()
         array.extend(rows)

@@ -1,6 +1,6 @@
-"""Changes of settings as people write them: NAME=VALUE, and lists of sub-apertures.
+"""Changes of settings in text form: NAME=VALUE, and lists of sub-apertures.
 
-Nothing is imported that takes time, for commands that only pass them on to a running engine.
+Imports are kept small, for commands that only forward changes to a running engine.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ _WORDS = {"none": None, "true": True, "false": False}
 def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
     """Return new values by name from texts such as "noise_std=2.5" and "keep_brightest=20".
 
-    Values are numbers, true, false, none, texts, or several of them between commas: one for each
-    sub-aperture. Names are not looked at: whoever has the settings knows which there are.
+    Values are numbers, true, false, none, text, or a comma-separated list with one of them for each
+    sub-aperture. Names are not checked here, but by the owner of the settings.
 
     Raises
     ------
     InputError
-        For a text that is not NAME=VALUE, a repeated name, an empty value.
+        If a text is not NAME=VALUE, a name is repeated, or a value is empty.
     """
     changes: dict[str, Any] = {}
     for text in texts:
@@ -34,7 +34,7 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"{name}: expected one new value, got two")
         items = [item.strip() for item in value.split(",")]
         if "" in items:
-            raise InputError(f"{text!r}: expected a value after '=', or several between commas")
+            raise InputError(f"{text!r}: expected a value after '=', or several separated by commas")
         parsed = [_parsed_value(item) for item in items]
         changes[name] = parsed[0] if len(parsed) == 1 else parsed
     if not changes:
@@ -43,14 +43,14 @@ def parse_changes(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_subapertures(text: str) -> list[int]:
-    """Return sub-apertures' numbers from a text such as "4,5,10-20"; both ends of a range belong to it.
+    """Return sub-aperture numbers from text such as "4,5,10-20"; ranges include both ends.
 
-    In the order given, each once.
+    The order is kept, duplicates are removed.
 
     Raises
     ------
     InputError
-        For anything else.
+        If the text has another form.
     """
     numbers: dict[int, None] = {}
     for part in text.split(","):
@@ -61,7 +61,7 @@ def parse_subapertures(text: str) -> list[int]:
             )
         first, last = int(ends[0]), int(ends[-1])
         if last < first:
-            raise InputError(f"sub-apertures {text!r}: expected a range upwards, got {part.strip()!r}")
+            raise InputError(f"sub-apertures {text!r}: expected an increasing range, got {part.strip()!r}")
         if last >= _MOST_SUBAPERTURES:
             raise InputError(f"sub-apertures {text!r}: expected numbers below {_MOST_SUBAPERTURES}")
         numbers.update(dict.fromkeys(range(first, last + 1)))

@@ -174,7 +174,7 @@ def slopes_kernel(window: tuple[int, int], before: int, algorithm: bool | None, 
     Raises
     ------
     InputError
-        When the window is too large for a warp.
+        If the window is too large for a warp.
     """
     strips = strips_of(window)
     ny, nx, rows, threads, last = strips.ny, strips.nx, strips.rows, strips.threads, strips.strips - 1

@@ -43,7 +43,7 @@ def strips_of(window: tuple[int, int]) -> Strips:
     Raises
     ------
     InputError
-        When it is too large for a warp.
+        If it is too large for a warp.
     """
     ny, nx = window
     if nx > WARP or ny * nx > MOST_PIXELS:

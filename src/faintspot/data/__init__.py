@@ -1,4 +1,4 @@
-"""A real frame to try things on, shipped with the package."""
+"""Example frame of a real sensor, shipped with the package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def mmt_frame() -> NDArray[np.uint16]:
-    """Return a frame of a real sensor at work: faint spots, hot pixels, an annular pupil.
+    """Return an on-sky frame with faint spots, hot pixels and an annular pupil.
 
     On-sky frame of the active-optics sensor of the MMIRS spectrograph at the 6.5 m MMT (15 April 2017): a
     square array of 14 lenslets across, 22 px apart. Cropped to the pupil.
@@ -17,7 +17,7 @@ def mmt_frame() -> NDArray[np.uint16]:
     Returns
     -------
     ndarray, uint16, shape (rows, columns)
-        ADU. Its dark and gain are not known.
+        Frame [ADU]. Dark level and gain are unknown.
 
     Notes
     -----

@@ -1,6 +1,6 @@
-"""Estimators of a spot's position: one file each, objects that say everything about themselves.
+"""Estimators of a spot's position: one module each, with a class that describes itself completely.
 
-A new one is a file like those here: a frozen dataclass with its options, and either `locate` in NumPy or a
+A new estimator is a module like these: a frozen dataclass with its options, and either `locate` in NumPy or a
 compiled kernel. `docs/estimators.md` describes them.
 """
 

@@ -1,7 +1,7 @@
-"""What an estimator is: a frozen dataclass of its own options that says everything about itself.
+"""Base class of the estimators: a frozen dataclass of options that describes itself completely.
 
-Everybody else (pipeline, study, planner, closed loop, real time, reports, command line) asks the object and
-never its name.
+Other code (pipeline, study, planner, closed loop, real time, reports, command line) queries the object and
+never tests its name.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 
 class Need(enum.Enum):
-    """What an estimator may have to know; the value says it in words, and what provides it.
+    """Prior knowledge that an estimator may require; the value describes it as in error messages.
 
     Examples
     --------
@@ -48,7 +48,7 @@ _MAKERS = {
 
 
 class Style(NamedTuple):
-    """How figures draw an estimator.
+    """Colour, line and marker of an estimator in figures.
 
     Examples
     --------
@@ -63,7 +63,7 @@ class Style(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step whose images are worth a picture."""
+    """Processing step whose images are shown in figures."""
 
     title: str
     stage: str
@@ -76,12 +76,12 @@ BACKGROUND = Step("background subtracted", "background_subtracted")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimator(Options):
-    """A way to find the position of a spot in a sub-aperture's image.
+    """Method that finds the position of the spot in a sub-aperture image.
 
-    A subclass is a frozen dataclass (`@dataclass(frozen=True, eq=False, kw_only=True)`) whose fields are its
-    options, declared by `faintspot.config.options.option`. It either overrides `locate`, in NumPy, or
-    `prepared`, with a compiled kernel. `faintspot.estimators.register` makes it known by its name, as does
-    the entry point group `faintspot.estimators` of an installed package.
+    A subclass is a frozen dataclass (`@dataclass(frozen=True, eq=False, kw_only=True)`) whose fields are
+    its options, declared by `faintspot.config.options.option`. It overrides `locate` (NumPy) or `prepared`
+    (compiled kernel). Register it by name with `faintspot.estimators.register`, or, in an installed
+    package, with the entry point group `faintspot.estimators`.
 
     Examples
     --------
@@ -104,73 +104,73 @@ class Estimator(Options):
     """
 
     name: ClassVar[str]
-    """What configuration files and command lines call it."""
+    """Name in configuration files and on the command line."""
     label: ClassVar[str]
-    """What reports and figures call it."""
+    """Name in reports and figures."""
     method: ClassVar[str] = ""
-    """How it works, in a few words."""
+    """Short description of the method."""
     needs: ClassVar[frozenset[Need]] = frozenset()
     cost: ClassVar[float] = 1.0
-    """Time, in units of the pipeline with 20 iterations of TV denoising (16 x 16 px); measured once."""
+    """Run time relative to the pipeline with 20 iterations of TV denoising (16 x 16 px); measured once."""
     style: ClassVar[Style] = Style("#666666", "-.", "d")
     steps_shown: ClassVar[tuple[Step, ...]] = (RAW, CALIBRATED)
-    """The steps worth a picture, in their order."""
+    """Steps shown in figures, in order."""
     takes_prior: ClassVar[bool] = False
-    """Whether slopes that a loop predicts help it."""
+    """Whether slopes predicted by a control loop improve the estimate."""
     runs_on_gpu: ClassVar[bool] = False
 
-    # What others ask for ----------------------------------------------------------------------------
+    # Description ---------------------------------------------------------------------------------------
 
     @property
     def required(self) -> frozenset[Need]:
-        """What it has to know, as its options are."""
+        """Prior knowledge that is required with the current options."""
         return self.needs
 
     @property
     def uses_flux(self) -> bool:
-        """Whether it is better for knowing the mean flux, as `faintspot.MeanFlux` finds it."""
+        """Whether knowing the mean flux (see `faintspot.MeanFlux`) improves the estimate."""
         return False
 
     @property
     def denoises(self) -> bool:
-        """Whether it removes noise from the images before it measures them."""
+        """Whether the images are denoised before the position is measured."""
         return False
 
     def without_denoising(self) -> Estimator | None:
-        """Return the same without its denoising; None when it has none."""
+        """Return the same estimator without denoising, or None if it does not denoise."""
         return None
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
-        """Say in one line what it does to each of n sub-apertures of so many pixels."""
+        """Describe in one line the processing of n sub-apertures with the given number of pixels."""
         options = ", ".join(f"{name} {self._span(name, n_subapertures, pixels)}" for name in self.chosen())
         return f"{self.method or self.label}{f' ({options})' if options else ''}"
 
     def for_scene(self, scene: Scene) -> Self:
-        """Return the same with the options that follow from a scene alone, before any are tuned."""
+        """Return a copy with the options that follow from a scene alone, before any are tuned."""
         return self
 
     def for_bright_flux(self) -> Estimator:
-        """Return what measures the same in images of plenty of flux and no noise, as for references."""
+        """Return an equivalent estimator for bright, noise-free images, as used for reference positions."""
         return self
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Return which options are tuned for a scene, and over which values; the first is the usual one."""
+        """Return the options to tune for a scene and their candidate values, the usual value first."""
         return {}
 
-    # What a pipeline asks for -----------------------------------------------------------------------
+    # Preparation and measurement ----------------------------------------------------------------------
 
     def prepared(self, sensor: Sensor) -> EstimatorPlan | None:
-        """Return what is computed once for a sensor, before the first frame; None: `locate` does the work.
+        """Return the tables computed for a sensor before the first frame, or None if `locate` is used.
 
         Raises
         ------
         InputError
-            When the options do not fit the sensor.
+            If the options do not fit the sensor.
         """
         return None
 
     def locate(self, images: NDArray[np.float32], sensor: Sensor, prior: Floats) -> Any:
-        """Return the positions of the spots of one frame: what an estimator without a kernel overrides.
+        """Return the positions of the spots of one frame; override this in an estimator without a kernel.
 
         Parameters
         ----------
@@ -178,22 +178,22 @@ class Estimator(Options):
             Calibrated sub-aperture images, electrons; bad pixels are filled.
         sensor : Sensor
         prior : (n, 2) float64
-            Predicted positions, px from the windows' middles.
+            Predicted positions, px from the window centres.
 
         Returns
         -------
         array (n, 2) or Positions
-            x and y, px from the windows' middles. What is not finite is flagged, never an error.
+            x and y, px from the window centres. Values that are not finite are flagged and raise no error.
         """
         raise NotImplementedError(f"{type(self).__name__}: expected an estimator with `locate` or `prepared`")
 
     def check(self, sensor: Sensor) -> None:
-        """Refuse a sensor that lacks what is needed.
+        """Raise an error if required knowledge about the sensor is missing.
 
         Raises
         ------
         InputError
-            When something is missing.
+            If something is missing.
         """
         missing = {
             Need.PSF: sensor.psf is None,
@@ -207,7 +207,7 @@ class Estimator(Options):
                 raise InputError(f"{need.value} for {wanted}, got none{_MAKERS.get(need, '')}")
 
     def _span(self, name: str, n_subapertures: int, pixels: int) -> str:
-        """Return the values of an option: one, or from which to which."""
+        """Return an option's value, or its range if it varies, as text."""
         if isinstance(getattr(self, name), str):
             return "automatic" if is_auto(getattr(self, name)) else str(getattr(self, name))
         values = self.values(name, n_subapertures, pixels)
@@ -218,7 +218,7 @@ class Estimator(Options):
 
 
 class Positions(NamedTuple):
-    """What an estimator in NumPy may return beside positions; each (n,).
+    """Positions and, optionally, flux and standard errors returned by `locate`; each of shape (n,).
 
     Examples
     --------
@@ -232,14 +232,14 @@ class Positions(NamedTuple):
     x: NDArray[Any]
     y: NDArray[Any]
     flux: NDArray[Any] | None = None
-    """Electrons. Default: the sum of the image."""
+    """Flux [electrons]. Default: sum of the image."""
     standard_error_x: NDArray[Any] | None = None
     standard_error_y: NDArray[Any] | None = None
     valid: NDArray[np.bool_] | None = None
 
 
 class EstimatorPlan:
-    """What an estimator has computed for one sensor, in the form that its kernel reads.
+    """Settings and tables of an estimator for one sensor, in the form that its kernel reads.
 
     Parameters
     ----------
@@ -250,39 +250,39 @@ class EstimatorPlan:
     kernel: Any = None
     """Compiled function that measures groups of sub-apertures: see `faintspot.kernels.groups`."""
     setting_rows: int = COMMON_ROWS
-    """Of the table of settings."""
+    """Number of rows in the settings table."""
     needs_flux: bool = False
-    """Whether the flux must be measured in every frame."""
+    """Whether the flux is measured in every frame."""
     flux_kernel: Any = staticmethod(flux_of_groups)
-    """Compiled function that measures it."""
+    """Compiled function that measures the flux."""
     flux_step: float = 1.02
-    """Measured flux counts in steps of this factor, so that settings vary slowly."""
+    """Measured flux is quantised in steps of this factor, so that settings change slowly."""
     prior_weight_row: int | None = None
-    """Of the table of settings: 1 / prior_std_px^2, for a prior whose width may change between frames."""
+    """Row of 1 / prior_std_px^2 in the settings table, for a prior whose width may change between frames."""
     in_python: bool = False
     """Whether the kernel only calibrates the images, and `locate_frame` finds the positions."""
     fewer_lanes_are_faster: bool = False
-    """Whether a group that is not full is measured faster with a narrower vector."""
+    """Whether an incomplete group is measured faster with a narrower SIMD vector."""
     variance: float
-    """Of a dark pixel, electrons squared."""
+    """Variance of a dark pixel [electrons^2]."""
     faults: int = 0
-    """Number of frames in which an estimator in NumPy has failed."""
+    """Number of frames in which `locate` failed."""
     fault: str = ""
-    """Error of the last one, in one line."""
+    """Message of the last failure, in one line."""
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         self.estimator, self.sensor = estimator, sensor
         self.variance = sensor.variance
 
     def each(self, name: str) -> NDArray[Any]:
-        """Return an option's value for every sub-aperture."""
+        """Return an option's value for each sub-aperture."""
         return self.estimator.values(name, self.sensor.n, self.sensor.pixels)
 
     def fill(self, table: NDArray[np.float32]) -> None:
-        """Write the estimator's own rows of a table of settings that do not depend on the flux."""
+        """Fill the rows of the settings table that do not depend on the flux."""
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
-        """Write those that do, for a flux (electrons) of every sub-aperture; NaN where it is not known."""
+        """Fill the rows that depend on the flux [electrons] of each sub-aperture; NaN where it is unknown."""
 
     def locate_frame(
         self,
@@ -297,12 +297,12 @@ class EstimatorPlan:
 
     @property
     def tables(self) -> Any:
-        """What the kernel reads beside the settings: a NamedTuple."""
+        """Tables that the kernel reads in addition to the settings: a NamedTuple."""
         raise NotImplementedError
 
     @property
     def own_scratch(self) -> Any:
-        """Function that makes the kernel's own memory; always the same one while `tables` stay."""
+        """Function that allocates the kernel's scratch memory; unchanged as long as `tables` are."""
         raise NotImplementedError
 
 

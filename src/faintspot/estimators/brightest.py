@@ -1,4 +1,4 @@
-"""The brightest pixels: background subtraction and centre of gravity, without denoising."""
+"""Brightest pixels: background subtraction and centre of gravity, without denoising."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class BrightestPixels(KeepingBrightest):
 
     @classmethod
     def like(cls, other: KeepingBrightest) -> BrightestPixels:
-        """Return what keeps the same pixels as another estimator, without its denoising."""
+        """Return an estimator with the background subtraction of `other` and no denoising."""
         return cls(**{name: getattr(other, name) for name in cls.declared()})
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:

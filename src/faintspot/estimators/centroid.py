@@ -1,4 +1,4 @@
-"""The plain centre of gravity, of all the flux in the window."""
+"""Centre of gravity of the flux in the whole window."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from faintspot.estimators.sensor import Sensor
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CentreOfGravity(Centroid):
-    """Centre of gravity of the whole window, nothing subtracted."""
+    """Centre of gravity of the whole window, without background subtraction."""
 
     name = "centroid"
     label = "centre of gravity"

@@ -1,4 +1,4 @@
-"""Tables of the estimators and of their options, in Markdown, made from the declarations."""
+"""Markdown tables of the estimators and their options, generated from the declarations."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _NEEDS = {
 
 
 def needs_in_words(kind: type[Estimator]) -> str:
-    """Return what an estimator has to know, in a few words."""
+    """Return the prior knowledge that an estimator requires, in a few words."""
     return ", ".join(words for need, words in _NEEDS.items() if need in kind.needs)
 
 
 def estimator_table() -> str:
-    """Return a table of all estimators: name, what it does, what it needs, cost."""
+    """Return a table of all estimators: name, method, requirements and cost."""
     rows = [
         f"| `{name}` | {kind.method or kind.label} | {needs_in_words(kind)} | {kind.cost:g} |"
         for name, kind in estimators().items()
     ]
-    return "\n".join(["| name | what it does | needs | cost |", "|---|---|---|---|", *rows])
+    return "\n".join(["| name | method | requires | cost |", "|---|---|---|---|", *rows])
 
 
 def option_table(kind: type[Options]) -> str:
-    """Return a table of the options of one class: name, default, what it may be, meaning."""
+    """Return a table of the options of one class: name, default, allowed values and meaning."""
     defaults = kind.defaults()
     rows = [
         f"| `{name}` | {_default(defaults[name])} | {allowed_in_words(declared)} | {declared.meaning} |"
@@ -43,13 +43,13 @@ def option_table(kind: type[Options]) -> str:
 
 
 def all_tables(shared: type[Options]) -> Mapping[str, str]:
-    """Return the tables of the documentation, by name: "estimators", "shared" and each estimator's own."""
+    """Return the documentation's tables by name: "estimators", "shared" and one for each estimator."""
     own = {name: option_table(kind) for name, kind in estimators().items()}
     return {"estimators": estimator_table(), "shared": option_table(shared), **own}
 
 
 def allowed_in_words(declared: Option) -> str:
-    """Say what an option may be, with its unit."""
+    """Describe the allowed values of an option, with the unit."""
     if declared.choices:
         parts = [", ".join(f'"{choice}"' for choice in declared.choices)]
     else:

@@ -1,4 +1,4 @@
-"""Errors of estimators of others: whatever their code raises becomes one line that names them."""
+"""Errors raised by third-party estimators, converted to one line that names the estimator."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _LONGEST = 300
 
 @contextlib.contextmanager
 def faults_of(title: str, file: str | None = None) -> Iterator[None]:
-    """Turn whatever code of others raises into an `InputError` of one line.
+    """Convert any exception raised by third-party code to a one-line `InputError`.
 
-    That includes SystemExit, and a KeyboardInterrupt that the code raises. Ctrl-C stays what it is.
+    This includes SystemExit, and a KeyboardInterrupt that the code itself raises. Ctrl-C still interrupts.
 
     Parameters
     ----------
     title : str
-        Whose code it is; the message begins with it.
+        Name of the code; the message begins with it.
     file : str, optional
-        Source file of that code; the message says in which of its lines the error was raised.
+        Source file of the code; the message states the line in which the error was raised.
 
     Raises
     ------
     InputError
-        For any error.
+        For any exception.
     """
     interrupts: list[int] = []
     former: Any = signal.getsignal(signal.SIGINT)
-    # Only the main thread gets signals, and may say how they are handled.
+    # Only the main thread receives signals and may change their handlers.
     watched = threading.current_thread() is threading.main_thread() and callable(former)
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -55,13 +55,13 @@ def faults_of(title: str, file: str | None = None) -> Iterator[None]:
 
 
 def one_line(error: BaseException) -> str:
-    """Return an error's name and text in one line of bounded length; of an `InputError` the text alone."""
+    """Return an error's name and text in one line of limited length; of an `InputError` the text alone."""
     text = " ".join(str(error).split())[:_LONGEST]
     return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 def _line_of(error: BaseException, file: str | None) -> str:
-    """Return the last line of a file on the way to where an error was raised."""
+    """Return the last line of `file` in the error's traceback, as text."""
     line, trace = None, error.__traceback__
     while trace is not None:
         line = trace.tb_lineno if trace.tb_frame.f_code.co_filename == file else line

@@ -1,4 +1,4 @@
-"""What the centres of gravity share: the background subtraction, and their compiled kernel."""
+"""Background subtraction and compiled kernel shared by the centre-of-gravity estimators."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from faintspot.kernels import gravity
 
 Floats = NDArray[np.float64]
 
-KEPT_FRACTION = 0.08  # of a window's pixels, where keep_brightest is not given: 20 of 16 x 16
+KEPT_FRACTION = 0.08  # of a window's pixels, if keep_brightest is not given: 20 of 16 x 16
 FEWEST_KEPT = 5
 FLUX_FLOOR = 1e-4
-_KEPT = (1.0, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0, 4.5)  # times the automatic number
-_USUAL_RANGE_PX = 1.0  # of positions, where no search range is set
+_KEPT = (1.0, 0.35, 0.5, 0.7, 1.4, 2.0, 3.0, 4.5)  # multiples of the automatic number
+_USUAL_RANGE_PX = 1.0  # of positions, if no search range is set
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Centroid(Estimator):
-    """A centre of gravity."""
+    """Centre of gravity."""
 
     flux_floor: Any = option(
         FLUX_FLOOR,
-        "A sub-aperture is flagged NO_FLUX when the flux that is left after the background subtraction is "
-        "not above this fraction of its image's largest pixel.",
+        "A sub-aperture is flagged NO_FLUX when the flux after background subtraction does not exceed this "
+        "fraction of the largest pixel of its image.",
         low=0.0,
         high=1.0,
     )
@@ -47,12 +47,12 @@ class Centroid(Estimator):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class KeepingBrightest(Centroid):
-    """A centre of gravity of the brightest pixels."""
+    """Centre of gravity of the brightest pixels."""
 
     keep_brightest: Any = option(
         None,
-        "Number of pixels that the background subtraction keeps. Default: 8 % of the window's pixels, at "
-        'least 5. "auto": by `faintspot.algorithms.automatic.automatic_kept_pixels`.',
+        "Number of pixels kept by the background subtraction. Default: 8 % of the window's pixels, at "
+        'least 5. "auto": chosen by `faintspot.algorithms.automatic.automatic_kept_pixels`.',
         low=1,
         high=2**24,
         whole=True,
@@ -60,12 +60,12 @@ class KeepingBrightest(Centroid):
     )
     rule: Any = option(
         "subtract_next",
-        "What is taken off the pixels that are kept; see `faintspot.brightest_pixels`.",
+        "Rule that sets the level subtracted from the kept pixels; see `faintspot.brightest_pixels`.",
         choices=RULES,
     )
 
     automatic_method: ClassVar[str]
-    """What `automatic_kept_pixels` calls it."""
+    """Value of `method` for `automatic_kept_pixels`."""
 
     @property
     def uses_flux(self) -> bool:
@@ -74,12 +74,12 @@ class KeepingBrightest(Centroid):
 
     @property
     def is_automatic(self) -> bool:
-        """Whether some option follows from the flux."""
+        """Whether an option is chosen from the flux."""
         return is_auto(self.keep_brightest)
 
     @property
     def required(self) -> frozenset[Need]:
-        """What the automatic options ask about, where there are any."""
+        """Knowledge required by the automatic options, if there are any."""
         return frozenset({Need.READ_NOISE, Need.WIDTH}) if self.is_automatic else frozenset()
 
     def default_of(self, name: str, pixels: int) -> Any:
@@ -89,24 +89,25 @@ class KeepingBrightest(Centroid):
         return super().default_of(name, pixels)
 
     def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """Return images (n, ny, nx) as the brightest pixels are sought in them; None: only its kernel knows.
+        """Return the images (n, ny, nx) from which the brightest pixels are selected.
 
-        Studies ask for it, which then keep every number of pixels at once.
+        None if only the kernel can compute them. Studies evaluate all numbers of kept pixels on these
+        images at once.
         """
         return None
 
     def for_bright_flux(self) -> Estimator:
-        """Keep the usual number of pixels where it follows from the flux."""
+        """Keep the default number of pixels if the number is automatic."""
         return self.replaced({"keep_brightest": None}) if is_auto(self.keep_brightest) else self
 
     def kept_in_words(self, n_subapertures: int, pixels: int) -> str:
-        """Say what is done after the denoising."""
+        """Describe the steps after denoising."""
         kept, rule = (self._span(name, n_subapertures, pixels) for name in ("keep_brightest", "rule"))
         number = "an automatic number of" if is_auto(self.keep_brightest) else kept
         return f"{number} brightest of {pixels} pixels kept (rule {rule}), centre of gravity"
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Numbers of kept pixels around the automatic one; speckles spread the flux over more."""
+        """Return numbers of kept pixels around the automatic one, larger for speckled spots."""
         kept = float(automatic_kept_pixels(**scene.rule_arguments, method=self.automatic_method))
         kept *= max(1.0, scene.d_over_r0)
         numbers = (int(np.clip(round(kept * factor), 1, scene.pixels - 1)) for factor in _KEPT)
@@ -128,16 +129,16 @@ class GravityPlan(EstimatorPlan):
         automatic = self._keeping is not None and self._keeping.is_automatic
         self.needs_flux = automatic and bool(np.isnan(sensor.flux_e).all())
 
-    # What the kernels read -------------------------------------------------------------------------------
+    # Tables of the kernels ------------------------------------------------------------------------------
 
     @cached_property
     def first_step(self) -> gravity.GravityTables:
-        """Tables of what is done before the background subtraction."""
+        """Tables of the step before the background subtraction."""
         return gravity.GravityTables()
 
     @property
     def before(self) -> int:
-        """What that is: NOTHING, SMOOTH or DENOISE of `faintspot.kernels.gravity`."""
+        """First step: NOTHING, SMOOTH or DENOISE of `faintspot.kernels.gravity`."""
         if self.first_step.flat_start is not None:
             return gravity.DENOISE
         return gravity.NOTHING if self.first_step.taps is None else gravity.SMOOTH
@@ -181,10 +182,10 @@ class GravityPlan(EstimatorPlan):
             table[gravity.SUBTRACT, selected] = rule != "threshold"
 
     def rule_arguments(self, flux_e: Floats) -> dict[str, Any]:
-        """Return what the automatic rules ask: flux, camera, and the spots before the pixels blur them."""
+        """Return the arguments of the automatic rules: flux, camera and optical spot size."""
         sensor, fwhm = self.sensor, self.sensor.spot_fwhm_px
         optical = np.sqrt(np.maximum(fwhm**2 - PIXEL_BLUR_PX2, 0.25 * fwhm**2))
-        # As the kernel's table holds them.
+        # Rounded as in the kernel's table.
         reach = sensor.search_range_px.astype(np.float32)
         return {
             "flux_e": flux_e,
@@ -199,6 +200,6 @@ class GravityPlan(EstimatorPlan):
 
 
 def keep_all(table: NDArray[np.float32]) -> None:
-    """Leave out the background subtraction: every pixel stays as it is."""
+    """Skip the background subtraction."""
     table[gravity.RANK] = table[gravity.SUBTRACT] = 0.0
     table[gravity.LEVEL] = -LARGEST_FLOAT32  # below every pixel

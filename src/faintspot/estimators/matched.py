@@ -1,4 +1,4 @@
-"""Matched filter: least squares with the PSF."""
+"""Matched filter: least-squares fit of the PSF."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from faintspot.estimators.stepping import Stepping
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fitted(Stepping):
-    """A fit of the PSF to the image."""
+    """Fit of the PSF to the image."""
 
     blur_px: Any = option(
         0.0,
-        "Standard deviation of a Gaussian that the PSF is blurred with, for what turbulence adds to a spot.",
+        "Standard deviation of the Gaussian blur applied to the PSF, for broadening by turbulence.",
         unit="px",
         low=0.0,
         high=16.0,
@@ -29,8 +29,8 @@ class Fitted(Stepping):
     )
     local_background: str = option(
         "auto",
-        "Whether a constant is fitted in every sub-aperture along with the spot, for a dark level or a sky "
-        'that is not known: "auto" where the calibration gives no dark, or a rough one.',
+        "Fit a constant background in every sub-aperture along with the spot, for an unknown dark level or "
+        'sky. "auto": fit it if the calibration gives no dark, or only a rough one.',
         choices=("auto", "on", "off"),
         per_subaperture=False,
     )
@@ -38,7 +38,7 @@ class Fitted(Stepping):
     needs = frozenset({Need.PSF})
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Blurs, of spots that are speckled."""
+        """Return blurs to try for speckled spots."""
         if not scene.d_over_r0:
             return {}
         return {"blur_px": [factor * scene.lambda_over_d_px for factor in BLURS]}
@@ -47,7 +47,7 @@ class Fitted(Stepping):
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Matched(Fitted):
-    """Matched filter: least squares of position and flux, all pixels weighted alike."""
+    """Matched filter: least-squares fit of position and flux, all pixels weighted equally."""
 
     name = "matched"
     label = "matched filter"

@@ -1,4 +1,4 @@
-"""Maximum a posteriori: likelihood with a prior on the position; the posterior's mean at very low flux."""
+"""Maximum a posteriori: likelihood with a prior on the position; posterior mean at very low flux."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from faintspot.kernels.groups import RANGE, flux_above_edges
 
 Floats = NDArray[np.float64]
 
-# Levels of measured flux, a tenth apart, that must fit into memory: a factor of two. Beyond what fits, the
-# nearest one's tables serve.
+# Levels of measured flux, a tenth apart, for which memory must suffice: a factor of two. Fluxes beyond the
+# levels that fit use the tables of the nearest one.
 _LEVELS = 8
 
 
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaximumAPosteriori(Likelihood):
-    """Maximum likelihood with a prior whose mean is the reference, or what a loop predicts."""
+    """Maximum likelihood with a prior centred on the reference position or on the predicted slope."""
 
     prior_std_px: Any = option(
         None,
-        "Standard deviation of the prior. Default: none but the search range.",
+        "Standard deviation of the prior on the position. Default: no prior other than the search range.",
         unit="px",
         low=1e-6,
         high=1e4,
     )
     preset: str = option(
         "accurate",
-        'How many steps are made where their number is not given: 3, or with "fast" 2.',
+        'Number of steps if `steps` is not given: 3, or 2 with "fast".',
         choices=PRESETS,
         per_subaperture=False,
     )
@@ -64,11 +64,11 @@ class MaximumAPosteriori(Likelihood):
         return True
 
     def for_scene(self, scene: Scene) -> Self:
-        """Take the spread of positions that are uniform within their range."""
+        """Set the prior to the standard deviation of positions distributed uniformly within their range."""
         return super().for_scene(scene).replaced({"prior_std_px": scene.position_range_px / math.sqrt(3)})
 
     def for_bright_flux(self) -> Self:
-        """Leave out the prior."""
+        """Remove the prior."""
         return super().for_bright_flux().replaced({"prior_std_px": None})
 
     def prepared(self, sensor: Sensor) -> LikelihoodPlan:
@@ -77,11 +77,11 @@ class MaximumAPosteriori(Likelihood):
 
 
 class _Plan(LikelihoodPlan):
-    """Tables of the posterior, too, for every level of flux that occurs."""
+    """Tables of the fit and of the posterior for each level of flux."""
 
     kernel = staticmethod(spot_fits.posterior_of_groups)
     prior_weight_row = spot_fits.PRIOR_WEIGHT
-    flux_step = 1.1  # larger than others', as each level has its tables
+    flux_step = 1.1  # larger than for other estimators, as each level needs its own tables
 
     def __init__(self, estimator: MaximumAPosteriori, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
@@ -89,11 +89,11 @@ class _Plan(LikelihoodPlan):
         if self.fits_background:
             self.flux_kernel = flux_above_edges
         self._posteriors: list[PosteriorGrid] = []
-        self._levels: dict[float, int] = {}  # first table of every level of flux that was measured
+        self._levels: dict[float, int] = {}  # first table of each level of flux measured so far
         self._scratch: tuple[int, Any] = (-1, None)
         self._grid, self._spacing = NO_POSTERIOR.grid, NO_POSTERIOR.spacing
         self.table_shape = (0, 0, 0)
-        """Of every kind's table: positions, rows, columns."""
+        """Shape of the table of each kind of sub-aperture: positions, rows, columns."""
 
     @property
     def tables(self) -> Any:
@@ -161,7 +161,7 @@ class _Plan(LikelihoodPlan):
         table[spot_fits.KIND] = before + which
 
     def _kinds(self, flux_e: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Return PSF, flux and floor of every kind of sub-aperture, (n_kinds, 3), and the kind of each."""
+        """Return PSF, flux and floor of each kind of sub-aperture, (n_kinds, 3), and the kind of each one."""
         columns = [self.psf.index_of(self.sensor.n), flux_e, self.each("weight_floor")]
         kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
         return kinds, which.reshape(-1)

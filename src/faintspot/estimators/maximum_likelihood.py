@@ -19,26 +19,26 @@ from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spots import PSFPlan
 from faintspot.kernels import spot_fits
 
-_MODEL_ERRORS = (0.3, 0.0, 1.0)  # of speckled spots
+_MODEL_ERRORS = (0.3, 0.0, 1.0)  # for speckled spots
 _LEARNT_WEIGHT_FLOOR = 1e-3
-_WHOLE_ELECTRONS_BELOW = 0.25  # read noise (e-) that rounding to whole electrons nearly takes away
+_WHOLE_ELECTRONS_BELOW = 0.25  # read noise (e-) that rounding to whole electrons nearly removes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Likelihood(Fitted):
-    """A fit whose weights follow from the noise."""
+    """Fit whose weights follow from the noise."""
 
     model_error: Any = option(
         0.0,
-        "How far the spots differ from the PSF, as a fraction of each pixel's light: bright pixels are "
-        "trusted no more than that. 0.1 to 0.5 for speckled spots; counts no more than sqrt(300 e- / flux).",
+        "Deviation of the spots from the PSF, as a fraction of each pixel's flux; it limits the weight of "
+        "bright pixels. 0.1 to 0.5 for speckled spots. Values above sqrt(300 e- / flux) are reduced to it.",
         low=0.0,
         high=10.0,
     )
     weight_floor: Any = option(
         2e-4,
-        "Variance, as a fraction of the flux, that is added to every pixel's weight, so that small errors "
-        "of the PSF in dark wings carry no large weights.",
+        "Variance, as a fraction of the flux, added to the variance of every pixel, so that small errors "
+        "of the PSF in dark wings do not get large weights.",
         low=0.0,
         high=1.0,
     )
@@ -46,15 +46,15 @@ class Likelihood(Fitted):
     needs = frozenset({Need.PSF, Need.READ_NOISE})
 
     def for_scene(self, scene: Scene) -> Self:
-        """Trust the wings of a learnt PSF less."""
+        """Reduce the weight of the wings of a learnt PSF."""
         return self.replaced({"weight_floor": _LEARNT_WEIGHT_FLOOR}) if scene.learnt else self
 
     def for_bright_flux(self) -> Self:
-        """Make no more steps: they would follow the weights of high flux, which are not those of faint."""
+        """Keep the number of steps: more would follow the weights of high flux."""
         return self
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Model errors, too, of spots that are speckled."""
+        """Return the options of the fit and, for speckled spots, also model errors."""
         errors = {"model_error": list(_MODEL_ERRORS)} if scene.d_over_r0 else {}
         return {**super().tuned(scene), **errors}
 
@@ -76,13 +76,13 @@ class MaximumLikelihood(Likelihood):
 
 
 class LikelihoodPlan(PSFPlan):
-    """Tables of a fit with weights; images of low noise are rounded to whole electrons."""
+    """Tables of a weighted fit; images with low read noise are rounded to whole electrons."""
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         noise = sensor.calibration.read_noise_photoelectrons
         if self.rounds_electrons and noise is not None:
-            # What rounding leaves: an electron too much or too little where the noise is beyond one half.
+            # Residual of the rounding: one electron more or less where the noise exceeds one half.
             self.variance = math.erfc(0.5 / (noise * math.sqrt(2.0))) if noise > 0 else 0.0
 
     @property

@@ -1,4 +1,4 @@
-"""Estimators in plain NumPy: images are calibrated by the compiled kernel, positions found in Python."""
+"""Estimators in plain NumPy: the compiled kernel calibrates the images, Python finds the positions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _AT_SEARCH_LIMIT = np.uint8(SubapertureFlag.AT_SEARCH_LIMIT)
 
 
 def _limited(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.uint8]) -> NDArray[Any]:
-    """Return slopes (n, 2) within the search range; flags (n,) say which valid ones it has limited."""
+    """Clip slopes (n, 2) to the search range, and set the flags (n,) of the valid ones that were clipped."""
     reach = table[groups.RANGE]
     at_limit = np.abs(away).max(axis=1) >= reach - groups.LIMIT_ROUNDING_PX
     flags &= ~_AT_SEARCH_LIMIT
@@ -35,7 +35,7 @@ def _limited(away: NDArray[Any], table: NDArray[np.float32], flags: NDArray[np.u
 
 
 def typical_images(n: int, window: tuple[int, int]) -> NDArray[np.float32]:
-    """Return images (n, ny, nx) of spots of 300 e- in the middles of windows, without noise."""
+    """Return noise-free images (n, ny, nx) of spots of 300 e- at the window centres."""
     y, x = (np.arange(side) - 0.5 * (side - 1) for side in window)
     profile = np.exp(-0.5 * (y[:, None] ** 2 + x**2))
     spot = (_TYPICAL_FLUX_E * profile / profile.sum()).astype(np.float32)
@@ -43,18 +43,18 @@ def typical_images(n: int, window: tuple[int, int]) -> NDArray[np.float32]:
 
 
 class PythonPlan(EstimatorPlan):
-    """The kernel calibrates images and flags what is bad; `locate` then finds the positions.
+    """Plan whose kernel calibrates images and flags bad ones; `locate` then finds the positions.
 
     Parameters
     ----------
     estimator : Estimator
-        With a `locate` of its own, which is tried on typical spots.
+        Estimator with its own `locate`, which is tested on typical spots.
     sensor : Sensor
 
     Raises
     ------
     InputError
-        When the estimator fails there.
+        If the estimator fails on them.
     """
 
     kernel = staticmethod(gravity.gravity_of_groups)
@@ -63,7 +63,7 @@ class PythonPlan(EstimatorPlan):
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         zero = sensor.zero.copy()
-        zero.flags.writeable = False  # else an estimator that writes into it moves all later slopes
+        zero.flags.writeable = False  # an estimator that writes into it would shift all later slopes
         super().__init__(estimator, replace(sensor, zero=zero))
         if type(estimator).locate is Estimator.locate:
             raise InputError(
@@ -86,18 +86,18 @@ class PythonPlan(EstimatorPlan):
         keep_all(table)
 
     def found(self, images: NDArray[np.float32], prior: NDArray[np.float64]) -> Positions:
-        """Return what the estimator finds in one frame, with the flux filled in.
+        """Return the positions that the estimator finds in one frame, with the flux filled in.
 
         Parameters
         ----------
         images : (n, ny, nx) float32
         prior : (n, 2) float64
-            Predicted positions, px from the windows' middles.
+            Predicted positions, px from the window centres.
 
         Raises
         ------
         InputError
-            Whatever `locate` raises, and when it returns another shape: one line that names the estimator.
+            If `locate` raises or returns another shape: one line that names the estimator.
         """
         n, kind = self.sensor.n, type(self.estimator)
         flux = images.sum(axis=(1, 2))  # before `locate`, which may write into the images
@@ -125,9 +125,9 @@ class PythonPlan(EstimatorPlan):
         frame: int,
         slopes: SlopeArrays,
     ) -> None:
-        """Write the slopes of one frame; flags hold what the calibration has found.
+        """Write the slopes of one frame; `flags` hold those of the calibration.
 
-        A frame in which the estimator fails is counted, and all its slopes are invalid.
+        If the estimator fails, the failure is counted and all slopes of the frame are invalid.
 
         Parameters
         ----------
@@ -135,9 +135,9 @@ class PythonPlan(EstimatorPlan):
         prior : (2, n) float32
             Predicted slopes, px from the reference.
         table : (rows, n) float32
-            Of settings.
+            Settings table.
         frame : int
-            Number of the frame in `slopes`.
+            Index of the frame in `slopes`.
         slopes : SlopeArrays
         """
         try:
@@ -149,13 +149,13 @@ class PythonPlan(EstimatorPlan):
     def write(
         self, found: Positions | None, table: NDArray[np.float32], frame: int, slopes: SlopeArrays
     ) -> None:
-        """Write what `found` has returned into the slopes of a frame; None: nothing was found."""
+        """Write the result of `found` into the slopes of a frame; None if nothing was found."""
         if found is None:
             nowhere = np.full(self.sensor.n, np.nan)
             found = Positions(nowhere, nowhere, nowhere)
         assert found.flux is not None
         ny, nx = self.sensor.window
-        usable = (np.abs(found.x) <= 0.5 * nx) & (np.abs(found.y) <= 0.5 * ny)  # also: finite
+        usable = (np.abs(found.x) <= 0.5 * nx) & (np.abs(found.y) <= 0.5 * ny)  # false for NaN, too
         usable &= np.abs(found.flux) <= LARGEST_FLOAT32
         usable &= True if found.valid is None else found.valid != 0
         flags = slopes.flags[frame]

@@ -1,4 +1,4 @@
-"""Which estimators there are, by name: the built-in ones, those of installed packages, and one's own."""
+"""Registry of estimators by name: built-in, installed and user-defined."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _BUILT_IN = (
     "maximum_a_posteriori",
     "trained",
 )
-"""Modules of this package, in the order in which estimators are shown."""
+"""Modules of this package, in the order in which estimators are listed."""
 
 Kind = TypeVar("Kind", bound="type[Estimator]")
 _kinds: dict[str, type[Estimator]] = {}
 
 
 def register(kind: Kind) -> Kind:
-    """Make an estimator known by its name; a decorator of its class.
+    """Register an estimator by its name; use as a class decorator.
 
     Raises
     ------
     InputError
-        When another one has that name.
+        If another estimator has that name.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def register(kind: Kind) -> Kind:
 
 
 def estimators() -> dict[str, type[Estimator]]:
-    """Return every estimator's class by name: built-in ones first, in the order in which they are shown.
+    """Return the classes of all estimators by name, built-in ones first.
 
     Examples
     --------
@@ -80,23 +80,23 @@ def estimators() -> dict[str, type[Estimator]]:
     """
     _load()
     places = {f"{__package__}.{module}": place for place, module in enumerate(_BUILT_IN)}
-    # Not in the order in which modules happened to be imported.
+    # Independent of the order in which modules happened to be imported.
     return dict(sorted(_kinds.items(), key=lambda item: places.get(item[1].__module__, len(places))))
 
 
 def restore(kinds: Mapping[str, type[Estimator]]) -> None:
-    """Make the estimators known that `estimators` has returned before, and no others."""
+    """Restore the registry to a mapping that `estimators` returned before."""
     global _kinds
     _kinds = dict(kinds)
 
 
 def estimator_named(name: str) -> type[Estimator]:
-    """Return the class of an estimator.
+    """Return the class of the estimator with the given name.
 
     Raises
     ------
     InputError
-        For an unknown name.
+        If the name is unknown.
 
     Examples
     --------
@@ -112,11 +112,11 @@ def estimator_named(name: str) -> type[Estimator]:
 
 @cache
 def _load() -> None:
-    """Import the built-in estimators, and those of installed packages."""
+    """Import the built-in estimators and those of installed packages."""
     modules = [f"faintspot.estimators.{module}" for module in _BUILT_IN]
     for module in modules:
         import_module(module)
-    # Whoever imported one of them first has changed their order.
+    # User code that imported one of them directly has changed the order.
     places = {module: place for place, module in enumerate(modules)}
     kinds = sorted(_kinds.values(), key=lambda kind: places.get(kind.__module__, len(places)))
     _kinds.clear()
@@ -124,6 +124,6 @@ def _load() -> None:
     for point in entry_points(group=ENTRY_POINTS):
         package = point.dist.name if point.dist else "?"
         title = f"estimator {point.name!r} of the package {package} (mend or uninstall it)"
-        # An import that ends the process would end it without a word.
+        # A plugin that exits on import would end the process without a message.
         with faults_of(title), mock.patch("os._exit", sys.exit):
             point.load()

@@ -1,4 +1,4 @@
-"""What is known of spots and camera when an estimator's options are chosen."""
+"""Knowledge of spots and camera from which an estimator's options are chosen."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 PIXEL_BLUR_PX2 = 0.46
-"""Increase of a Gaussian spot's squared FWHM by the integration over a pixel, px^2."""
+"""Increase of a Gaussian spot's squared FWHM due to integration over a pixel [px^2]."""
 
 
 @dataclass(frozen=True)
@@ -17,28 +17,28 @@ class Scene:
     Parameters
     ----------
     flux_e : float
-        Photo-electrons of a spot in a frame.
+        Flux of a spot in a frame [photo-electrons].
     read_noise_e : float
-        Photo-electrons.
+        Read noise [photo-electrons].
     window : (int, int)
-        ny, nx of a sub-aperture, px.
+        Size of a sub-aperture window, ny and nx [px].
     spot_fwhm_px : float
-        Full width at half maximum of the optical spot, without the pixels' blur.
+        Full width at half maximum of the optical spot, without the blur of the pixels [px].
     position_range_px : float
-        Spots are within plus and minus this of the reference on each axis.
+        Largest distance of the spots from the reference position on each axis [px].
     elongation : float
-        Width along the long axis over that along the short one.
+        Ratio of the widths along the long and the short axis.
     excess_noise : float
-        Factor on the photon noise's variance: 2 for an EMCCD at high gain.
+        Factor on the variance of the photon noise: 2 for an EMCCD at high gain.
     background_e : float
-        Mean photo-electrons per pixel whose mean is taken off and whose noise stays.
+        Background per pixel [photo-electrons], whose mean is subtracted and whose noise remains.
     d_over_r0 : float
-        Side of a sub-aperture in Fried parameters at the sensor's wavelength where that speckles the spots; 0
-        where it does not.
+        Side of a sub-aperture in Fried parameters at the sensor's wavelength, if the spots are speckled;
+        otherwise 0.
     diffraction_px : float, optional
-        lambda / d on the detector, px. Default: that of a spot of this width.
+        lambda / d on the detector [px]. Default: that of a spot of this width.
     profile : str
-        "diffraction" or "gaussian".
+        Spot profile, "diffraction" or "gaussian".
     learnt : bool
         Whether the PSF was learnt from frames.
 
@@ -75,7 +75,7 @@ class Scene:
 
     @property
     def seen_fwhm_px(self) -> float:
-        """Width of the spots with the pixels' blur."""
+        """Width of the spots including the blur of the pixels."""
         return math.sqrt(self.spot_fwhm_px**2 + PIXEL_BLUR_PX2)
 
     @property

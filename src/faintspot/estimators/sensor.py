@@ -1,4 +1,4 @@
-"""What an estimator is prepared for: the sensor, its camera, and what is known of its spots."""
+"""Sensor for which an estimator is prepared: geometry, camera and knowledge of the spots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A sensor as an estimator sees it.
+    """Layout, camera and spots of a sensor, as seen by an estimator.
 
     Parameters
     ----------
@@ -26,15 +26,15 @@ class Sensor:
     calibration : Calibration
     psf, score : PSF, Score, or None
     zero : (n, 2) array
-        Reference positions, px from the windows' middles.
+        Reference positions, px from the window centres.
     search_range_px : (n,) array
-        How far from it a position may be; infinite where anywhere.
+        Largest distance of a position from the reference; infinite if there is no limit.
     flux_e : (n,) array
-        Expected flux, electrons; NaN where it is not known.
+        Expected flux [electrons]; NaN where unknown.
     given_fwhm_px : (n, 2) array
-        Full width at half maximum of the spots along x and y; NaN where it is not given.
+        Full width at half maximum of the spots along x and y; NaN where not given.
     width : int
-        SIMD lanes.
+        Number of SIMD lanes.
     """
 
     layout: Layout
@@ -64,19 +64,19 @@ class Sensor:
 
     @property
     def excess_noise(self) -> float:
-        """Factor on the photon noise's variance."""
+        """Factor on the variance of the photon noise."""
         return self.calibration.excess_noise
 
     @property
     def variance(self) -> float:
-        """Of a dark pixel, photo-electrons squared; 0 where the read noise is not known."""
+        """Variance of a dark pixel [photo-electrons^2]; 0 if the read noise is unknown."""
         noise = self.calibration.read_noise_photoelectrons
         background = self.calibration.excess_noise * self.calibration.background_e
         return 0.0 if noise is None else noise**2 + background
 
     @cached_property
     def spot_fwhm_px(self) -> Floats:
-        """Full width at half maximum of every spot along x and y, (n, 2); NaN where unknown."""
+        """Full width at half maximum of each spot along x and y, (n, 2); NaN where unknown."""
         given = self.given_fwhm_px
         if self.psf is None:
             return given

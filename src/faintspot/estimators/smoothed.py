@@ -22,7 +22,7 @@ from faintspot.estimators.spot_tables import gaussian_taps
 from faintspot.kernels import gravity
 
 _USUAL_PX = 0.7
-_WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # times the automatic width
+_WIDTHS = (1.0, 0.6, 0.8, 1.3, 1.7)  # multiples of the automatic width
 
 
 @register
@@ -32,7 +32,7 @@ class Smoothed(KeepingBrightest):
 
     smoothing_px: Any = option(
         None,
-        "Standard deviation of the Gaussian. Default 0.7.",
+        "Standard deviation of the Gaussian. Default: 0.7.",
         unit="px",
         low=0.0,
         high=16.0,
@@ -66,12 +66,12 @@ class Smoothed(KeepingBrightest):
         return f"Gaussian smoothing of {width} px; {self.kept_in_words(n_subapertures, pixels)}"
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Widths around the automatic one, too."""
+        """Return numbers of kept pixels and widths around the automatic ones."""
         width = float(automatic_smoothing(**scene.rule_arguments)) or _USUAL_PX
         return {**super().tuned(scene), "smoothing_px": [width * factor for factor in _WIDTHS]}
 
     def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `KeepingBrightest`; images are continued by zeros."""
+        """Return the smoothed images; they are padded with zeros."""
         from scipy.ndimage import gaussian_filter
 
         width = float(self.values("smoothing_px", 1, images[0].size)[0])
@@ -84,7 +84,7 @@ class Smoothed(KeepingBrightest):
 
 
 class _Plan(GravityPlan):
-    """Taps of the smoothing."""
+    """Tables of a smoothing followed by a centre of gravity."""
 
     @cached_property
     def first_step(self) -> gravity.GravityTables:

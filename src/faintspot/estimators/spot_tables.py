@@ -1,4 +1,4 @@
-"""What the estimators that know the spot need, in the kernels' own form, computed before the first frame."""
+"""Tables of the estimators that know the spot, in the form that kernels read."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ FWHM_TO_STD = 1.0 / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 START_SMOOTHING = (
     0.73  # standard deviation of the smoothing in units of the spot's FWHM: about a matched filter
 )
-_REACH = 2.5  # standard deviations at which a Gaussian is cut off
-_START_OFFSETS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # of the spot from the pixel that it is the brightest of, px
-_LEAST_START_FLUX = 1e-5  # of a spot's flux, where hardly any pixel exceeds the image's mean
-_OUTLIER_FRACTION = 0.01  # from which on a slope is flagged
+_REACH = 2.5  # standard deviations at which a Gaussian is truncated
+_START_OFFSETS = (-1.0 / 3.0, 0.0, 1.0 / 3.0)  # of the spot from the centre of its brightest pixel, px
+_LEAST_START_FLUX = 1e-5  # fraction of a spot's flux, where hardly any pixel exceeds the image's mean
+_OUTLIER_FRACTION = 0.01  # above which a slope is flagged
 _NEAR_OUTLIERS = 0.9
-_GRID_OF_FWHM = 0.25  # spacing of the posterior's grid; at most ...
+_GRID_OF_FWHM = 0.25  # spacing of the posterior's grid, at most
 _COARSEST_OF_FWHM = 0.4
-_GRID_POSITIONS = 13  # ... and otherwise about so many positions along an axis
-_BLOCK_NUMBERS = 1 << 22  # worked on at a time: bounds the memory beside the tables
+_GRID_POSITIONS = 13  # approximate number of positions along an axis, otherwise
+_BLOCK_NUMBERS = 1 << 22  # processed at a time, to limit the memory
 
 
 @dataclass(frozen=True)
 class SpotModel:
-    """Profiles of the spots, or of the weights that follow them, as the kernels read them."""
+    """Profiles of the spots, or of weights centred on them, as the kernels read them."""
 
     tables: NDArray[np.float32]
     """(n_models, 2, rank, 2, PHASES, length), see `faintspot.kernels.profiles.look_up`."""
     index: NDArray[np.int64]
     """Model of each sub-aperture."""
     fwhm_px: Floats
-    """Of the spots, (n_models, 2)."""
+    """Full width at half maximum of the spots, (n_models, 2)."""
     taps: NDArray[np.float32]
-    """Of the smoothing that finds the start, (n_models, 2, 1 + reach)."""
+    """Taps of the smoothing that finds the start, (n_models, 2, 1 + reach)."""
     start_flux: Floats
-    """What the brightest pixel of a spot that is smoothed in its window has of its flux, (n_models,)."""
+    """Fraction of its flux in the brightest pixel of a smoothed spot, (n_models,)."""
     gain: Floats
     """Factor on the steps of the weighted centre of gravity, (n_models, 2)."""
 
@@ -56,7 +56,7 @@ class SpotModel:
 
 
 def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int, background: bool) -> SpotModel:
-    """Prepare the PSFs of n sub-apertures; `background`: images begin with their mean taken off."""
+    """Prepare the PSFs of n sub-apertures; `background`: the mean of each image has been subtracted."""
     along, across = psf.separable_terms
     tables = [_profile_tables(terms, psf.oversampling, window, width) for terms in (along, across)]
     taps = gaussian_taps(START_SMOOTHING * psf.fwhm_px, window)
@@ -68,9 +68,9 @@ def model_of_psf(psf: PSF, n: int, window: tuple[int, int], width: int, backgrou
 def model_of_weights(
     weight_fwhm_px: Floats, spot_fwhm_px: Floats, psf: PSF | None, window: tuple[int, int], width: int
 ) -> SpotModel:
-    """Prepare the Gaussian weights of every sub-aperture, widths (n, 2) along x and y.
+    """Prepare the Gaussian weights of each sub-aperture, with widths (n, 2) along x and y.
 
-    The spots are Gaussian unless the PSF is known.
+    The spots are taken to be Gaussian unless the PSF is known.
     """
     n = len(weight_fwhm_px)
     planes = np.zeros(n, np.int64) if psf is None else psf.index_of(n)
@@ -91,7 +91,7 @@ def model_of_weights(
 
 
 def gaussian_psf(fwhm_px: Floats) -> PSF:
-    """Return Gaussian spots of widths (n, 2) along x and y."""
+    """Return Gaussian spots with widths (n, 2) along x and y."""
     longer, shorter = fwhm_px.max(axis=1), fwhm_px.min(axis=1)
     return PSF.analytic(
         "gaussian",
@@ -104,7 +104,7 @@ def gaussian_psf(fwhm_px: Floats) -> PSF:
 
 
 def gaussian_taps(std_px: Floats, window: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the taps (..., 1 + reach) of Gaussians, the central one first, each with sum 1."""
+    """Return the taps (..., 1 + reach) of Gaussians of sum 1, the central tap first."""
     reach = max(1, min(math.ceil(_REACH * float(np.max(std_px))), max(window) - 1))
     exponent = -0.5 * (np.arange(reach + 1) / np.asarray(std_px)[..., None]) ** 2
     taps = np.exp(exponent)
@@ -113,7 +113,7 @@ def gaussian_taps(std_px: Floats, window: tuple[int, int]) -> NDArray[np.float32
 
 
 def _places(window: tuple[int, int], width: int) -> tuple[int, Floats]:
-    """Return the length of a profile's table, and the offsets (PHASES, length) of its elements, px."""
+    """Return the length of a profile's table, and the offsets (PHASES, length) of its elements [px]."""
     margin = max(window) + MARGIN
     length = 2 * margin + 2 * width
     return length, np.arange(length) - margin + np.arange(PHASES)[:, None] / PHASES
@@ -122,8 +122,8 @@ def _places(window: tuple[int, int], width: int) -> tuple[int, Floats]:
 def _profile_tables(
     terms: Floats, oversampling: int, window: tuple[int, int], width: int
 ) -> NDArray[np.float32]:
-    """Profiles (n, rank, nodes) and their derivatives in the position, (n, rank, 2, PHASES, length)."""
-    from scipy.interpolate import CubicSpline  # here: importing it takes longer than the first slopes
+    """Tabulate profiles (n, rank, nodes) and their derivatives: (n, rank, 2, PHASES, length)."""
+    from scipy.interpolate import CubicSpline  # imported here: it takes longer than the first slopes
 
     _, offsets = _places(window, width)
     half = (terms.shape[2] - 1) / 2 / oversampling
@@ -131,13 +131,13 @@ def _profile_tables(
     spline = CubicSpline(nodes, terms, axis=2)
     inside = np.abs(offsets) <= half
     place = np.where(inside, offsets, 0.0)
-    # An offset is pixel - position: the derivative in the position has the other sign.
+    # An offset is pixel - position, so that the derivative with respect to the position changes sign.
     values = np.stack([spline(place), -spline(place, 1)], axis=2)
     return np.ascontiguousarray(np.where(inside, values, 0.0), np.float32)
 
 
 def _gaussian_tables(std_px: Floats, window: tuple[int, int], width: int) -> NDArray[np.float32]:
-    """Weights, 1 at the centre, as `_profile_tables`."""
+    """Tabulate weights with maximum 1, as `_profile_tables`."""
     _, offsets = _places(window, width)
     z = offsets / std_px[:, None, None]
     weight = np.exp(-0.5 * z**2)
@@ -153,7 +153,7 @@ def _start_flux(
     *,
     background: bool = False,
 ) -> Floats:
-    """Mean over sub-pixel positions of the brightest pixel of a smoothed spot in the window's middle."""
+    """Return the mean brightest pixel of a smoothed spot over sub-pixel positions at the window centre."""
     offsets = np.array([(x, y) for x in _START_OFFSETS for y in _START_OFFSETS])
     ny, nx = window
     offsets += 0.5 * np.array([1 - nx % 2, 1 - ny % 2])  # from the pixel n // 2
@@ -167,13 +167,13 @@ def _start_flux(
 
 
 def _taps_around(middle: int, taps: Floats, n: int) -> Floats:
-    """Return the taps that n pixels have in the smoothed value of the pixel `middle`."""
+    """Return the taps by which n pixels contribute to the smoothed value of the pixel `middle`."""
     away = np.abs(np.arange(n) - middle)
     return np.where(away < len(taps), taps[np.minimum(away, len(taps) - 1)], 0.0)
 
 
 def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:
-    """Inverse of what the weighted centre of gravity sees of a small displacement, along x and y."""
+    """Return the inverse response of the weighted centre of gravity to a small displacement in x and y."""
     side = 2 * math.ceil(4.0 * float(std_px.max())) + 5
     u = np.arange(side) - (side - 1) / 2
     step, seen = 0.05, np.zeros(2)
@@ -193,15 +193,15 @@ def _weighted_gain(psf: PSF, plane: int, std_px: Floats) -> Floats:
 def least_flux(
     psf: PSF, plane: int, variance: float, excess: float, search_range_px: float, side: int
 ) -> float:
-    """Return the flux (electrons) below which about 1 % of a spot's positions are those of noise.
+    """Return the flux [electrons] below which noise causes about 1 % of a spot's positions.
 
-    A spot is confused with one of the n places in the search range where the noise may make another when the
-    difference of two log-likelihood ratios, of variance twice its mean, goes the wrong way: t such that
-    n Q(t / sqrt(2)) = 0.01 standard deviations of significance, where t^2 / 2 is the expected log-likelihood
-    ratio of the spot against no spot. To that 0.9 is added, found by simulation: errors beyond 1 px come from
-    neighbouring places as well.
+    A spot is confused with one of the n places in the search range where noise can imitate one when the
+    difference of two log-likelihood ratios, of variance twice its mean, has the wrong sign. The condition is
+    n Q(t / sqrt(2)) = 0.01, where t is the significance in standard deviations and t^2 / 2 is the expected
+    log-likelihood ratio of the spot against no spot. Add 0.9 to t, found by simulation, because errors beyond
+    1 px also come from neighbouring places.
     """
-    from scipy.optimize import brentq  # here: importing them takes longer than the first slopes
+    from scipy.optimize import brentq  # imported here: it takes longer than the first slopes
     from scipy.special import ndtri
 
     reach = min(search_range_px, 0.5 * side)
@@ -210,7 +210,7 @@ def least_flux(
     offsets = np.array([(x, y) for x in _START_OFFSETS for y in _START_OFFSETS])
     image = np.maximum(psf.images(offsets, (side, side), which=plane), 0.0).mean(axis=0)
     if not image.any():
-        return 0.0  # there is no spot to tell from noise
+        return 0.0  # without noise
     v = max(variance, SMALLEST_VARIANCE)
 
     def missing(log_flux: float) -> float:
@@ -235,7 +235,7 @@ class PosteriorGrid:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """What the kernel takes."""
+        """Arguments of the kernel."""
         return self.tables, self.constants, self.grid, self.spacing
 
 
@@ -245,7 +245,7 @@ NO_POSTERIOR = PosteriorGrid(
 
 
 def joined(parts: list[PosteriorGrid]) -> PosteriorGrid:
-    """Return the tables of several levels of flux, on one grid, one after the other."""
+    """Concatenate the tables of several levels of flux on the same grid."""
     return PosteriorGrid(
         np.concatenate([part.tables for part in parts]),
         np.concatenate([part.constants for part in parts]),
@@ -257,7 +257,7 @@ def joined(parts: list[PosteriorGrid]) -> PosteriorGrid:
 def posterior_grid(
     reach_px: float, fwhm_px: float, window: tuple[int, int]
 ) -> tuple[NDArray[np.float32], float]:
-    """Return positions (n, 2) that cover +-reach_px around the window's centre, and their spacing."""
+    """Return positions (n, 2) that cover +-reach_px around the window centre, and their spacing."""
     spacing = min(max(_GRID_OF_FWHM * fwhm_px, 2.0 * reach_px / _GRID_POSITIONS), _COARSEST_OF_FWHM * fwhm_px)
     axes = []
     for n in (window[1], window[0]):
@@ -268,7 +268,7 @@ def posterior_grid(
 
 
 def posterior_shape(positions: int, window: tuple[int, int], width: int) -> tuple[int, int, int]:
-    """Return the shape of one table of the posterior: positions, rows, columns filled up to whole vectors."""
+    """Return the shape of one table of the posterior: positions, rows, columns padded to whole vectors."""
     return positions, window[0], -(-window[1] // width) * width
 
 
@@ -283,7 +283,7 @@ def posterior_tables(
     window: tuple[int, int],
     width: int,
 ) -> PosteriorGrid:
-    """Prepare the grid's tables for each triple of a PSF, a flux and a dark pixel's variance."""
+    """Compute the tables of the grid for each triple of a PSF, a flux and a variance of a dark pixel."""
     nx = window[1]
     tables = np.zeros((len(flux_e), *posterior_shape(len(grid), window, width)), np.float32)
     constants = np.empty((len(flux_e), len(grid)), np.float32)
@@ -307,7 +307,7 @@ def score_tables(
 ) -> tuple[NDArray[np.float32], int, int]:
     """Return the tables of `faintspot.kernels.trained.apply_score`, steps per pixel and margin.
 
-    Kind and flux class are one axis, the class counting faster.
+    Kind and flux class share one axis, on which the flux class varies fastest.
     """
     steps = score.steps_per_px
     margin = max(window) + MARGIN

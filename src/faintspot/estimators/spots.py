@@ -1,4 +1,4 @@
-"""What the estimators that know the spot share: its profiles, and the rows of their settings."""
+"""Spot profiles and settings rows shared by the estimators that know the spot."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from faintspot.kernels.groups import RANGE
 
 Floats = NDArray[np.float64]
 
-_LARGEST_MOVE = 0.25  # of a step, in units of the FWHM; 1 px for narrow spots
+_LARGEST_MOVE = 0.25  # in a step, in units of the FWHM; 1 px for narrow spots
 
 BLURS = (0.4, 0.0, 0.8, 1.2)
-"""Of a speckled spot's PSF, in units of lambda / d."""
+"""Blurs of the PSF of a speckled spot, in units of lambda / d."""
 
 
 class SpotPlan(EstimatorPlan):
-    """Settings and tables of an estimator that reads profiles of spots, or of weights that follow them."""
+    """Settings and tables of an estimator that uses profiles of spots, or of weights centred on them."""
 
     setting_rows = spot_fits.SETTING_ROWS
 
@@ -32,17 +32,17 @@ class SpotPlan(EstimatorPlan):
 
     @cached_property
     def model(self) -> SpotModel:
-        """Profiles of the spots, or of weights."""
+        """Profiles of the spots or of the weights."""
         raise NotImplementedError
 
     @cached_property
     def taps(self) -> NDArray[np.float32]:
-        """Taps of every sub-aperture's smoothing, (n, 2, 1 + reach)."""
+        """Taps of the smoothing in each sub-aperture, (n, 2, 1 + reach)."""
         return np.ascontiguousarray(self.model.taps[self.model.index])
 
     @property
     def step_count(self) -> int:
-        """Steps of the fit."""
+        """Number of steps of the fit."""
         return self.estimator.step_count
 
     @property
@@ -52,13 +52,13 @@ class SpotPlan(EstimatorPlan):
 
     @cached_property
     def fits_background(self) -> bool:
-        """Whether a constant is fitted along with the spot."""
+        """Whether a constant background is fitted along with the spot."""
         choice = getattr(self.estimator, "local_background", "off")
         return choice == "on" or (choice == "auto" and not self.sensor.calibration.vouches_for_dark)
 
     @property
     def model_tables(self) -> spot_fits.ModelTables:
-        """What the kernels read that follow a profile."""
+        """Tables of the kernels that use a profile."""
         return spot_fits.ModelTables(
             self.step_count, self.rounds_electrons, self.fits_background, self.taps, self.model.tables
         )
@@ -88,7 +88,7 @@ class SpotPlan(EstimatorPlan):
         table[spot_fits.FLUX] = np.nan_to_num(flux_e)
 
     def _least_flux(self, search_range_px: NDArray[np.float32]) -> Floats:
-        """Flux of every sub-aperture below which outliers are to be expected."""
+        """Return the flux of each sub-aperture below which outliers are expected."""
         sensor = self.sensor
         if sensor.psf is None:
             widths, index = np.unique(sensor.spot_fwhm_px, axis=0, return_inverse=True)
@@ -107,13 +107,13 @@ class SpotPlan(EstimatorPlan):
 
     @cached_property
     def psf(self) -> Any:
-        """The sensor's PSF, blurred where the estimator asks for that."""
+        """PSF of the sensor, blurred if the estimator requires it."""
         psf, blur = self.sensor.psf, float(getattr(self.estimator, "blur_px", 0.0))
         return psf.blurred(blur) if psf is not None and blur > 0 else psf
 
 
 class PSFPlan(SpotPlan):
-    """The same for a fit of the PSF itself."""
+    """Settings and tables of a fit of the PSF itself."""
 
     kernel = staticmethod(spot_fits.fitted_of_groups)
 

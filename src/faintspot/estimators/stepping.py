@@ -1,4 +1,4 @@
-"""What the estimators share that make a number of steps."""
+"""Base class of the estimators that make a fixed number of steps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STEPS_IN_BRIGHT_FLUX = 12
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stepping(Estimator):
-    """An estimator that makes the same number of steps for every image, so that the time is known."""
+    """Estimator that makes the same number of steps for every image, so that its run time is constant."""
 
     steps: Any = option(None, "Number of steps.", low=1, high=100, whole=True, per_subaperture=False)
 
@@ -23,11 +23,11 @@ class Stepping(Estimator):
 
     @property
     def step_count(self) -> int:
-        """Number of steps, also where none is given."""
+        """Number of steps, given or default."""
         return int(self.steps or self.usual_steps[getattr(self, "preset", "accurate")])
 
     def for_bright_flux(self) -> Self:
-        """Make more steps: without noise, what is left of where they began is a bias."""
+        """Make more steps: without noise, the remaining influence of the starting point is a bias."""
         return self.replaced({"steps": max(self.step_count, _STEPS_IN_BRIGHT_FLUX)})
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:

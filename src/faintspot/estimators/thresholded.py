@@ -1,4 +1,4 @@
-"""Centre of gravity of what is above a threshold."""
+"""Centre of gravity of the flux above a threshold."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from faintspot.kernels import gravity
 from faintspot.kernels.host import WIDTHS, lanes_for
 from faintspot.kernels.thresholded import RowTables, thresholded_in_rows
 
-_OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # times that of a dark pixel
-_OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # where a spot is bright
+_OF_NOISE = (3.0, 1.5, 2.0, 2.5, 4.0, 5.0)  # multiples of the noise of a dark pixel
+_OF_PEAK = (0.05, 0.1, 0.2, 0.3)  # for bright spots
 _SMALLEST_E = 0.01
 
 
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Thresholded(Centroid):
-    """Centre of gravity of every pixel less a threshold; what is negative then counts as 0."""
+    """Centre of gravity after subtracting a threshold from every pixel; negative pixels are set to 0."""
 
-    threshold_e: Any = option(None, "What is taken off every pixel.", unit="e-", low=0.0, high=1e12)
+    threshold_e: Any = option(None, "Level subtracted from every pixel.", unit="e-", low=0.0, high=1e12)
 
     name = "thresholded"
     label = "thresholded centre of gravity"
-    method = "centre of gravity of what is above a threshold"
+    method = "centre of gravity of the flux above a threshold"
     cost = 0.15
     style = Style("#9a9a9a", ":", "X")
 
     def in_words(self, n_subapertures: int, pixels: int) -> str:
         """See `Estimator`."""
-        return f"centre of gravity of what is above {self._span('threshold_e', n_subapertures, pixels)} e-"
+        return f"centre of gravity of the flux above {self._span('threshold_e', n_subapertures, pixels)} e-"
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Multiples of a dark pixel's noise, and fractions of a typical spot's peak."""
+        """Return multiples of the noise of a dark pixel, and fractions of a typical spot's peak."""
         peak = scene.flux_e / (2.5 * scene.seen_fwhm_px**2)
         levels = [factor * scene.dark_noise_e for factor in _OF_NOISE] + [
             factor * peak for factor in _OF_PEAK
@@ -52,7 +52,7 @@ class Thresholded(Centroid):
         return {"threshold_e": list(dict.fromkeys(max(float(f"{e:.3g}"), _SMALLEST_E) for e in levels))}
 
     def for_bright_flux(self) -> Thresholded:
-        """Take nothing off: a level for faint flux is none for bright."""
+        """Subtract nothing: a threshold for low flux does not suit high flux."""
         return self.replaced({"threshold_e": 0.0})
 
     def check(self, sensor: Sensor) -> None:
@@ -68,12 +68,12 @@ class Thresholded(Centroid):
 
 
 class _Plan(GravityPlan):
-    """Thresholds, and what the kernel takes that measures pixels in rows, where that is possible."""
+    """Thresholds, and the tables of the kernel that reads pixels in rows, if it can be used."""
 
     def __init__(self, estimator: Thresholded, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
         columns = sensor.window[1]
-        # The machine's width, whatever the sub-apertures': the order of a sum depends on it.
+        # Width of the machine, not of the pipeline: the order of a sum depends on it.
         widest = lanes_for(np.float32).width
         self._widths = [width for width in WIDTHS if columns % width == 0 and width <= widest]
         if self._widths:

@@ -1,4 +1,4 @@
-"""Total-variation denoising, brightest pixels, centre of gravity: the paper's method."""
+"""Total-variation denoising, brightest pixels, centre of gravity: the method of the paper."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from faintspot.estimators.sensor import Sensor
 from faintspot.kernels import gravity
 from faintspot.kernels.flat_start import flat_start_table
 
-_STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # times the automatic strength
+_STRENGTHS = (1.0, 0.4, 0.6, 0.8, 1.25)  # multiples of the automatic strength
 _LEAST_STRENGTH_E = 1e-3
 
 
@@ -36,9 +36,9 @@ class TotalVariation(KeepingBrightest):
 
     noise_std: Any = option(
         None,
-        'Strength of the denoising: the standard deviation of the noise to remove from a pixel. "auto": from '
-        "read noise, flux and spot, by `faintspot.algorithms.automatic.automatic_strength`. 0: not denoised. "
-        "Lowered where it is too strong for an image: above 0.9 of the image's own rms it becomes 0.6 of it.",
+        'Denoising strength: standard deviation of the noise to remove from a pixel. "auto": chosen from '
+        "read noise, flux and spot by `faintspot.algorithms.automatic.automatic_strength`. 0: no "
+        "denoising. A strength above 0.9 of an image's own rms is lowered to 0.6 of it.",
         unit="e-",
         low=0.0,
         automatic=True,
@@ -46,20 +46,20 @@ class TotalVariation(KeepingBrightest):
     tolerance: Any = option(
         None,
         "Relative change at which the denoising of a sub-aperture stops; see `faintspot.tv_denoise`. "
-        'Default: that of the preset, 0.02 or, with "fast", 0: only the limit stops it.',
+        'Default: that of the preset, 0.02; with "fast" 0 (only the iteration limit applies).',
         low=0.0,
         high=1.0,
     )
     max_iterations: Any = option(
-        None, "Its iteration limit. Default: that of the preset, 200 or 8.", low=1, high=2**24, whole=True
+        None, "Iteration limit. Default: that of the preset, 200 or 8.", low=1, high=2**24, whole=True
     )
     algorithm: str = option(
-        "fgp", "How the denoising iterates.", choices=tuple(ALGORITHMS), per_subaperture=False
+        "fgp", "Algorithm of the denoising.", choices=tuple(ALGORITHMS), per_subaperture=False
     )
     preset: str = option(
         "accurate",
-        '"fast" does little work, and the same for every image: 8 iterations of the denoising. docs/fast.md '
-        "says what it costs.",
+        '"fast": 8 denoising iterations for every image, so that the run time is constant. Its accuracy is '
+        "given in docs/fast.md.",
         choices=PRESETS,
         per_subaperture=False,
     )
@@ -96,7 +96,7 @@ class TotalVariation(KeepingBrightest):
         return BrightestPixels.like(self)
 
     def for_bright_flux(self) -> Estimator:
-        """Do not denoise: an image without noise has nothing to take off."""
+        """Do not denoise: a noise-free image has nothing to remove."""
         return self.without_denoising().for_bright_flux()
 
     def default_of(self, name: str, pixels: int) -> Any:
@@ -121,11 +121,11 @@ class TotalVariation(KeepingBrightest):
         )
 
     def for_scene(self, scene: Scene) -> Self:
-        """Do little work."""
+        """Use the preset "fast"."""
         return self.replaced({"preset": "fast"})
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Strengths around the automatic one, too."""
+        """Return numbers of kept pixels and strengths around the automatic ones."""
         ordinary = float(
             suggested_strength(scene.dark_noise_e, scene.excess_noise * scene.flux_e, scene.pixels)
         )
@@ -135,7 +135,7 @@ class TotalVariation(KeepingBrightest):
     def denoised(self, images: NDArray[np.float32]) -> NDArray[np.float32] | None:
         """See `KeepingBrightest`."""
         if is_auto(self.noise_std):
-            return None  # it follows from the flux
+            return None  # the strength depends on the flux
         limits = {name: getattr(self, name) for name in ("tolerance", "max_iterations")}
         result: NDArray[np.float32] = tv_denoise(
             images,
@@ -153,7 +153,7 @@ class TotalVariation(KeepingBrightest):
 
 
 class _Plan(GravityPlan):
-    """Strengths, and what the denoising starts with."""
+    """Strengths, and the starting point of the denoising."""
 
     estimator: TotalVariation
 

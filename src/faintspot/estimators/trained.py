@@ -1,4 +1,4 @@
-"""A linear score learnt for the sensor, applied in a few passes."""
+"""Trained linear score, applied in a few passes."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _LEAST_SMOOTHING_PX = 0.1
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trained(Estimator):
-    """The trained linear score; `faintspot.train_estimator` and `train_from_frames` make one."""
+    """Trained linear score, made by `faintspot.train_estimator` or `train_from_frames`."""
 
     name = "trained"
     label = "trained score"
-    method = "a linear score learnt for the sensor, applied in a few passes"
+    method = "trained linear score of the sensor, applied in a few passes"
     needs = frozenset({Need.SCORE})
     cost = 0.15
     style = Style("#6b3fa0", "-", "h")

@@ -1,4 +1,4 @@
-"""Centre of gravity under a Gaussian weight that follows the spot."""
+"""Centre of gravity with a Gaussian weight centred on the spot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from faintspot.estimators.spots import SpotPlan
 from faintspot.estimators.stepping import Stepping
 from faintspot.kernels import spot_fits
 
-_WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # times the spot's
+_WIDTHS = (1.0, 0.6, 0.8, 1.25, 1.6, 2.2)  # multiples of the spot's width
 
 
 @register
@@ -31,29 +31,29 @@ class Weighted(Stepping):
 
     weight_fwhm_px: Any = option(
         None,
-        "Full width at half maximum of the weight, geometric mean of both axes; it is elongated like the "
-        "spot. Default: that of the spot.",
+        "Full width at half maximum of the weight, geometric mean of both axes; the weight has the "
+        "elongation of the spot. Default: the width of the spot.",
         unit="px",
         low=0.1,
         high=64.0,
     )
     preset: str = option(
         "accurate",
-        'How many steps are made where their number is not given: 8, or with "fast" 3.',
+        'Number of steps if `steps` is not given: 8, or 3 with "fast".',
         choices=PRESETS,
         per_subaperture=False,
     )
 
     name = "weighted"
     label = "weighted centre of gravity"
-    method = "centre of gravity under a Gaussian weight that follows the spot"
+    method = "centre of gravity with a Gaussian weight centred on the spot"
     needs = frozenset({Need.WIDTH})
     cost = 0.23
     style = Style("#009E73", "--", "^")
     usual_steps: ClassVar[Mapping[str, int]] = {"accurate": 8, "fast": 3}
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Widths around the spot's."""
+        """Return widths around that of the spot."""
         return {"weight_fwhm_px": [factor * scene.seen_fwhm_px for factor in _WIDTHS]}
 
     def prepared(self, sensor: Sensor) -> SpotPlan:

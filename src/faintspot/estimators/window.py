@@ -1,4 +1,4 @@
-"""Slopes that are linear in the pixels: a fixed Gaussian window, or any fixed weights."""
+"""Slopes that are linear in the pixels, by a fixed Gaussian window or any fixed weights."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from faintspot.spots.fixed_weights import FixedWeights
 
 Floats = NDArray[np.float64]
 
-_WIDTHS = (1.25, 0.8, 1.0, 1.6, 2.0, 2.8)  # times the spot's
+_WIDTHS = (1.25, 0.8, 1.0, 1.6, 2.0, 2.8)  # multiples of the spot's width
 _WIDTHS_OF_SPECKLES = (2.0, 1.0, 1.25, 1.6, 2.8, 4.0)
-_LEAST_WEIGHT = 1e-4  # of the window's middle: what is less counts nothing, and need not be read
-_STEP_PX = 0.25  # by which the spot is moved to find the gain
+_LEAST_WEIGHT = 1e-4  # relative to the window's centre; pixels with smaller weights are not read
+_STEP_PX = 0.25  # displacement of the spot from which the gain is computed
 _SMALLEST_GAIN = 0.02
-_LEAST_FLUX = 1e-6  # of the brightest spot's
+_LEAST_FLUX = 1e-6  # relative to the brightest spot
 MEAN, FRAME, NONE = "mean", "frame", "none"
 
 
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Window(Estimator):
-    """Centre of gravity under a fixed window over its mean flux and its gain (Nicolle et al. 2004)."""
+    """Centre of gravity with a fixed window, divided by its mean flux and its gain (Nicolle et al. 2004)."""
 
     window_fwhm_px: Any = option(
         None,
-        "Full width at half maximum of the Gaussian window at the reference position, geometric mean of both "
-        "axes; it is elongated like the spot. Default: that of the spot. Fixed weights that the pipeline is "
-        "given take its place.",
+        "Full width at half maximum of the Gaussian window at the reference position, geometric mean of "
+        "both axes; the window has the elongation of the spot. Default: the width of the spot. Replaced by"
+        " the fixed weights of the pipeline, if given.",
         unit="px",
         low=0.1,
         high=1e3,
     )
     region_px: Any = option(
         None,
-        "Side of the square of pixels around the reference position that count; what is bad or saturated "
-        "elsewhere is not looked at. Default: the whole sub-aperture.",
+        "Side of the square of pixels around the reference position that is used; bad or saturated pixels "
+        "elsewhere have no effect. Default: the whole sub-aperture.",
         unit="px",
         low=0.0,
         high=64.0,
@@ -57,16 +57,16 @@ class Window(Estimator):
     )
     normalisation: Any = option(
         None,
-        'What the sums are divided by: "mean", the flux that is expected (`flux_e`, or a running mean); '
-        '"frame", the flux of the frame itself under the window; "none": nothing. Default: "mean" where '
-        'the flux is known, else "frame".',
+        'Normalisation of the sums. "mean": expected flux (`flux_e`, or a running mean); "frame": flux of '
+        'the frame within the window; "none": no normalisation. Default: "mean" if the flux is known, '
+        'otherwise "frame".',
         choices=(MEAN, FRAME, NONE),
         per_subaperture=False,
     )
     centroid_gain: Any = option(
         None,
-        "Slope that the window shows for a displacement of 1 px, by which slopes are divided. Default: that "
-        "of the spot near the reference position.",
+        "Centroid gain: slope measured for a displacement of 1 px; slopes are divided by it. Default: that"
+        " of the spot near the reference position.",
         low=0.0,
         high=100.0,
         low_open=True,
@@ -74,7 +74,7 @@ class Window(Estimator):
 
     name = "window"
     label = "fixed window"
-    method = "centre of gravity under a fixed window, over its mean flux and gain"
+    method = "centre of gravity with a fixed window, divided by its mean flux and gain"
     needs = frozenset({Need.WIDTH})
     cost = 0.08
     style = Style("#8C510A", "-", "p")
@@ -85,12 +85,12 @@ class Window(Estimator):
         return self.normalisation in (None, MEAN)
 
     def tuned(self, scene: Scene) -> Mapping[str, Sequence[Any]]:
-        """Widths around the spot's; wider ones where it is speckled."""
+        """Return widths around that of the spot; wider ones for speckled spots."""
         factors = _WIDTHS_OF_SPECKLES if scene.d_over_r0 > 1 else _WIDTHS
         return {"window_fwhm_px": [factor * scene.seen_fwhm_px for factor in factors]}
 
     def for_bright_flux(self) -> Window:
-        """Divide by the flux that is there."""
+        """Normalise by the flux of the frame."""
         return self.replaced({"normalisation": FRAME}) if self.uses_flux else self
 
     def check(self, sensor: Sensor) -> None:
@@ -115,7 +115,7 @@ class Window(Estimator):
 
 
 class _Plan(EstimatorPlan):
-    """Weights of every sub-aperture, and what follows from them."""
+    """Weights of each sub-aperture and the tables derived from them."""
 
     setting_rows = window.SETTING_ROWS
     own_scratch = staticmethod(window.no_scratch)
@@ -129,7 +129,7 @@ class _Plan(EstimatorPlan):
 
     @cached_property
     def weights(self) -> FixedWeights:
-        """Those that were given, or those of the Gaussian windows."""
+        """Weights given to the pipeline, or those of the Gaussian windows."""
         given, sensor = self.sensor.score, self.sensor
         if not isinstance(given, FixedWeights):
             return self._gaussian()
@@ -142,7 +142,7 @@ class _Plan(EstimatorPlan):
         return FixedWeights(inside * x / gain, inside * y / gain, spot, inside * flux, np.arange(sensor.n))
 
     def _gaussian(self) -> FixedWeights:
-        """Windows around the reference positions."""
+        """Compute Gaussian windows at the reference positions."""
         sensor = self.sensor
         gain, region = np.nan_to_num(self.each("centroid_gain")), self._half_regions()
         planes = np.zeros(sensor.n) if sensor.psf is None else sensor.psf.index_of(sensor.n)
@@ -168,26 +168,26 @@ class _Plan(EstimatorPlan):
         return FixedWeights(maps[0], maps[1], at_reference, weight / seen[:, None, None], index.reshape(-1))
 
     def _window_std_px(self) -> Floats:
-        """Standard deviations of the windows along x and y, (n, 2)."""
+        """Return the standard deviations of the windows along x and y, (n, 2)."""
         spot = self.sensor.spot_fwhm_px
         factor = self.each("window_fwhm_px") / np.sqrt(spot.prod(axis=1))
         std: Floats = FWHM_TO_STD * spot * np.where(np.isnan(factor), 1.0, factor)[:, None]
         return std
 
     def _half_regions(self) -> Floats:
-        """Half of the sides of the regions that count, (n,) px."""
+        """Return half the side of the region that is used, (n,) px."""
         half: Floats = np.minimum(0.5 * np.nan_to_num(self.each("region_px"), nan=np.inf), 1e3)
         return half
 
     @cached_property
     def _maps(self) -> Floats:
-        """Weights of every kind, (n_kinds, ny, nx, 3)."""
+        """Return the weights of each kind, (n_kinds, ny, nx, 3)."""
         weights = self.weights
         return np.stack([weights.x, weights.y, weights.flux], axis=-1)
 
     @cached_property
     def _region(self) -> tuple[int, int, int, int]:
-        """First row, first column, and those after the last ones, of the pixels that count."""
+        """Return the first row and column of the pixels used, and those after the last ones."""
         counted = np.argwhere(self._maps.any(axis=(0, 3)))
         counted = counted if len(counted) else np.zeros((1, 2), np.int64)
         (top, left), (bottom, right) = counted.min(axis=0), counted.max(axis=0) + 1
@@ -195,10 +195,10 @@ class _Plan(EstimatorPlan):
 
     @cached_property
     def _columns(self) -> tuple[int, int, int] | None:
-        """SIMD width, first and number of columns of whole vectors in the window; None: there are none."""
+        """Return SIMD width, first column and number of columns of whole vectors in the window, or None."""
         _, left, _, right = self._region
         side, found = self.sensor.window[1], []
-        # The machine's width, whatever the sub-apertures': the order of a sum depends on it.
+        # Width of the machine, not of the pipeline: the order of a sum depends on it.
         for width in (width for width in WIDTHS if width <= lanes_for(np.float32).width):
             columns = -(-(right - left) // width) * width
             if columns <= side:
@@ -221,7 +221,7 @@ class _Plan(EstimatorPlan):
         return self._row_tables(whole)
 
     def _row_tables(self, whole: window.WindowTables) -> window.RowTables:
-        """Return the tables of `window_in_rows`: weights times electrons per ADU, and what the dark gives."""
+        """Return the tables of `window_in_rows`: weights times gain, and the contribution of the dark."""
         assert self._columns is not None
         sensor, (width, left, columns) = self.sensor, self._columns
         top, bottom = whole.top, whole.top + whole.rows
@@ -273,19 +273,19 @@ class _Plan(EstimatorPlan):
         elif how == FRAME:
             table[window.DIVISOR] = 0.0
         else:
-            # A spot that is known to have no flux is none; where nothing is known, the frame says it.
+            # A known flux of 0 means no spot; where the flux is unknown, the frame's own flux is used.
             illuminated = np.where(flux_e > _LEAST_FLUX * np.nan_to_num(flux_e).max(), flux_e, -1.0)
             table[window.DIVISOR] = np.where(np.isnan(flux_e), 0.0, illuminated)
         table[window.OFFSET_X], table[window.OFFSET_Y] = offsets
 
 
 def _offsets(middles: Floats, window_px: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Return how far pixels are from middles (n, 2), px from the window's: (n, 1, nx) and (n, ny, 1)."""
+    """Return the offsets of pixels from `middles` (n, 2) in the window: (n, 1, nx) and (n, ny, 1) px."""
     v, u = (np.arange(side) - 0.5 * (side - 1) for side in window_px)
     return u - middles[:, :1, None], v[:, None] - middles[:, 1:, None]
 
 
 def _outside(u: Floats, v: Floats, half: Floats) -> NDArray[np.bool_]:
-    """Return which pixels are not within half a side of the middles."""
+    """Return which pixels are more than half a side away from the middles."""
     away: NDArray[np.bool_] = np.maximum(np.abs(u), np.abs(v)) >= half[:, None, None]
     return away

@@ -43,7 +43,7 @@ def lanes_for(dtype: DTypeLike, width: int | None = None) -> Lanes:
     Raises
     ------
     InputError
-        When the width is none of these.
+        If the width is none of these.
     """
     wanted: Any = width if width is not None else os.environ.get(_ENVIRONMENT, _native_width())
     if str(wanted) not in {str(choice) for choice in WIDTHS}:

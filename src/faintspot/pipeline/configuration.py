@@ -1,6 +1,6 @@
-"""One TOML file (faintspot.toml) for layout, calibration, estimator and settings, PSF and score.
+"""One TOML file (faintspot.toml) for layout, calibration, estimator, settings, PSF and score.
 
-Maps of a calibration, PSF and score are kept beside it, in NAME.calibration.npz and so on, and named in it.
+Calibration maps, PSF and score are stored beside it, in NAME.calibration.npz etc., and named in it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Item = Layout | Calibration | Settings | PSF | Score
 
 
 class Configuration(NamedTuple):
-    """Everything that a configuration file describes."""
+    """Contents of a configuration file."""
 
     layout: Layout
     settings: Settings
@@ -38,7 +38,7 @@ class Configuration(NamedTuple):
 
 
 def load(path: str | Path, table: str) -> Any:
-    """Read one part of a configuration file as the object it describes.
+    """Read one part of a configuration file.
 
     Parameters
     ----------
@@ -53,14 +53,14 @@ def load(path: str | Path, table: str) -> Any:
     Raises
     ------
     InputError
-        When the file cannot be read, is not TOML, lacks the table, or has an unknown key or a bad value.
+        If the file cannot be read, is not TOML, lacks the table, or has an unknown key or an invalid value.
     """
     kinds: dict[str, Any] = {"layout": Layout, "calibration": Calibration, "settings": Settings}
     return kinds[table].load(path)
 
 
 def load_all(path: str | Path) -> Configuration:
-    """Read everything from a configuration file; PSF and score may be absent."""
+    """Read all parts of a configuration file; PSF and score may be absent."""
     path = Path(path)
     document = read_tables(path)
     return Configuration(
@@ -73,12 +73,12 @@ def load_all(path: str | Path) -> Configuration:
 
 
 def has(path: str | Path, table: str) -> bool:
-    """Say whether a configuration file exists and has a table; "settings" may be its [estimator] alone.
+    """Return whether a configuration file has a table; for "settings", an [estimator] table is sufficient.
 
     Raises
     ------
     InputError
-        When the file exists and cannot be read, or is not TOML.
+        If the file exists and cannot be read, or is not TOML.
     """
     if not Path(path).exists():
         return False
@@ -87,12 +87,12 @@ def has(path: str | Path, table: str) -> bool:
 
 
 def save(path: str | Path, item: Item) -> None:
-    """Write an object into its table of a configuration file; other tables and comments stay as they are.
+    """Write an object into its table of a configuration file; preserve other tables and comments.
 
     Raises
     ------
     InputError
-        When the file exists and is not TOML, or cannot be written.
+        If the file exists and is not TOML, or cannot be written.
     """
     if not isinstance(item, PSF | Score):
         item.save(path)
@@ -104,7 +104,7 @@ def save(path: str | Path, item: Item) -> None:
 
 
 def packed(calibration: Calibration, psf: PSF | None, score: Score | None) -> dict[str, str] | None:
-    """Return the files that `save` writes, as base64 text by name; None where they exceed 1 MiB."""
+    """Return the files that `save` writes, as base64 text by name; None if they exceed 1 MiB in total."""
     with TemporaryDirectory() as folder:
         for item in (calibration, psf, score):
             if item is not None:
@@ -116,12 +116,12 @@ def packed(calibration: Calibration, psf: PSF | None, score: Score | None) -> di
 
 
 def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score | None]:
-    """Return what `packed` was given.
+    """Return the inputs of `packed` from its result.
 
     Raises
     ------
     InputError
-        When they are no such files.
+        If the files are invalid.
     """
     with TemporaryDirectory() as folder:
         path = Path(folder) / _PACKED
@@ -135,7 +135,7 @@ def unpacked(files: Mapping[str, str]) -> tuple[Calibration, PSF | None, Score |
 
 
 def to_text(*items: Layout | Calibration | Settings) -> str:
-    """Return the configuration as TOML text; maps of a calibration are given by their shape only."""
+    """Return the configuration as TOML text; calibration maps are represented by their shapes."""
     tables: dict[str, Any] = {}
     for item in items:
         if isinstance(item, Settings):
@@ -146,7 +146,7 @@ def to_text(*items: Layout | Calibration | Settings) -> str:
 
 
 def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
-    """Return the PSF that a configuration file describes or names, if any."""
+    """Return the PSF that a configuration file describes or names, or None."""
     if "psf" not in document:
         return None
     values = document["psf"]
@@ -158,7 +158,7 @@ def psf_of(path: Path, document: Mapping[str, dict[str, Any]]) -> PSF | None:
 
 
 def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None:
-    """Return the score that a configuration file names, if any."""
+    """Return the score that a configuration file names, or None."""
     if "score" not in document:
         return None
     with errors_of_table(path, "score"):
@@ -166,7 +166,7 @@ def score_of(path: Path, document: Mapping[str, dict[str, Any]]) -> Score | None
 
 
 def _named_file(path: Path, table: str, values: Mapping[str, Any], known: tuple[str, ...]) -> Path:
-    """The file that a table names, relative to the configuration."""
+    """Return the file that a table names, relative to the configuration file."""
     check_keys(f"{table}.", values, known)
     name = values.get("file")
     if not isinstance(name, str):

@@ -1,4 +1,4 @@
-"""Slopes of frames on the GPU: tables brought there once, launches, results."""
+"""Measurement of slopes on the GPU: transfer of tables, kernel launches and results."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from faintspot.sensor.layout import Layout
 
 MOST_FRAMES = 65535
-"""In one launch: so many blocks CUDA counts along y."""
+"""Maximum number of frames in one launch (limit of CUDA's grid along y)."""
 
 MOST_FRAME_PIXELS = 2**31 - 1
-"""Of one frame: so many an int32 counts."""
+"""Maximum number of pixels of a frame (limit of int32 indices)."""
 
 _MOST_BYTES = 1 << 28  # of frames on the GPU at a time
 
 
 @dataclass(frozen=True)
 class DeviceSlopes:
-    """Slopes in the GPU's memory, arrays of shape (n_frames, n_subapertures); see `Slopes`.
+    """Slopes in GPU memory, arrays of shape (n_frames, n_subapertures); see `Slopes`.
 
-    The arrays are Numba's, which CuPy, PyTorch and JAX take as they are.
+    The arrays are Numba device arrays, which CuPy, PyTorch and JAX accept directly.
     """
 
     x: Any
@@ -60,7 +60,7 @@ class DeviceSlopes:
 
 @dataclass(frozen=True)
 class Results:
-    """What the kernel writes, in one piece of memory so that one transfer brings all of it."""
+    """Results of the kernel in one block of memory, which is transferred at once."""
 
     memory: Any
     """uint8."""
@@ -78,7 +78,7 @@ class Results:
 
     @staticmethod
     def size_of(n_frames: int, n: int) -> int:
-        """Bytes for n_frames frames of n sub-apertures."""
+        """Return the number of bytes for n_frames frames of n sub-apertures."""
         return 29 * n_frames * n
 
     def slopes(self) -> DeviceSlopes:
@@ -97,19 +97,19 @@ class Results:
 
 
 class DevicePipeline:
-    """A pipeline's work on the GPU. `SlopePipeline(..., device="cuda").on_device` is one.
+    """GPU part of a pipeline, available as `SlopePipeline(..., device="cuda").on_device`.
 
     Parameters
     ----------
     layout : Layout
     calibration : Calibration
     plan : Plan
-        The pipeline's tables.
+        Tables of the pipeline.
 
     Raises
     ------
     InputError
-        For an estimator that runs on the CPU only, and windows that are too large for a warp.
+        If the estimator runs on the CPU only, or the windows are too large for a warp.
     """
 
     def __init__(self, layout: Layout, calibration: Calibration, plan: Plan) -> None:
@@ -143,26 +143,26 @@ class DevicePipeline:
 
     @property
     def needs_flux(self) -> bool:
-        """Whether settings follow the flux of each frame, which only the CPU measures."""
+        """Whether settings follow the flux of each frame, which is measured on the CPU only."""
         return self._plan.needs_flux
 
     def measure(self, frames: Any, *, stream: Any = 0) -> DeviceSlopes:
-        """Measure frames that are in the GPU's memory; the slopes stay there.
+        """Measure frames in GPU memory; the slopes remain there.
 
-        Images of a stack (n, ny, nx), each with settings of its own, are sub-apertures of one tall frame
-        (n * ny, nx): see `faintspot.measure_images` for its layout.
+        A stack of images (n, ny, nx), each with its own settings, is passed as the sub-apertures of one
+        tall frame (n * ny, nx); see `faintspot.measure_images` for its layout.
 
         Parameters
         ----------
         frames : (h, w) or (n, h, w) array on the GPU, uint16 or float32, contiguous
-            Numba's, or anything with `__cuda_array_interface__`, such as CuPy's or PyTorch's.
+            Numba array, or any object with `__cuda_array_interface__`, such as a CuPy or PyTorch array.
         stream : Numba stream, optional
-            Where the kernel is launched. This returns before it has run.
+            Stream of the kernel launch. The call returns before the kernel has run.
 
         Raises
         ------
         InputError
-            For frames that are not of this kind or shape, and for settings that follow each frame's flux.
+            If the frames have another type or shape, or if settings follow the flux of each frame.
         """
         self.check_constant_flux()
         array = frames if hasattr(frames, "copy_to_host") else _as_device_array(frames)
@@ -188,15 +188,15 @@ class DevicePipeline:
     def measure_from_host(
         self, frames: NDArray[Any], dtype: DTypeLike, variants: NDArray[np.int64]
     ) -> tuple[NDArray[Any], ...]:
-        """Measure frames (n, h, w) in the host's memory; return what `Slopes` holds, (n, n_subapertures).
+        """Measure frames (n, h, w) in host memory; return the arrays of `Slopes`, (n, n_subapertures).
 
         Parameters
         ----------
         frames : (n, h, w) array, uint16 or float32, contiguous
         dtype : dtype
-            Of the camera's pixels, which says at what value they saturate.
+            Type of the camera's pixels, which sets their saturation level.
         variants : (n,) int64
-            Table of settings of each frame.
+            Settings table of each frame.
         """
         most = min(max(1, _MOST_BYTES // frames[0].nbytes), MOST_FRAMES)
         parts = []
@@ -211,13 +211,13 @@ class DevicePipeline:
         return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
 
     def new_results(self, n_frames: int) -> Results:
-        """Return memory on the GPU for the slopes of so many frames."""
+        """Allocate GPU memory for the slopes of a number of frames."""
         n = len(self.layout)
         memory = cuda.device_array(Results.size_of(n_frames, n), np.uint8)
         return Results.within(memory, n_frames, n)
 
     def launch(self, frames: Any, dtype: DTypeLike, variants: Any, results: Results, stream: Any = 0) -> None:
-        """Launch the kernel on arrays of the GPU; parameters as `slopes_kernel` takes them."""
+        """Launch the kernel on GPU arrays; parameters as those of `slopes_kernel`."""
         blocks = max(-(-len(self.layout) // WARPS), FEWEST_BLOCKS), len(frames)
         self._kernel[blocks, WARPS * WARP, stream](
             frames.reshape(len(frames), self._maps.shape[1]),
@@ -235,21 +235,21 @@ class DevicePipeline:
         )
 
     def check_constant_flux(self) -> None:
-        """Refuse settings that follow each frame's flux.
+        """Raise an error if settings follow the flux of each frame.
 
         Raises
         ------
         InputError
-            For such.
+            If they do.
         """
         if self.needs_flux:
             raise InputError(
-                "settings.flux_e: expected the flux per sub-aperture, since automatic settings would follow "
-                "each frame's, which is measured on the CPU only"
+                "settings.flux_e: expected the flux per sub-aperture, since automatic settings would "
+                "follow the flux of each frame, which is measured on the CPU only"
             )
 
     def _tables_on_device(self) -> Any:
-        """The tables of settings, brought over anew only where there are new ones."""
+        """Return the settings tables on the GPU, transferred again only if they have changed."""
         tables = self._plan.settings
         if self._tables is None or self._tables[0] is not tables:
             self._tables = tables, cuda.to_device(np.ascontiguousarray(tables, np.float32))
@@ -257,7 +257,7 @@ class DevicePipeline:
 
 
 def _as_device_array(frames: Any) -> Any:
-    """An array of another library as Numba's, without a copy."""
+    """Return an array of another library as a Numba device array, without copying."""
     if not hasattr(frames, "__cuda_array_interface__"):
         raise InputError(
             f"frames: expected an array on the GPU, got {type(frames).__name__}; call the pipeline for "

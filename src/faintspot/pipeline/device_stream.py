@@ -1,4 +1,4 @@
-"""The steady state: frame after frame of one sensor through one CUDA stream."""
+"""Continuous operation: frame after frame of one sensor through one CUDA stream."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from faintspot.pipeline.slopes import Slopes
 
 
 class FrameStream:
-    """Measures the frames of one sensor, one after the other, without waiting for other sensors.
+    """Measures the frames of one sensor one after the other, independently of other sensors.
 
-    Frames and slopes lie in pinned host memory, which the GPU reads and writes by itself. Transfer, kernel
-    and transfer are recorded once as a CUDA graph, so that a frame costs one call of the driver; where that
-    is not possible (`captured` says so), they are started one by one. Several sensors have a `FrameStream`
-    each, and may have a thread each.
+    Frames and slopes are in pinned host memory, which the GPU accesses directly. The transfers and the
+    kernel are recorded as a CUDA graph, so that a frame needs one driver call. If the driver cannot record
+    them (`captured` is False), they are started one by one. For several sensors, use one `FrameStream`
+    each, in one thread or in several.
 
     Parameters
     ----------
     pipeline : SlopePipeline
-        Made with device="cuda". Settings that follow the flux of each frame need `flux_e`.
+        Pipeline made with device="cuda". If settings follow the flux of each frame, set `flux_e`.
     dtype : dtype
-        Of the camera's pixels: uint16 or float32.
+        Type of the camera's pixels: uint16 or float32.
     capture : bool
-        False starts the three steps one by one in any case.
+        Record the steps as a CUDA graph if possible. False: always start them one by one.
 
     Raises
     ------
     InputError
-        When the pipeline is not of this kind, or for another dtype.
+        If the pipeline does not use the GPU, or the dtype is another one.
 
     Examples
     --------
@@ -61,7 +61,7 @@ class FrameStream:
         self._work: DevicePipeline = pipeline.on_device
         shape, n = pipeline.layout.frame_shape, len(pipeline.layout)
         self.frame: Any = cuda.pinned_array(shape, kind)
-        """The next frame, (h, w): to be filled before `submit`, left alone until `wait` has returned."""
+        """Next frame, (h, w): write it before `submit` and do not change it until `wait` has returned."""
         self.frame[:] = 0
         self.stream = cuda.stream()
         """Numba's stream."""
@@ -73,7 +73,7 @@ class FrameStream:
         self._arrays = SlopeArrays(*(getattr(measured, field.name) for field in fields(measured)))
         self._flag_doubtful = pipeline.flag_doubtful
         self._slopes = Slopes(*(getattr(measured, field.name)[0] for field in fields(measured)))
-        self._start_steps()  # compiles, loads and brings the tables over
+        self._start_steps()  # compiles, loads and transfers the tables
         self.stream.synchronize()
         self._graph = _captured(self.stream, self._start_steps) if capture and not simulated() else None
 
@@ -83,16 +83,16 @@ class FrameStream:
         return self._graph is not None
 
     def submit(self) -> None:
-        """Start to measure `frame`; returns at once."""
+        """Start the measurement of `frame`; return immediately."""
         if self._graph is None:
             self._start_steps()
         else:
             _launch(self._graph, self.stream)
 
     def wait(self) -> Slopes:
-        """Wait for the frame that was submitted last, and return its slopes.
+        """Wait for the frame submitted last, and return its slopes.
 
-        They are views of memory that the next `submit` overwrites.
+        The slopes are views of memory that the next `submit` overwrites.
         """
         self.stream.synchronize()
         self._flag_doubtful(self._arrays)
@@ -107,12 +107,12 @@ class FrameStream:
 
 @cache
 def _driver() -> Any:
-    """CUDA's driver, which numba-cuda brings along."""
+    """Return the CUDA driver of numba-cuda."""
     return importlib.import_module("cuda.bindings.driver")
 
 
 def _captured(stream: Any, start: Any) -> Any:
-    """Record as a graph what `start` puts into a stream; None where the driver cannot."""
+    """Record the operations of `start` in a stream as a graph; return None if the driver cannot."""
     driver = _driver()
     handle = driver.CUstream(int(stream))
     mode = driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_THREAD_LOCAL
@@ -122,7 +122,7 @@ def _captured(stream: Any, start: Any) -> Any:
     started = True
     try:
         start()
-    except Exception:  # whatever the driver does not record; the steps work one by one, as has been seen
+    except Exception:  # any operation that the driver cannot record; the steps themselves have run before
         started = False
     error, graph = driver.cuStreamEndCapture(handle)
     if error or not started:
@@ -132,8 +132,8 @@ def _captured(stream: Any, start: Any) -> Any:
 
 
 def _launch(graph: Any, stream: Any) -> None:
-    """Start a recorded graph."""
+    """Launch a recorded graph."""
     driver = _driver()
     (error,) = driver.cuGraphLaunch(graph, driver.CUstream(int(stream)))
     if error:
-        raise RuntimeError(f"the GPU refused a frame: {error}")
+        raise RuntimeError(f"the GPU rejected a frame: {error}")

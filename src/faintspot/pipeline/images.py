@@ -1,4 +1,4 @@
-"""Estimators for stacks of images, each image a sub-aperture of its own."""
+"""Measurement of stacks of images, each image a separate sub-aperture."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ def measure_images(
     score: Score | None = None,
     prior: ArrayLike | None = None,
 ) -> Slopes:
-    """Measure the positions of the spots of a stack of images, each image a sub-aperture of its own.
+    """Measure the positions of the spots in a stack of images, each image a separate sub-aperture.
 
     Parameters
     ----------
     images : (n, ny, nx) array
-        ADU; electrons with the default calibration.
+        Images [ADU]; electrons with the default calibration.
     settings : Settings or Estimator
-        Its arrays hold one value per image. Flux that is not given (`flux_e`) is the mean of the stack.
+        Arrays in it hold one value per image. If `flux_e` is not given, the mean flux of the stack is used.
     calibration : Calibration, optional
-        Without maps: gain, dark level, read noise.
+        Gain, dark level and read noise; maps are not allowed.
     psf, score
-        As `SlopePipeline`; an index holds the PSF or kind of each image.
+        As for `SlopePipeline`; an index holds the PSF or kind of each image.
     prior : (n, 2) array, optional
-        Predicted positions, px from the images' centres.
+        Predicted positions, px from the image centres.
 
     Returns
     -------
     Slopes
-        Arrays of shape (n,); x and y in px from each image's centre.
+        Arrays of shape (n,); x and y in px from the image centres.
 
     Raises
     ------
     InputError
-        For images that are not real or not three-dimensional, and as `SlopePipeline`.
+        If the images are not real or not three-dimensional, and as for `SlopePipeline`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Slopes as tables and arrays of other packages, with names and units."""
+"""Conversion of slopes to labelled tables and arrays of other packages, with units."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Variables = Mapping[str, NDArray[Any]]
 
 
 def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Dataset:
-    """Return what `Slopes.to_xarray` does."""
+    """Return the result of `Slopes.to_xarray`."""
     try:
         import xarray
     except ImportError:
@@ -54,7 +54,7 @@ def dataset_of(slopes: Variables, layout: Layout | None, unit: str) -> xarray.Da
 
 
 def table_of_slopes(slopes: Variables, layout: Layout | None, unit: str) -> pandas.DataFrame:
-    """Return what `Slopes.to_pandas` does."""
+    """Return the result of `Slopes.to_pandas`."""
     try:
         import pandas
     except ImportError:
@@ -71,7 +71,7 @@ def table_of_slopes(slopes: Variables, layout: Layout | None, unit: str) -> pand
 
 
 def layout_coordinates(layout: Layout) -> dict[str, NDArray[Any]]:
-    """Return where each sub-aperture is, as files of slopes hold it."""
+    """Return the position of each sub-aperture in the form used in files of slopes."""
     return {
         "centre_x": layout.centres[:, 0],
         "centre_y": layout.centres[:, 1],
@@ -83,7 +83,7 @@ def layout_coordinates(layout: Layout) -> dict[str, NDArray[Any]]:
 def _parts(
     slopes: Variables, layout: Layout | None, unit: str
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
-    """Return variables (n_frames, n_subapertures) in a unit, and coordinates."""
+    """Return the variables (n_frames, n_subapertures) in the given unit, and the coordinates."""
     variables = {name: np.atleast_2d(slopes[name]) for name in VARIABLES}
     n = variables["x"].shape[1]
     if layout is not None and len(layout) != n:

@@ -1,4 +1,4 @@
-"""The flux of every sub-aperture as a running mean: what a single faint frame cannot say."""
+"""Running mean of the flux of each sub-aperture, for frames that are too faint for a flux per frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LEAST_FLUX_E = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MeanFlux:
-    """Mean flux of every sub-aperture over the frames before; a value that is passed on, frame by frame.
+    """Mean flux of each sub-aperture over the previous frames; an immutable value, updated frame by frame.
 
     ::
 
@@ -28,17 +28,17 @@ class MeanFlux:
     Parameters
     ----------
     flux_e : (n,) or (n_frames, n) array
-        Flux, electrons, of one frame or of several, whose mean counts.
+        Flux [electrons] of one frame, or of several, which are averaged.
     time_constant_frames : float
-        Frames after which a frame counts 1 / e times as much as the newest; before as many have been seen,
-        all count alike.
+        Number of frames after which the weight of a frame has decreased by a factor of e. The first frames,
+        up to this number, are weighted equally.
     frames : float
-        Frames that `flux_e` (n,) is the mean of. Default: 1, or their number.
+        Number of frames averaged in `flux_e` (n,). Default: 1, or the number of frames given.
 
     Raises
     ------
     InputError
-        For flux that is not finite, of another shape, or numbers out of range.
+        If flux is not finite or of another shape, or a number is out of range.
 
     Examples
     --------
@@ -65,12 +65,12 @@ class MeanFlux:
         object.__setattr__(self, "frames", float(frames))
 
     def updated(self, flux_e: ArrayLike) -> MeanFlux:
-        """Return the mean with one more frame's flux (n,), electrons; what is not finite counts nothing.
+        """Return the mean updated by a frame's flux (n,) [electrons]; values that are not finite are ignored.
 
         Raises
         ------
         InputError
-            For another number of sub-apertures.
+            If the number of sub-apertures differs.
         """
         flux = real_array("flux_e", flux_e)
         if flux.shape != self.flux_e.shape:
@@ -82,6 +82,6 @@ class MeanFlux:
 
     @property
     def positive_flux_e(self) -> NDArray[np.float64]:
-        """The mean, and a thousandth of an electron where noise has made it less."""
+        """Mean flux, at least 0.001 electrons."""
         flux: NDArray[np.float64] = np.maximum(self.flux_e, _LEAST_FLUX_E)
         return flux

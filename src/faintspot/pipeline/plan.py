@@ -1,4 +1,4 @@
-"""What a pipeline computes once, before the first frame: settings and tables in the kernels' own form."""
+"""Settings and tables that a pipeline computes before the first frame, in the form that kernels read."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from faintspot.sensor.neighbours import LEAST_DIFFERENCE, neighbours_of
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
 
-_FWHM_OF_KEPT = 0.58  # px, times the root of a good number of kept pixels: 12 of a spot of FWHM 2 px
-_MOST_FLUX_E = 9e8  # of a frame's mean sub-aperture: beyond, settings stay the same
+_FWHM_OF_KEPT = 0.58  # px, times the square root of a good number of kept pixels: 12 for a FWHM of 2 px
+_MOST_FLUX_E = 9e8  # mean flux per sub-aperture above which settings stay constant
 
 Floats = NDArray[np.float64]
 
 
 def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> NDArray[np.float32]:
-    """Dark and scale of every sub-aperture's pixels in the kernel's own order, to be read as one stream.
+    """Return dark and scale of all sub-aperture pixels in the order in which the kernel reads them.
 
-    Shape (n_groups, pixels, 2, W); the last group repeats its last sub-aperture.
+    The shape is (n_groups, pixels, 2, W); the last group is padded with its last sub-aperture.
     """
     n_groups = -(-len(layout) // width)
     windows = layout.images(calibration.maps(layout.frame_shape)).reshape(2, len(layout), layout.pixels)
@@ -42,21 +42,21 @@ def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> 
 
 
 class Plan:
-    """Settings of every sub-aperture and the estimator's tables, for every level of flux that occurs.
+    """Settings of each sub-aperture and tables of the estimator, for each level of flux that occurs.
 
     Parameters
     ----------
     layout, settings, calibration, psf, score
-        As `SlopePipeline`.
+        As for `SlopePipeline`.
     zero : (n, 2) array
-        Reference positions, px from the windows' centres.
+        Reference positions, px from the window centres.
     width : int
-        SIMD lanes.
+        Number of SIMD lanes.
 
     Raises
     ------
     InputError
-        When the parts do not fit together.
+        If the parts are inconsistent.
     """
 
     def __init__(
@@ -91,9 +91,9 @@ class Plan:
         own = self.estimator.prepared(self.sensor)
         self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if own is None else own
         self.expected = self._expected(settings)
-        """Where spots may be: those elsewhere are flagged."""
+        """Expected range of the spot positions; spots outside are flagged."""
         self.no_prior = np.zeros((1, 2, n), np.float32)
-        """The prior of slopes that nobody has predicted: 0."""
+        """Prior used without predicted slopes: 0."""
         self._fixed = self._fixed_table(each)
         self._levels: list[NDArray[np.float32]] = []
         self._variants: dict[int, int] = {}
@@ -105,17 +105,17 @@ class Plan:
 
     @property
     def needs_flux(self) -> bool:
-        """Whether the flux must be measured in every frame."""
+        """Whether the flux is measured in every frame."""
         return self.prepared.needs_flux
 
     @property
     def settings(self) -> NDArray[np.float32]:
-        """Tables of settings (n_variants, rows, n)."""
+        """Settings tables (n_variants, rows, n)."""
         return self._arguments()[0]
 
     @property
     def own_scratch(self) -> Any:
-        """Function that makes the memory of the estimator's kernel."""
+        """Function that allocates the scratch memory of the estimator's kernel."""
         return self._arguments()[2]
 
     def kernel(self, frames: NDArray[Any]) -> Direct:
@@ -123,7 +123,7 @@ class Plan:
         return self._direct(self.prepared.kernel, frames)
 
     def flux_kernel(self, frames: NDArray[Any]) -> Direct:
-        """Return the compiled function that sums up their flux."""
+        """Return the compiled function that sums their flux."""
         return self._direct(self.prepared.flux_kernel, frames)
 
     def _direct(self, kernel: Any, frames: NDArray[Any]) -> Direct:
@@ -133,20 +133,20 @@ class Plan:
         return self._kernels[key]
 
     def task(self, variants: NDArray[np.int64], prior: NDArray[np.float32] | None = None) -> Task:
-        """Return what the kernel is to do with frames.
+        """Return the kernel's task for frames.
 
         Parameters
         ----------
         variants : (n_frames,) int64
-            Table of settings of each frame.
+            Settings table of each frame.
         prior : (1 or n_frames, 2, n) float32, optional
-            Predicted slopes. Default 0.
+            Predicted slopes. Default: 0.
         """
         settings, tables, _ = self._arguments()
         return Task(settings, variants, self.no_prior if prior is None else prior, tables)
 
     def _arguments(self) -> tuple[NDArray[np.float32], Any, Any]:
-        """Settings, tables and scratch, made anew only where there is new flux."""
+        """Return settings, tables and scratch function, rebuilt only for a new flux level."""
         with self._lock:
             if self._made is None or len(self._made[0]) != len(self._levels):
                 prepared = self.prepared
@@ -154,12 +154,12 @@ class Plan:
             return self._made
 
     def variants(self, flux_e: Floats) -> NDArray[np.int64]:
-        """Return the variant of frames with that high flux per sub-aperture; make those that are new."""
+        """Return the variants for the given fluxes per sub-aperture; add those that are missing."""
         with np.errstate(invalid="ignore"):
             flux = np.clip(np.nan_to_num(flux_e, nan=1.0, posinf=_MOST_FLUX_E), 1.0, _MOST_FLUX_E)
         step = self.prepared.flux_step
         levels = np.rint(np.log(flux) / math.log(step)).astype(np.int64)
-        with self._lock:  # several threads may measure frames with one pipeline
+        with self._lock:  # several threads may measure frames with the same pipeline
             for level in np.unique(levels).tolist():
                 if level not in self._variants:
                     self._add(np.full(self.sensor.n, step**level))
@@ -167,13 +167,13 @@ class Plan:
         return np.array([self._variants[level] for level in levels.tolist()], np.int64)
 
     def _add(self, flux_e: Floats) -> None:
-        """Add the settings' table of a flux level."""
+        """Add the settings table of a flux level."""
         table = self._fixed.copy()
         self.prepared.fill_flux(table, flux_e)
         self._levels.append(table)
 
     def _expected(self, settings: Settings) -> Expected:
-        """Return where spots may be; they are whole where half their width is inside the window."""
+        """Return the expected positions; a spot is complete if half its width is inside the window."""
         sensor, layout = self.sensor, self.sensor.layout
         fwhm = np.ones((sensor.n, 2))
         if "keep_brightest" in settings.declared() and not is_auto(settings.keep_brightest):
@@ -191,7 +191,7 @@ class Plan:
         )
 
     def _fixed_table(self, each: Any) -> NDArray[np.float32]:
-        """The settings that do not depend on the flux."""
+        """Return the settings that do not depend on the flux."""
         sensor = self.sensor
         table = np.zeros((self.prepared.setting_rows, sensor.n), np.float32)
         table[groups.ZERO_X], table[groups.ZERO_Y] = sensor.zero.T

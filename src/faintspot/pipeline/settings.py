@@ -1,4 +1,4 @@
-"""Settings: the estimator of a sensor, and what every estimator is told of slopes and spots."""
+"""Settings: the estimator of a sensor, and the options that all estimators share."""
 
 from __future__ import annotations
 
@@ -20,25 +20,24 @@ from faintspot.estimators.registry import estimator_named, estimators
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SharedOptions(Options):
-    """What every estimator is told."""
+    """Options shared by all estimators."""
 
     search_range_px: Any = option(
         None,
-        "Largest slope: positions are sought, and kept, within so much of the reference. Default: the whole "
-        "window.",
+        "Maximum distance from the reference position; larger slopes are clipped. Default: the whole window.",
         unit="px",
         low=0.0,
         high=1e4,
         low_open=True,
     )
     max_bad_fraction: Any = option(
-        0.25, "A sub-aperture with a larger fraction of bad pixels is invalid.", low=0.0, high=1.0
+        0.25, "Fraction of bad pixels above which a sub-aperture is invalid.", low=0.0, high=1.0
     )
-    error_scale: Any = option(1.0, "Factor on the standard errors.", low=0.0, high=1e3, low_open=True)
+    error_scale: Any = option(1.0, "Factor applied to the standard errors.", low=0.0, high=1e3, low_open=True)
     flux_e: Any = option(
         None,
-        'Flux expected of a spot in a frame, for estimators that use it and for "auto". Default: measured '
-        "in each frame, as the mean of all sub-apertures.",
+        'Expected flux of a spot in a frame, used by some estimators and for "auto". Default: the mean over '
+        "all sub-apertures, measured in each frame.",
         unit="e-",
         low=0.0,
         high=1e12,
@@ -46,34 +45,34 @@ class SharedOptions(Options):
     )
     spot_fwhm_px: Any = option(
         None,
-        "Full width at half maximum of the spots in the frame, along x. Default: that of the PSF.",
+        "Full width at half maximum of the spots in the frame, along x. Default: the width of the PSF.",
         unit="px",
         low=0.1,
         high=64.0,
     )
     spot_fwhm_y_px: Any = option(
-        None, "The same along y. Default: as along x.", unit="px", low=0.1, high=64.0
+        None, "As spot_fwhm_px, along y. Default: the width along x.", unit="px", low=0.1, high=64.0
     )
 
 
 class Settings:
-    """How each sub-aperture's image is turned into a position; immutable.
+    """Estimator of a sensor and its options; immutable.
 
     Parameters
     ----------
     estimator : str or Estimator
-        How a position is found: a name of `faintspot.estimators.estimators`, with its own options among
-        `options`, or such an object. Default: "tv".
+        Name from `faintspot.estimators.estimators`, with the options of the estimator in `options`, or an
+        estimator object. Default: "tv".
     **options
-        Options of the estimator, and those that all share: `search_range_px`, `max_bad_fraction`,
-        `error_scale`, `flux_e`, `spot_fwhm_px`, `spot_fwhm_y_px`. docs/configuration.md describes each. Most
-        may hold one value per sub-aperture. They are attributes of the settings.
+        Options of the estimator, and the shared options `search_range_px`, `max_bad_fraction`,
+        `error_scale`, `flux_e`, `spot_fwhm_px` and `spot_fwhm_y_px`; see docs/configuration.md. Most
+        options accept one value per sub-aperture. All are attributes of the settings.
 
     Raises
     ------
     InputError
-        For an unknown option or one of another estimator, a value out of range, NaN, of the wrong kind, or
-        arrays of different lengths.
+        If an option is unknown or belongs to another estimator, a value is out of range, NaN or of the wrong
+        type, or arrays have different lengths.
 
     Examples
     --------
@@ -86,7 +85,7 @@ class Settings:
     SHARED: ClassVar[tuple[str, ...]] = tuple(SharedOptions.declared())
 
     estimator: Estimator
-    """How a position is found."""
+    """Estimator of the spot positions."""
     _shared: SharedOptions
 
     def __init__(self, estimator: str | Estimator = "tv", **options: Any) -> None:
@@ -112,7 +111,7 @@ class Settings:
         raise AttributeError(f"Settings are immutable: use settings.replace({name}=...)")
 
     def __getattr__(self, name: str) -> Any:
-        """Return an option, of the estimator or shared."""
+        """Return an option of the estimator or a shared option."""
         if not name.startswith("_"):
             for part in (self._shared, self.estimator):
                 if name in part.declared():
@@ -138,11 +137,11 @@ class Settings:
         return f"Settings({self.estimator.name!r}{options})"
 
     def declared(self) -> dict[str, Option]:
-        """Return the declarations of all options, by name: the estimator's own, then the shared ones."""
+        """Return the declarations of all options by name: first the estimator's, then the shared ones."""
         return {**self.estimator.declared(), **self._shared.declared()}
 
     def chosen(self) -> dict[str, Any]:
-        """Return the options that are not at their defaults."""
+        """Return the options whose values are not the defaults."""
         return {**self.estimator.chosen(), **self._shared.chosen()}
 
     # Files ------------------------------------------------------------------------------------------
@@ -159,7 +158,7 @@ class Settings:
         Raises
         ------
         InputError
-            For an unknown key, one of another estimator, a bad value.
+            If a key is unknown or belongs to another estimator, or a value is invalid.
         """
         own, shared = dict(table_of(path, document, "estimator")), document.get("settings", {})
         with errors_of_table(path, "estimator"):
@@ -184,7 +183,7 @@ class Settings:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write the tables [estimator] and [settings] of a configuration file; others stay as they are."""
+        """Write the tables [estimator] and [settings] of a configuration file; preserve other tables."""
         save_tables(path, {name: values or None for name, values in self.to_tables().items()})
 
     # Changes ----------------------------------------------------------------------------------------
@@ -195,15 +194,15 @@ class Settings:
         Parameters
         ----------
         where : int or sequence of int, optional
-            Sub-apertures to change; default all. A boolean array selects as in NumPy.
+            Sub-apertures to change; default: all. A boolean array is a mask.
         **changes
-            New values by name; with `where`, a scalar or one value per selected sub-aperture. Another
-            `estimator` keeps the shared options, and of the others those that it has, too.
+            New values by name; with `where`, a scalar or one value per selected sub-aperture. If `estimator`
+            changes, shared options are kept, and so are the options that the new estimator has as well.
 
         Raises
         ------
         InputError
-            For an unknown name, a bad value, an index out of range.
+            If a name is unknown, a value is invalid, or an index is out of range.
         """
         if where is None and "estimator" in changes:
             return self._with_estimator(**changes)
@@ -228,24 +227,24 @@ class Settings:
         return cls(estimator, **vars(shared))
 
     def values(self, name: str, n_subapertures: int, pixels: int) -> NDArray[Any]:
-        """Return one value per sub-aperture, with defaults filled in; NaN where there is none.
+        """Return one value per sub-aperture, with defaults filled in; NaN if there is none.
 
         Raises
         ------
         InputError
-            When the settings are for another number of sub-apertures.
+            If the settings are for another number of sub-apertures.
         """
         part = self._shared if name in self.SHARED else self.estimator
         return part.values(name, n_subapertures, pixels)
 
 
 def check_option(name: str, kind: type[Estimator], prefix: str = "") -> None:
-    """Refuse an option that an estimator does not have, and say whose it is.
+    """Raise an error if the estimator does not have an option; name the estimators that do.
 
     Raises
     ------
     InputError
-        When it has no such option.
+        If it has no such option.
     """
     if name in kind.declared():
         return
@@ -268,12 +267,12 @@ def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def without_denoising(settings: Settings, where: str) -> Settings:
-    """Return settings with the same estimator without its denoising.
+    """Return settings with the same estimator without denoising.
 
     Raises
     ------
     InputError
-        When it has none; the text says `where` that was asked for.
+        If the estimator does not denoise; the message begins with `where`.
     """
     plain = settings.estimator.without_denoising()
     if plain is None:
@@ -285,30 +284,30 @@ def without_denoising(settings: Settings, where: str) -> Settings:
 
 
 def with_preset(settings: Settings, preset: str) -> Settings:
-    """Return settings whose estimator does as much work as a preset says.
+    """Return settings whose estimator uses the given preset.
 
     Raises
     ------
     InputError
-        When it does the same work always.
+        If the estimator has no presets.
     """
     if "preset" not in settings.estimator.declared():
         others = ", ".join(repr(name) for name, kind in estimators().items() if "preset" in kind.declared())
         raise InputError(
-            f"preset = {preset!r}: the estimator {settings.estimator.name!r} does the same work always; "
-            f"{others} have presets"
+            f"preset = {preset!r}: the estimator {settings.estimator.name!r} has no presets; "
+            f"expected one of {others}"
         )
     return settings.replace(preset=preset)
 
 
 def option_names() -> list[str]:
-    """Return the names of all options of all estimators, and of the shared ones; "estimator" is the first."""
+    """Return the names of all options of all estimators, and the shared ones, preceded by "estimator"."""
     own = (name for kind in estimators().values() for name in kind.declared())
     return list(dict.fromkeys(["estimator", *own, *Settings.SHARED]))
 
 
 def spot_fwhm_px(settings: Settings, n_subapertures: int, pixels: int) -> NDArray[np.float64]:
-    """Return the widths (n, 2) of the spots along x and y that settings give; NaN where they give none."""
+    """Return the widths (n, 2) of the spots along x and y given by the settings; NaN where not given."""
     along, across = (
         settings.values(name, n_subapertures, pixels).astype(np.float64)
         for name in ("spot_fwhm_px", "spot_fwhm_y_px")

@@ -1,4 +1,4 @@
-"""The slope pipeline: frame -> calibrate -> estimator -> slopes."""
+"""Slope pipeline: frame -> calibration -> estimator -> slopes."""
 
 from __future__ import annotations
 
@@ -34,37 +34,38 @@ if TYPE_CHECKING:
 
 _KERNEL_TYPES = (np.dtype(np.uint16), np.dtype(np.float32))
 _NO_STAGES = np.empty((0, 0, 0, 0), np.float32)
-_FLUX_COST = 0.1  # of summing up a sub-aperture's pixels, as `Estimator.cost`
+_FLUX_COST = 0.1  # of summing the pixels of a sub-aperture, in units of `Estimator.cost`
 
 
 class SlopePipeline:
-    """Turns frames into slopes.
+    """Computes slopes from frames.
 
     Parameters
     ----------
     layout : Layout
     settings : Settings or Estimator
     calibration : Calibration, optional
-        Default: frames are in electrons already.
+        Default: frames are already in electrons.
     reference : array or Slopes, optional
-        Reference positions, px from each sub-aperture's centre, subtracted from every position: (n, 2) x and
-        y, or (2 n,) all x then all y, or the slopes of one frame; up to the frame's longer side. Default 0.
+        Reference positions, px from the centre of each sub-aperture, which are subtracted from all
+        positions: (n, 2) x and y, or (2 n,) all x then all y, or the slopes of one frame. Their magnitude
+        must not exceed the longer side of the frame. Default: 0.
     psf : PSF, optional
-        Needed by estimators that know the spot itself; tells others the spots' width.
+        Required by estimators that use the spot shape; it provides the spot width to others.
     score : Score, optional
-        Needed by estimators that apply one: `TrainedScore`; `FixedWeights` take the place of a window's.
+        Required by estimators that apply one: `TrainedScore`, or `FixedWeights` for a window.
     width : int, optional
-        SIMD width in float32 numbers: 4, 8 or 16. Default: what the machine has.
+        SIMD width in float32 numbers: 4, 8 or 16. Default: the width of the machine.
     threads : int, optional
-        Most threads to use. Default: all processors that the process may use. Slopes do not depend on it.
+        Maximum number of threads. Default: all available processors. Slopes do not depend on it.
     device : {"cpu", "cuda"}, optional
-        Where frames are measured. On an NVIDIA GPU ("cuda", see `faintspot.cuda`) with estimators that run
-        there; `explain` and real time use the CPU always.
+        Device on which frames are measured. "cuda" uses an NVIDIA GPU (see `faintspot.cuda`), for the
+        estimators that support it; `explain` and real time always use the CPU.
 
     Raises
     ------
     InputError
-        When the parts do not fit together, and for "cuda" without a GPU.
+        If the parts are inconsistent, or for "cuda" without a GPU.
     MissingExtraError
         For "cuda" without the extra `gpu`.
 
@@ -106,23 +107,23 @@ class SlopePipeline:
         self._calibration = packed_calibration(layout, self.calibration, self._lanes.width)
         self._parts = psf, score, layout.offsets + _reference_positions(reference, layout)
         self.plan = self._prepared()
-        """What was computed beforehand."""
+        """Settings and tables computed before the first frame."""
         self._identity = _identity(*self._parts)
         self.device = one_of("device", device, ("cpu", "cuda"))
         self.on_device = self._device_pipeline() if self.device == "cuda" else None
 
     @classmethod
     def from_file(cls, path: str | Path, **options: Any) -> SlopePipeline:
-        """Make the pipeline that a configuration file (faintspot.toml) describes."""
+        """Make the pipeline described by a configuration file (faintspot.toml)."""
         layout, settings, calibration, psf, score = configuration.load_all(path)
         return cls(layout, settings, calibration, psf=psf, score=score, **options)
 
     def _prepared(self) -> Plan:
-        """Make the tables for the SIMD lanes that are set."""
+        """Compute the tables for the current SIMD width."""
         return Plan(self.layout, self.settings, self.calibration, *self._parts, self._lanes.width)
 
     def _device_pipeline(self) -> DevicePipeline:
-        """Bring the tables to the GPU."""
+        """Transfer the tables to the GPU."""
         from faintspot.cuda.availability import check_cuda
 
         check_cuda()
@@ -132,7 +133,7 @@ class SlopePipeline:
 
     @property
     def width(self) -> int:
-        """Sub-apertures that are measured at once."""
+        """Number of sub-apertures measured at once."""
         return self._lanes.width
 
     def with_width(self, width: int) -> SlopePipeline:
@@ -141,7 +142,7 @@ class SlopePipeline:
         Raises
         ------
         InputError
-            For another width.
+            If the width is another one.
         """
         other = copy.copy(self)
         other._lanes = lanes_for(np.float32, width)
@@ -152,7 +153,7 @@ class SlopePipeline:
 
     @property
     def spot(self) -> tuple[PSF | None, Score | None]:
-        """PSF and score that it was given."""
+        """PSF and score of the pipeline."""
         return self._parts[:2]
 
     def with_settings(self, settings: Settings) -> SlopePipeline:
@@ -161,7 +162,7 @@ class SlopePipeline:
         Raises
         ------
         InputError
-            When they do not fit.
+            If they do not fit the sensor.
         """
         psf, score, zero = self._parts
         return SlopePipeline(
@@ -177,21 +178,21 @@ class SlopePipeline:
         )
 
     def with_flux(self, mean_flux: MeanFlux | ArrayLike) -> SlopePipeline:
-        """Return the same pipeline for a mean flux of its sub-apertures.
+        """Return the same pipeline with the given mean flux of its sub-apertures.
 
-        Estimators that use the flux measure it in every frame where nobody tells them (`flux_e`), which
-        costs precision when a frame is faint. Flux counts in steps of a few per cent: where it has not
-        changed by so much, this pipeline itself is returned, so that it may be called in every frame.
+        If `flux_e` is not set, estimators that use the flux measure it in every frame, which is less
+        precise for faint frames. Flux is quantised in steps of a few per cent. If it has not changed by a
+        step, this pipeline itself is returned, so that the method may be called in every frame.
 
         Parameters
         ----------
         mean_flux : MeanFlux, or float or (n,) array
-            Electrons of a frame.
+            Flux of a frame [electrons].
 
         Raises
         ------
         InputError
-            For flux that is not positive, or of another number of sub-apertures.
+            If flux is not positive, or the number of sub-apertures differs.
         """
         flux_e = mean_flux.positive_flux_e if isinstance(mean_flux, MeanFlux) else mean_flux
         flux_e = numbers_between("mean_flux", flux_e, 0.0, 1e12, low_open=True)
@@ -209,7 +210,7 @@ class SlopePipeline:
         return self.with_settings(self.settings.replace(flux_e=np.broadcast_to(rounded, known.shape)))
 
     def for_images(self) -> SlopePipeline:
-        """Return the same pipeline for calibrated images (n, ny, nx), electrons, read as one tall frame."""
+        """Return the same pipeline for calibrated images (n, ny, nx) [electrons], read as one tall frame."""
         layout, camera = self.layout, self.calibration
         other = copy.copy(self)
         other.layout = Layout.stacked(len(layout), layout.window, layout.offsets)
@@ -228,11 +229,11 @@ class SlopePipeline:
 
     @property
     def needs_flux(self) -> bool:
-        """Whether settings follow the flux of each frame, which is looked at before it is measured."""
+        """Whether settings follow the flux of each frame, which is measured first."""
         return self.plan.needs_flux
 
     def fingerprint(self) -> bytes:
-        """Return bytes that differ between pipelines that could give different slopes for the same frame."""
+        """Return bytes that identify the pipeline: they differ if slopes of the same frame may differ."""
         parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape))
         calibration = self.calibration
         text = (
@@ -247,27 +248,27 @@ class SlopePipeline:
     def __call__(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Slopes:
         """Measure the slopes of a frame (h, w) or of frames (n, h, w), in ADU.
 
-        NaN and infinite pixels count as bad pixels; a sub-aperture that cannot be measured is flagged.
+        NaN and infinite pixels are treated as bad pixels; a sub-aperture that cannot be measured is flagged.
 
         Parameters
         ----------
         frame : array
         prior : array or Slopes, optional
-            Predicted slopes, px, for "map" (the mean of its prior) and "trained" (where it begins): as
-            `reference`, or one such array for every frame. Default 0, which is also what counts where a
-            number is not finite, or larger than the frame's longer side.
+            Predicted slopes [px], used by "map" (mean of the prior) and "trained" (starting point): an
+            array as for `reference`, or one such array per frame. Default: 0, which also replaces values
+            that are not finite or exceed the longer side of the frame.
 
         Raises
         ------
         InputError
-            For a frame that is not real or not of the layout's shape, or a prior of the wrong shape.
+            If a frame is not real or does not have the layout's shape, or the prior has the wrong shape.
         """
         return self._run(self._checked(frame), _camera_type(frame), prior, explain=False)[0]
 
     def explain(self, frame: ArrayLike, prior: ArrayLike | Slopes | None = None) -> Stages:
-        """Return the sub-aperture images after every step, for pictures and for finding faults.
+        """Return the sub-aperture images after every step, for figures and for debugging.
 
-        Estimators that work on the calibrated image itself leave it as it is in every step.
+        For estimators that use the calibrated image directly, the later images are equal to it.
         """
         array = self._checked(frame)
         slopes, stages = self._run(array, _camera_type(frame), prior, explain=True)
@@ -290,7 +291,7 @@ class SlopePipeline:
         prior: ArrayLike | Slopes | None,
         explain: bool,
     ) -> tuple[Slopes, NDArray[np.float32]]:
-        """Compute the slopes, and the stages where asked for."""
+        """Compute the slopes, and the stages if requested."""
         frames = kernel_frames(array)
         n_frames, n = len(frames), len(self.layout)
         results = SlopeArrays(*[np.empty((n_frames, n), dtype) for dtype in RESULT_TYPES])
@@ -324,28 +325,28 @@ class SlopePipeline:
         return Slopes(*(results if array.ndim == 3 else [result[0] for result in results])), stages
 
     def flag_doubtful(self, results: SlopeArrays) -> None:
-        """Add the flags of spots that their window's edge cuts, or that are unlike all their neighbours.
+        """Set the flags of spots that are cut by the edge of their window or differ from all neighbours.
 
-        They follow from the slopes of whole frames, and are no reason to wait with the slopes.
+        The flags need the slopes of whole frames; slopes can be used before they are set.
         """
         scratch = np.empty(len(self.layout), np.float32)
         flag_doubtful(results.x, results.y, results.flags, self.plan.expected, scratch)
 
     def source(self, frames: NDArray[Any], dtype: DTypeLike) -> Source:
-        """Return what kernels read of frames.
+        """Return the frames in the form that kernels read.
 
         Parameters
         ----------
         frames : (n, h, w) array, uint16 or float32, contiguous
         dtype : dtype
-            Of the camera's pixels, which says at what value they saturate.
+            Type of the camera's pixels, which sets their saturation level.
         """
         saturation = self.calibration.saturation(np.dtype(dtype))
         corners, window = self.layout.corners, self.layout.window
         return Source(self._lanes, frames, corners, *window, self._calibration, saturation)
 
     def _variants(self, source: Source) -> NDArray[np.int64]:
-        """Which table of settings every frame is measured with, by its flux where that matters."""
+        """Return the index of the settings table of each frame, by its flux if settings depend on it."""
         n_frames, n = len(source.frames), len(self.layout)
         if not self.needs_flux:
             return np.zeros(n_frames, np.int64)
@@ -362,17 +363,17 @@ class SlopePipeline:
 
 
 def kernel_frames(array: NDArray[Any]) -> NDArray[Any]:
-    """Return frames as kernels read them: (n, h, w), contiguous, uint16 or float32."""
+    """Return frames in the form that kernels read: (n, h, w), contiguous, uint16 or float32."""
     if array.dtype in _KERNEL_TYPES and array.flags.c_contiguous and array.dtype.isnative:
         return array if array.ndim == 3 else array[None]
     dtype = np.uint16 if array.dtype == np.uint8 else np.float32
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
+    with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
         frames = np.ascontiguousarray(array, dtype=dtype)
     return frames.reshape(-1, *array.shape[-2:])
 
 
 def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -> NDArray[np.float64]:
-    """Reference positions as (n, 2)."""
+    """Return the reference positions as (n, 2)."""
     n, side = len(layout), max(layout.frame_shape)
     if reference is None:
         return np.zeros((n, 2))
@@ -386,14 +387,14 @@ def _reference_positions(reference: ArrayLike | Slopes | None, layout: Layout) -
 
 
 def _camera_type(frame: ArrayLike) -> np.dtype[Any]:
-    """Return the type of a frame's pixels as they were given: integers with a mask become floats later."""
+    """Return the type of the frame's pixels as given: masked integers become floats later."""
     return frame.dtype if isinstance(frame, np.ndarray) else np.asarray(frame).dtype
 
 
 def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> NDArray[np.float32]:
-    """Predicted slopes as the kernel reads them: (1 or n_frames, 2, n).
+    """Return the predicted slopes as the kernel reads them: (1 or n_frames, 2, n).
 
-    What no frame can hold, as of a loop that has diverged, counts as not predicted.
+    Values larger than the frame, as of a diverged loop, are treated as not predicted.
     """
     n = len(layout)
     array = real_array("prior", prior.vector if isinstance(prior, Slopes) else prior)
@@ -409,7 +410,7 @@ def _prior_slopes(prior: ArrayLike | Slopes, n_frames: int, layout: Layout) -> N
 
 
 def _identity(psf: PSF | None, score: Score | None, zero: NDArray[np.float64]) -> bytes:
-    """A digest of what slopes depend on beside layout, settings and calibration."""
+    """Return a digest of the inputs of slopes other than layout, settings and calibration."""
     digest = hashlib.sha256(zero.tobytes())
     for part in (psf, score):
         for field in fields(part) if part is not None else ():

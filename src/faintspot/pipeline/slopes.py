@@ -1,4 +1,4 @@
-"""What a pipeline gives: slopes, and the images after every step."""
+"""Results of a pipeline: slopes, and the images after every step."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ class Slopes:
     """
 
     x: NDArray[np.float32]
-    """Position of the spot along columns, px from the reference; 0 where invalid."""
+    """Position of the spot along columns, px from the reference position; 0 where invalid."""
     y: NDArray[np.float32]
-    """Position along rows."""
+    """Position of the spot along rows, likewise."""
     flux: NDArray[np.float32]
-    """Electrons left after the background subtraction."""
+    """Flux after the background subtraction [electrons]."""
     flags: NDArray[np.uint8]
     """Bits of `SubapertureFlag`."""
     iterations: NDArray[np.int32]
-    """Iterations that the denoising took."""
+    """Number of denoising iterations."""
     bad_pixels: NDArray[np.int32]
     """Number of pixels that were masked, NaN or infinite."""
     standard_error_x: NDArray[np.float32]
-    """Standard error of x, px; infinite where invalid, and where the read noise is not known."""
+    """Standard error of x [px]; infinite where invalid, and where the read noise is unknown."""
     standard_error_y: NDArray[np.float32]
 
     @property
@@ -64,21 +64,21 @@ class Slopes:
 
     @property
     def vector(self) -> NDArray[np.float32]:
-        """All x, then all y, along the last axis: what a reconstructor multiplies."""
+        """All x, then all y, along the last axis: the input vector of a reconstructor."""
         return np.concatenate([self.x, self.y], axis=-1)
 
     @classmethod
     def from_variables(cls, variables: Mapping[str, NDArray[Any]], n_frames: int | None = None) -> Slopes:
-        """Return the slopes of a file's variables, all frames or the first `n_frames`."""
+        """Return the slopes from a file's variables, all frames or the first `n_frames`."""
         return cls(**{item.name: variables[item.name][:n_frames] for item in fields(cls)})
 
     @property
     def variables(self) -> dict[str, NDArray[Any]]:
-        """The quantities that files of slopes hold, by name."""
+        """Variables stored in files of slopes, by name."""
         return {name: getattr(self, name) for name in VARIABLES}
 
     def _in_words(self) -> dict[str, str]:
-        """Return the numbers of frames and sub-apertures, the valid fraction, rms and flux, by name."""
+        """Return numbers of frames and sub-apertures, valid fraction, rms and flux as text, by name."""
         valid = self.valid
         found = {
             "frames": f"{1 if self.x.ndim == 1 else len(self.x)}",
@@ -98,31 +98,30 @@ class Slopes:
         return table("Slopes", self._in_words())
 
     def to_xarray(self, layout: Layout | None = None, *, unit: str = "px") -> xarray.Dataset:
-        """Return an xarray.Dataset with dimensions frame and subaperture, units as attributes.
+        """Return an xarray.Dataset with dimensions frame and subaperture, and units as attributes.
 
         Parameters
         ----------
         layout : Layout, optional
-            Of these sub-apertures: for centre_x, centre_y (px), row and column as coordinates.
+            Layout of the sub-apertures, which adds centre_x, centre_y (px), row and column as coordinates.
         unit : {"px", "arcsec"}
-            Of positions and their standard errors; arcsec needs a layout with `pixel_scale_arcsec`.
+            Unit of positions and standard errors; arcsec needs a layout with `pixel_scale_arcsec`.
 
         Raises
         ------
         InputError
-            When the layout has another number of sub-apertures, or no scale that is needed.
+            If the layout has another number of sub-apertures, or lacks the required pixel scale.
         MissingExtraError
-            When xarray is not installed.
+            If xarray is not installed.
         """
         from faintspot.pipeline.labelled import dataset_of
 
         return dataset_of(self.variables, layout, unit)
 
     def to_pandas(self, layout: Layout | None = None, *, unit: str = "px") -> pandas.DataFrame:
-        """Return a pandas.DataFrame with a row for each frame and sub-aperture, its index.
+        """Return a pandas.DataFrame with one row for each frame and sub-aperture, which form the index.
 
-        Columns have the names of .csv files, as x_px; `layout` and `unit` are those of `to_xarray`, and so
-        are the errors.
+        Columns are named as in .csv files, such as x_px. Parameters and errors are those of `to_xarray`.
         """
         from faintspot.pipeline.labelled import table_of_slopes
 
@@ -131,7 +130,7 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Stages:
-    """The sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes.
+    """Sub-aperture images after every step, (..., n_subapertures, ny, nx), and the slopes.
 
     Examples
     --------
@@ -146,9 +145,9 @@ class Stages:
     """
 
     raw: NDArray[Any]
-    """As in the frame, ADU."""
+    """Raw pixels [ADU]."""
     calibrated: NDArray[np.float32]
-    """Electrons, bad pixels filled."""
+    """Calibrated images [electrons], bad pixels filled in."""
     denoised: NDArray[np.float32]
     background_subtracted: NDArray[np.float32]
     slopes: Slopes

@@ -56,7 +56,7 @@ def find_layout(frame: ArrayLike, **options: Any) -> FoundLayout:
     Raises
     ------
     InputError
-        When no regular array of spots is found, or no window lies within the frame.
+        If no regular array of spots is found, or no window lies within the frame.
     """
     found = find_windows(frame, **options)
     grid, within = found.lenslets, found.within

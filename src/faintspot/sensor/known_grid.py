@@ -75,7 +75,7 @@ def find_illuminated(
     Raises
     ------
     InputError
-        When the grid does not fit into the frame, or no cell is illuminated.
+        If the grid does not fit into the frame, or no cell is illuminated.
     """
     grid = _whole_grid(frame.shape, shape, pixels, roi)
     images = grid.images(frame)

@@ -157,7 +157,7 @@ class Layout:
         Raises
         ------
         InputError
-            When the mask is not of this length, a number is out of range or twice there, or none is left.
+            If the mask is not of this length, a number is out of range or twice there, or none is left.
         """
         index = _index(chosen, len(self))
         return replace(
@@ -213,7 +213,7 @@ class Layout:
         Raises
         ------
         InputError
-            When nothing is lit, or as for `Layout`.
+            If nothing is lit, or as for `Layout`.
         """
         check_keys("", optics, OPTICS, what="argument")
         n_rows, n_columns = pair_of_numbers("shape", shape, 1, _LARGEST_PX)
@@ -296,7 +296,7 @@ class Layout:
         Raises
         ------
         InputError
-            When no regular array of spots is found.
+            If no regular array of spots is found.
         """
         from faintspot.sensor.windows import find_windows
 

@@ -135,7 +135,7 @@ def find_lenslets(
     Raises
     ------
     InputError
-        When the arguments are wrong, or when no lattice of at least four lit lenslets in two rows and two
+        If the arguments are wrong, or when no lattice of at least four lit lenslets in two rows and two
         columns stands out of the noise.
 
     Notes

@@ -37,7 +37,7 @@ def pupil_of(layout: Layout) -> Pupil:
     Raises
     ------
     InputError
-        When these two make a disk in which not all centres of sub-apertures lie.
+        If these two make a disk in which not all centres of sub-apertures lie.
     """
     pitch = lenslet_pitch(layout)
     angle = np.deg2rad(layout.angle_deg)

@@ -64,7 +64,7 @@ def find_windows(
     Raises
     ------
     InputError
-        When no regular array of spots is found, or no window lies within the frame.
+        If no regular array of spots is found, or no window lies within the frame.
     """
     array = _finite_or_masked("frame", frame)
     window = None if pixels is None else window_size("pixels", pixels)

@@ -74,7 +74,7 @@ def subapertures(
     Raises
     ------
     InputError
-        When a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of its range or of the wrong shape.
 
     Examples
     --------
@@ -177,7 +177,7 @@ def sensor_frames(
     Raises
     ------
     InputError
-        When a value is not finite, out of its range or of the wrong shape, or a window leaves the frame.
+        If a value is not finite, out of its range or of the wrong shape, or a window leaves the frame.
 
     Examples
     --------

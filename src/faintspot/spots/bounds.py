@@ -119,7 +119,7 @@ def cramer_rao(
     Raises
     ------
     InputError
-        When a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of its range or of the wrong shape.
 
     Examples
     --------

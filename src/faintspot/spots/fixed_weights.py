@@ -111,7 +111,7 @@ class FixedWeights:
         Raises
         ------
         InputError
-            When they are for another number.
+            If they are for another number.
         """
         if self.index is None:
             return np.zeros(n_subapertures, np.int64)
@@ -129,7 +129,7 @@ class FixedWeights:
         Raises
         ------
         InputError
-            When x and y do not follow from one map of weights: those of a Gaussian window do.
+            If x and y do not follow from one map of weights: those of a Gaussian window do.
         """
         rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in self.window)
         counted = (self.x != 0) | (self.y != 0) | (self.flux != 0)
@@ -232,7 +232,7 @@ class FixedWeights:
         Raises
         ------
         InputError
-            When the file cannot be written.
+            If the file cannot be written.
         """
         save_fields(path, self, _FIELDS)
 
@@ -243,7 +243,7 @@ class FixedWeights:
         Raises
         ------
         InputError
-            When the file cannot be read or holds something else.
+            If the file cannot be read or holds something else.
         """
         return load_fields(cls, path, "fixed weights", _FIELDS, optional=("flux", "index"))
 

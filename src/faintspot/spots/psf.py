@@ -236,7 +236,7 @@ class PSF:
         Raises
         ------
         InputError
-            When it is negative or NaN.
+            If it is negative or NaN.
         """
         std = number_between("std_px", std_px, 0.0, 100.0) * self.oversampling
         from scipy.ndimage import gaussian_filter
@@ -250,7 +250,7 @@ class PSF:
         Raises
         ------
         InputError
-            When the index is for another number of sub-apertures.
+            If the index is for another number of sub-apertures.
         """
         if self.index is None:
             return np.zeros(n_subapertures, np.int64)
@@ -283,7 +283,7 @@ class PSF:
         Raises
         ------
         InputError
-            When it cannot be written.
+            If it cannot be written.
         """
         save_fields(path, self, _FIELDS)
 
@@ -294,7 +294,7 @@ class PSF:
         Raises
         ------
         InputError
-            When it cannot be read or is no PSF.
+            If it cannot be read or is no PSF.
         """
         return load_fields(cls, path, "a PSF", _FIELDS, optional=("index",))
 

@@ -147,7 +147,7 @@ class TrainedScore:
         Raises
         ------
         InputError
-            When the flux is not a positive number.
+            If the flux is not a positive number.
         """
         flux = np.log(number_between("flux_e", flux_e, 0.0, low_open=True))
         kinds = self.standard_error_px if self.index is None else self.standard_error_px[self.index]
@@ -235,7 +235,7 @@ class TrainedScore:
         Raises
         ------
         InputError
-            When the file cannot be written.
+            If the file cannot be written.
         """
         save_fields(path, self, _FIELDS)
 
@@ -246,7 +246,7 @@ class TrainedScore:
         Raises
         ------
         InputError
-            When the file cannot be read or holds something else.
+            If the file cannot be read or holds something else.
         """
         return load_fields(cls._stored, path, "a trained score", _FIELDS, optional=("index",))
 
@@ -265,7 +265,7 @@ def load_score(path: str | Path) -> Score:
     Raises
     ------
     InputError
-        When the file cannot be read or holds something else.
+        If the file cannot be read or holds something else.
     """
     try:
         return FixedWeights.load(path)

@@ -128,7 +128,7 @@ def spots(
     Raises
     ------
     InputError
-        When a value is not finite or out of its range, or an array has another shape.
+        If a value is not finite or out of its range, or an array has another shape.
 
     Examples
     --------

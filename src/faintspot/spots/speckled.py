@@ -97,7 +97,7 @@ def speckled_spots(
     Raises
     ------
     InputError
-        When a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of its range or of the wrong shape.
 
     Examples
     --------

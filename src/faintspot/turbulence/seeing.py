@@ -156,7 +156,7 @@ def estimate_r0(
     Raises
     ------
     InputError
-        When shapes do not fit together, or there are fewer than 20 frames.
+        If shapes do not fit together, or there are fewer than 20 frames.
     """
     slopes, places = _checked(slopes_px, cells)
     part = np.zeros(len(slopes), np.int64) if segment is None else np.asarray(segment)
