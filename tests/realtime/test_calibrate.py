@@ -89,7 +89,7 @@ def test_what_is_refused(files: tuple[Path, Control], tmp_path: Path) -> None:
     path = tmp_path / "faintspot.toml"
     path.write_text((files[0]).read_text().split("[control]")[0])
     with running(files) as sky:
-        assert "--commands: expected the number" in str(calibrated(path, sky).exception)
+        assert "--actuators" in str(calibrated(path, sky).exception)
         kept = calibrated(path, sky, "--keep-reference", "--actuators", "5")
         assert "--keep-reference: expected reference_slopes in [control]" in str(kept.exception)
         stream = pyshmem.create(f"{sky.name}_commands", shape=(COMMANDS,), dtype=np.float32)
@@ -100,7 +100,7 @@ def test_what_is_refused(files: tuple[Path, Control], tmp_path: Path) -> None:
         deaf = calibrated(path, sky, "--actuators", "3", "--rounds", "6")
         assert "the mirror does not answer: pokes of 50" in str(deaf.exception)
         assert "[control]" not in path.read_text()
-        large = ("--amplitude", "60", "--commands", "3")
+        large = ("--amplitude", "60", "--actuators", "3")
         save_control(files[0], largest_command=50.0)
         assert "--amplitude 60: expected at most largest_command, 50" in str(
             calibrated(files[0], sky, *large).exception

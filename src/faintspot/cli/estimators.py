@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import click
 
-from faintspot.cli.commands import option
-from faintspot.estimators.documentation import all_tables, allowed_in_words, needs_in_words
+from faintspot.estimators.documentation import allowed_in_words, needs_in_words
 from faintspot.estimators.registry import estimator_named, estimators
 
 
 @click.command(short_help="List the estimators, or the options of one.")
 @click.argument("name", required=False)
-@option("--markdown", is_flag=True, help="Print the tables of the documentation.")
-def command(name: str | None, markdown: bool) -> None:
-    """List the estimators, those of installed packages too; or the options of the one that is named.
+def command(name: str | None) -> None:
+    """List all estimators, those of installed packages included, or the options of the named one.
 
     \b
     Examples:
@@ -25,10 +23,6 @@ def command(name: str | None, markdown: bool) -> None:
 
     from faintspot.pipeline.settings import SharedOptions
 
-    if markdown:
-        for title, text in all_tables(SharedOptions).items():
-            click.echo(f"{title}\n\n{text}\n")
-        return
     table = Table(box=None, pad_edge=False)
     if name is None:
         for heading in ("name", "what it does", "needs"):

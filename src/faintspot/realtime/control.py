@@ -65,7 +65,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         When no engine listens there, when it says no, and when it does not answer in time.
     """
     kind, name = server_of(Path(path))
-    starts = "run" if kind == ENGINE else kind
+    starts = "run" if kind == ENGINE else f"{kind} run"
     try:
         line = _encoded({"command": command, **fields})
     except (TypeError, ValueError) as error:
