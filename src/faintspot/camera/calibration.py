@@ -26,9 +26,9 @@ from faintspot.config.tables import (
 )
 from faintspot.io.frames import open_frames, read_array
 
-_BLOCK_PIXELS = 1 << 22  # in memory at a time
+_BLOCK_PIXELS = 1 << 22  # processed at a time
 _MAPS = ("dark", "flat", "bad_pixels")
-# What the kernels square in float32, with a wide margin; no camera comes near.
+# Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
 _GAINS = 1e-9, 1e9
 _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
 
@@ -40,15 +40,15 @@ def _largest(dtype: np.dtype[Any]) -> float:
 
 @dataclass(frozen=True)
 class Calibration:
-    """From raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.
+    """Conversion of raw frames to electrons: (raw - dark) * gain_e_per_adu / (em_gain * flat); immutable.
 
     Parameters
     ----------
     dark : float or (h, w) array, optional, ADU
-        What a frame without flux holds: bias and dark current. NaN marks a bad pixel. Default: not known,
-        counted as 0; 0 says that there is none.
+        Frame without flux: bias and dark current. NaN marks a bad pixel. Default: unknown, and treated as
+        0. A value of 0 states that there is none.
     rough_dark : bool
-        Whether `dark` is only near the truth, such as the background of frames with light in them.
+        Whether `dark` is only approximate, such as the background of frames with light in them.
     flat : (h, w) array, optional
         Relative response of each pixel, 1 on average. NaN, zero or negative marks a bad pixel.
     gain_e_per_adu : float
@@ -56,22 +56,22 @@ class Calibration:
     em_gain : float
         Multiplication gain of an EMCCD; 1 for other cameras.
     bad_pixels : (h, w) array of bool, or (n, 2) array of row and column, optional
-        Pixels not to use; they are filled from their neighbours within the sub-aperture.
+        Pixels to ignore; they are filled in from their neighbours within the sub-aperture.
     saturation_adu : float, optional
-        Raw value from which a pixel counts as saturated. Default: the largest value of the frames' integer
-        dtype; none for floating-point frames.
+        Raw value at which a pixel is saturated. Default: the largest value of the integer dtype of the
+        frames; none for floating-point frames.
     read_noise_e : float, optional
-        Standard deviation of the read noise in electrons at the camera's output, after multiplication: in
-        photo-electrons it is read_noise_e / em_gain. Needed for standard errors and for the estimators "ml"
+        Standard deviation of the read noise in electrons at the camera's output, after multiplication; in
+        photo-electrons it is read_noise_e / em_gain. Required for standard errors and for the estimators "ml"
         and "map".
     background_e : float
-        Mean photo-electrons per pixel and frame of sky and dark current: `dark` takes off their mean, but
-        their noise stays.
+        Mean background of sky and dark current per pixel and frame [photo-electrons], whose mean is
+        subtracted with `dark` and whose noise remains.
 
     Raises
     ------
     InputError
-        For a value out of range, or arrays of different shapes.
+        If a value is out of range, or arrays have different shapes.
 
     Examples
     --------
@@ -137,12 +137,12 @@ class Calibration:
 
     @property
     def vouches_for_dark(self) -> bool:
-        """Whether the level of a frame without flux is known; else estimators may fit it."""
+        """Whether the dark level is known accurately; otherwise estimators may fit it."""
         return self.dark is not None and not self.rough_dark
 
     @property
     def read_noise_photoelectrons(self) -> float | None:
-        """Read noise divided by the multiplication gain; None where it is not known."""
+        """Read noise divided by the multiplication gain; None if unknown."""
         return None if self.read_noise_e is None else self.read_noise_e / self.em_gain
 
     @classmethod
@@ -152,7 +152,7 @@ class Calibration:
 
     @classmethod
     def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Calibration:
-        """Make a calibration from the tables of a configuration file; the default where it has none."""
+        """Return the calibration in the tables of a configuration file, or the default if there is none."""
         values = document.get("calibration", {})
         with errors_of_table(path, "calibration"):
             check_fields("calibration", cls, values)
@@ -169,12 +169,12 @@ class Calibration:
         save_tables(path, {"calibration": {**values, **{key: f"{store.name}:{key}" for key in maps}}})
 
     def to_table(self) -> dict[str, Any]:
-        """Return the table of a configuration file, with maps given by their shape only."""
+        """Return the table of a configuration file, in which maps are represented by their shapes."""
         values = chosen_fields(self)
         return {key: f"map of {value.shape}" if is_map(value) else value for key, value in values.items()}
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """The maps of the size of a frame."""
+        """Maps with the size of a frame."""
         arrays = {"dark": self.dark, "flat": self.flat, "bad_pixels": self.bad_pixels}
         return {
             name: value
@@ -183,7 +183,7 @@ class Calibration:
         }
 
     def maps(self, frame_shape: tuple[int, int]) -> NDArray[np.float32]:
-        """Return dark (ADU) and electrons per ADU of every pixel, NaN in bad ones: (2, h, w) float32.
+        """Return dark [ADU] and electrons per ADU of each pixel, NaN in bad ones: (2, h, w) float32.
 
         Raises
         ------
@@ -196,7 +196,7 @@ class Calibration:
                     f"calibration.{name}: expected the frame's shape {frame_shape}, got {array.shape}"
                 )
         maps = np.empty((2, *frame_shape), np.float32)
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a bad pixel
+        with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
             maps[0] = 0.0 if self.dark is None else self.dark
             gain = np.full(frame_shape, self.gain_e_per_adu / self.em_gain)
             if self.flat is not None:
@@ -208,10 +208,10 @@ class Calibration:
         return maps
 
     def saturation(self, dtype: np.dtype[Any]) -> float:
-        """Return the raw value from which a pixel of frames of this dtype is saturated (NaN: none)."""
+        """Return the raw value at which pixels of this dtype are saturated (NaN: none)."""
         if self.saturation_adu is not None:
             return self.saturation_adu
-        # Not infinity: an infinite pixel would reach it.
+        # Not infinity, which an infinite pixel would reach.
         return _largest(dtype) if dtype.kind in "iu" else math.nan
 
     def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -227,7 +227,7 @@ class Calibration:
 
 
 def _map(name: str, value: Any) -> NDArray[np.float64]:
-    """An image in which NaN is allowed; a private, read-only copy."""
+    """Return a private, read-only copy of a map, which may contain NaN."""
     array = real_array(name, value).astype(np.float64)
     if array.ndim != 2:
         raise InputError(f"{name}: expected shape (h, w), got {array.shape}")
@@ -242,7 +242,7 @@ def _scalar_or_map(name: str, value: Any) -> Any:
 
 
 def _mask_or_list(value: Any) -> NDArray[Any]:
-    """A mask of bool, or rows and columns as (n, 2) int64."""
+    """Return a boolean mask, or rows and columns as (n, 2) int64."""
     try:
         array = np.array(value)
     except ValueError:
@@ -266,7 +266,7 @@ def _mask_or_list(value: Any) -> NDArray[Any]:
 def read_map(key: str, location: str | Path) -> NDArray[Any]:
     """Read `dark` or `flat` (the mean of several frames), or `bad_pixels`.
 
-    Bad pixels are a map in which every value but 0 is bad, or rows of (row, column).
+    Bad pixels are a map of nonzero values, or rows of (row, column).
 
     Raises
     ------
@@ -286,5 +286,5 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
 
 
 def _map_or_value(path: Path, key: str, value: Any) -> Any:
-    """A map named by its file, relative to the configuration."""
+    """Read the map named in a configuration file, relative to that file."""
     return read_map(key, str(path.parent / value)) if key in _MAPS and isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""A camera's detector: from the mean flux on each pixel to what is read out."""
+"""Model of a camera's detector, from the mean flux on each pixel to the digitised image."""
 
 from __future__ import annotations
 
@@ -14,29 +14,28 @@ from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
 
 LARGEST_MEAN_E = 1e12
-"""The largest mean number of electrons per pixel accepted (far beyond any full well)."""
+"""Largest mean number of electrons per pixel accepted (far above any full well)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detector:
     """A CCD, CMOS or electron-multiplying CCD with its noise.
 
-    In the order of the flux: photo-electrons of the star, background and dark current (each Poisson),
-    full well, multiplication register, read noise (Gaussian), conversion to ADU, quantisation.
+    The effects are applied in this order: photo-electrons of the star, background and dark current (each
+    Poisson), full well, multiplication register, read noise (Gaussian), conversion to ADU, quantisation.
 
-    The convention for ADU is ``adu = offset_adu + electrons_out / gain_e_per_adu``, where electrons_out is
-    what leaves the multiplication register plus the read noise. Photo-electrons are got back by
-    ``(adu - offset_adu) * gain_e_per_adu / em_gain``, which is what `to_electrons` does. With the default
-    offset and gain, and no multiplication, ADU are electrons.
+    ADU are defined by ``adu = offset_adu + electrons_out / gain_e_per_adu``, where electrons_out is the
+    output of the multiplication register plus the read noise. `to_electrons` converts back to
+    photo-electrons, ``(adu - offset_adu) * gain_e_per_adu / em_gain``. With the default offset and gain,
+    and no multiplication, ADU are electrons.
 
-    Each source of noise draws from a generator of its own, so that changing one leaves the draws of the
-    others as they were.
+    Each source of noise has its own generator, so that changing one does not change the draws of the others.
 
     Parameters
     ----------
     read_noise_e : float or array_like, shape (ny, nx)
-        Standard deviation of the read noise in electrons at the output, that is after multiplication:
-        in photo-electrons it is read_noise_e / em_gain. Any number from 0; never rounded.
+        Standard deviation of the read noise in electrons at the output, after multiplication; in
+        photo-electrons it is read_noise_e / em_gain. Any number >= 0; not rounded.
     dark_e : float or array_like, shape (ny, nx)
         Mean electrons per pixel and frame from dark current and clock-induced charge.
     background_e : float or array_like, shape (ny, nx)
@@ -46,22 +45,22 @@ class Detector:
         output is Gamma distributed with shape n and scale em_gain (Basden, Haniff & Mackay 2003, MNRAS
         345, 985), the limit for a gain much above 1.
     gain_e_per_adu : float
-        Electrons (after multiplication) for one ADU.
+        Electrons (after multiplication) per ADU.
     offset_adu : float
-        Level added to every pixel. With `bits`, values below 0 ADU are cut off: give an offset of
-        several times the read noise.
+        Level added to every pixel. With `bits`, values below 0 ADU are clipped: use an offset of several
+        times the read noise.
     bits : int or None
         Bits of the analogue-to-digital converter, 1 to 32: values are rounded to whole ADU and saturate at
         0 and at 2**bits - 1. None leaves them continuous.
     full_well_e : float or None
-        Largest number of electrons that a pixel holds before multiplication.
+        Maximum number of electrons in a pixel before multiplication.
     hot_pixels : sequence of (row, column, electrons)
-        Pixels with that many mean dark electrons per frame on top of `dark_e`.
+        Pixels with additional dark electrons per frame (mean), on top of `dark_e`.
 
     Raises
     ------
     InputError
-        If a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of range or of the wrong shape.
 
     Examples
     --------
@@ -102,34 +101,34 @@ class Detector:
 
     @property
     def excess_noise_factor(self) -> float:
-        """Factor by which the multiplication register raises the variance of the electrons: 2, or 1 without.
+        """Factor of the multiplication register on the variance of the electrons: 2, or 1 without one.
 
-        It is the F^2 of Robbins & Hadwen (2003, IEEE Trans. Electron Devices 50, 1227) in the limit of a
-        large gain, which is exact for this register's Gamma distribution.
+        It is F^2 of Robbins & Hadwen (2003, IEEE Trans. Electron Devices 50, 1227) in the limit of large
+        gain, which is exact for the Gamma distribution of this register.
         """
         return 2.0 if self.em_gain > 1 else 1.0
 
     def expose(
         self, mean_e: ArrayLike, rng: np.random.Generator | None = None
     ) -> NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]:
-        """Return one read-out of the detector for each image of mean photo-electrons.
+        """Return one simulated read-out for each image of mean photo-electrons.
 
         Parameters
         ----------
         mean_e : array_like, shape (..., ny, nx)
             Mean photo-electrons per pixel from the star, 0 to 1e12. Zeros give dark frames (with sky).
         rng : numpy.random.Generator, optional
-            Where the noise comes from.
+            Generator of the noise.
 
         Returns
         -------
         ndarray, shape (..., ny, nx)
-            ADU: float32, or with `bits` uint16 (up to 16 bits) or uint32.
+            Read-out [ADU]: float32, or with `bits` uint16 (up to 16 bits) or uint32.
 
         Raises
         ------
         InputError
-            If `mean_e` is negative or not finite, or its images do not have the shape of the detector's
+            If `mean_e` is negative or not finite, or its images do not match the shape of the detector's
             maps or do not contain its hot pixels.
         """
         mean = self._checked_mean(mean_e)
@@ -149,33 +148,33 @@ class Detector:
     def to_electrons(self, adu: ArrayLike) -> NDArray[np.float32] | NDArray[np.float64]:
         """Return the photo-electrons of a read-out: (adu - offset_adu) * gain_e_per_adu / em_gain.
 
-        Background and dark current are still in them.
+        Background and dark current are not subtracted.
 
         Parameters
         ----------
         adu : array_like
-            What `expose` returned, any shape.
+            Read-out of `expose`, any shape.
 
         Returns
         -------
         ndarray, same shape
-            Photo-electrons; float64 when `adu` is, else float32.
+            Photo-electrons; float64 if `adu` is, otherwise float32.
 
         Raises
         ------
         InputError
-            If `adu` holds anything but finite numbers.
+            If `adu` is not finite.
         """
         values = finite_array("adu", adu)
         electrons = (values.astype(np.float64) - self.offset_adu) * (self.gain_e_per_adu / self.em_gain)
         return electrons if values.dtype == np.float64 else electrons.astype(np.float32)
 
     def variance(self, mean_e: ArrayLike) -> NDArray[np.float64]:
-        """Return the variance, in photo-electrons squared, of a read-out turned into photo-electrons.
+        """Return the variance [photo-electrons^2] of a read-out converted to photo-electrons.
 
-        excess_noise_factor * (mean_e + dark + background) + (read_noise_e / em_gain)^2, and with `bits`
-        one twelfth of an ADU squared. Saturation and full well are left out, and the twelfth holds once
-        the noise is at least half an ADU.
+        It is excess_noise_factor * (mean_e + dark + background) + (read_noise_e / em_gain)^2, and with
+        `bits` one twelfth of an ADU squared. Saturation and full well are ignored, and the last term is
+        valid if the noise is at least half an ADU.
 
         Parameters
         ----------
@@ -189,7 +188,7 @@ class Detector:
         Raises
         ------
         InputError
-            As `expose` does.
+            As for `expose`.
         """
         mean = self._checked_mean(mean_e)
         collected = mean + self._dark_map(mean.shape) + self.background_e
@@ -200,7 +199,7 @@ class Detector:
         return variance
 
     def _checked_mean(self, mean_e: ArrayLike) -> NDArray[np.float64]:
-        """Return the mean images as float64; refuse what does not fit the detector."""
+        """Return the mean images as float64; raise an error if they do not fit the detector."""
         mean: NDArray[np.float64] = numbers_between("mean_e", mean_e, 0, LARGEST_MEAN_E)
         if mean.ndim < 2:
             raise InputError(f"mean_e: expected shape (..., rows, columns), got {mean.shape}")
@@ -216,7 +215,7 @@ class Detector:
         return mean
 
     def _dark_map(self, shape: tuple[int, ...]) -> float | NDArray[np.float64]:
-        """Return the mean dark electrons, hot pixels included, for images (..., ny, nx) of that shape."""
+        """Return the mean dark electrons, including hot pixels, for images of shape (..., ny, nx)."""
         if not self.hot_pixels:
             return self.dark_e
         dark = np.broadcast_to(self.dark_e, shape[-2:]).copy()
@@ -227,7 +226,7 @@ class Detector:
     def _digitise(
         self, electrons_out: NDArray[np.float64]
     ) -> NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]:
-        """Convert electrons at the output to ADU; round and saturate them when the converter has bits."""
+        """Convert electrons at the output to ADU; round and saturate them if `bits` is set."""
         adu = self.offset_adu + electrons_out / self.gain_e_per_adu
         if self.bits is None:
             return adu.astype(np.float32)
@@ -236,7 +235,7 @@ class Detector:
 
 
 def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
-    """Return a level of at least 0: a number, or a read-only map of shape (ny, nx)."""
+    """Return a level >= 0: a number, or a read-only map of shape (ny, nx)."""
     level: NDArray[np.float64] = numbers_between(name, value, 0, LARGEST_MEAN_E)
     if level.ndim == 0:
         return float(level)

@@ -1,4 +1,4 @@
-"""Hot pixels: single pixels and pairs that stand out from their surroundings as no spot does."""
+"""Detection of hot pixels: single pixels and pairs that are sharper than any spot."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from faintspot.base.checks import number_between, real_array
 from faintspot.base.errors import InputError
 
 _MAD_TO_STD = 1.4826
-_SHARPNESS = 4.0  # excess over the spread of the neighbours; a Nyquist-sampled spot's peak has 3 at most
+_SHARPNESS = 4.0  # excess over the spread of the neighbours; at most 3 for a Nyquist-sampled spot
 
 
 def find_hot_pixels(frame: ArrayLike, *, threshold: float = 8.0) -> NDArray[np.int64]:
     """Find isolated bright pixels, and pairs of them, in a frame.
 
-    A pixel is hot when it exceeds the median of its 8 neighbours by more than `threshold` standard deviations
-    of the frame's noise and by more than 4 times the spread (second largest minus smallest) of these
-    neighbours. The largest may be hot too. The peaks of spots that are sampled at the Nyquist rate or better
-    stay below that; those of sharper spots do not.
+    A pixel is hot when it exceeds the median of its 8 neighbours by more than `threshold` standard
+    deviations of the noise of the frame and by more than 4 times their spread (second largest minus
+    smallest). The largest neighbour may be hot, too. Peaks of spots sampled at the Nyquist rate or better
+    stay below this limit; those of sharper spots do not.
 
     Parameters
     ----------
     frame : (h, w) array
-        NaN marks pixels that are known to be bad; they are not reported.
+        Image of the spots. NaN marks pixels known to be bad; they are not reported.
     threshold : float
 
     Returns
     -------
     (n, 2) array of int
-        Row and column of each, as `faintspot.Calibration` takes them.
+        Row and column of each, as required by `faintspot.Calibration`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Read noise and gain of a camera, from dark frames and from frames of a steady light."""
+"""Read noise and gain of a camera, from dark frames and from frames with constant flux."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from faintspot.sensor.layout import Layout
 Floats = NDArray[np.float64]
 
 _BY_DARKS = "read noise and dark level: dark frames, median pixel"
-_TILE = 16  # side of the parts of a frame that are taken to move as one, px
+_TILE = 16  # side of the parts of a frame that are assumed to move together, px
 _GROUPS = 16  # of pixels, for standard errors
 _ITERATIONS = 20
-_LARGEST_EXCESS = 10.0  # times the expected variance: pixels above that are left out as flickering
-_LARGEST_SCATTER = 3.0  # of the bright pixels' variances about the line, times the expected mean square
-_LARGEST_SECOND_ORDER = 0.15  # share by which second derivatives may change the slope
+_LARGEST_EXCESS = 10.0  # times the expected variance: pixels above it are ignored as flickering
+_LARGEST_SCATTER = 3.0  # mean square of bright pixels' variances about the line, over the expected one
+_LARGEST_SECOND_ORDER = 0.15  # largest relative change of the slope by second derivatives
 _LARGEST_CURVATURE = 0.25  # relative difference of the gains from faint and bright pixels
-_DARKEST_FOR_NOISE = 0.05  # share of pixels whose noise stands for the read noise, likewise
-_DARKEST = 0.01  # share of pixels whose level stands for the dark level where nothing better is known
+_DARKEST_FOR_NOISE = 0.05  # fraction of pixels whose noise is used as read noise, without dark frames
+_DARKEST = 0.01  # fraction of pixels whose level is used as dark level if it is unknown
 
 
 @dataclass(frozen=True)
 class DetectorMeasurement:
-    """What `measure_detector` found; None where it was not possible. Each error is one standard error.
+    """Result of `measure_detector`; None for values that could not be measured. Errors are standard errors.
 
     Parameters
     ----------
     read_noise_adu, read_noise_adu_error : float
         Standard deviation of a typical pixel in the dark.
     gain_e_per_adu, gain_e_per_adu_error : float or None
-        Electrons (after multiplication) for one ADU.
+        Electrons (after multiplication) per ADU.
     dark_level_adu, dark_level_adu_error : float
         Level of a typical pixel in the dark.
     read_noise_e, read_noise_e_error : float or None
-        Read noise in electrons at the camera's output, as `faintspot.simulate.Detector` counts it.
+        Read noise in electrons at the camera's output, as in `faintspot.simulate.Detector`.
     faint_gain_e_per_adu, bright_gain_e_per_adu : float or None
-        Gain from the pixels with the fainter and the brighter half of the flux alone.
+        Gain from the pixels with the fainter and the brighter half of the flux separately.
     reliable : bool
-        False when the gain should not be believed: the variance is no straight line in the mean, does not
-        rise with the flux, or the flux moves too much. The last of `notes` says which.
+        False if the gain is not reliable: the variance is not linear in the mean, does not increase with the
+        flux, or the flux moves too much. The last of `notes` gives the reason.
     notes : tuple of str
-        How each value was found, and what is wrong with it.
+        Method used for each value, and problems found.
     """
 
     read_noise_adu: float
@@ -68,7 +68,7 @@ class DetectorMeasurement:
 
 
 class _Dark(NamedTuple):
-    """Level in the dark: of each pixel or of all, and of a typical one."""
+    """Dark level of each pixel or of all, and of a typical pixel."""
 
     level: Any
     typical: float
@@ -76,20 +76,20 @@ class _Dark(NamedTuple):
 
 
 class _Value(NamedTuple):
-    """A value and its standard error."""
+    """Value and standard error."""
 
     value: float
     error: float
 
 
 class _Curve(NamedTuple):
-    """One photon-transfer point a pixel: variance = intercept * share + slope * flux, expected."""
+    """Photon-transfer curve, one point per pixel: expected variance = intercept * share + slope * flux."""
 
     variance: Floats
-    share: Floats  # of its own variance that is left once common changes are taken out
+    share: Floats  # fraction of its own variance left after common changes are removed
     flux: Floats  # mean above the dark level, weighted likewise
     mean: Floats  # plain mean above the dark level
-    degrees: float  # of freedom of each variance
+    degrees: float  # degrees of freedom of each variance
 
 
 class _Line(NamedTuple):
@@ -107,38 +107,40 @@ def measure_detector(
     dark_level_adu: float | None = None,
     range_adu: tuple[float, float] | None = None,
 ) -> DetectorMeasurement:
-    """Measure a camera's read noise and gain.
+    """Measure the read noise and the gain of a camera.
 
-    Read noise: temporal standard deviation of the median pixel of dark frames (hot pixels do not matter),
-    after taking off each frame's own median. Gain: photon transfer (Janesick 2007, Photon Transfer), the
-    slope of each pixel's variance against its mean in frames of a steady light. The variance is half the mean
-    square of the difference between successive frames, so slow drifts do not count. Changes of brightness
-    and small movements common to a sub-aperture (to an area of 16 x 16 px without `layout`) are fitted and
-    taken out, in proportion to the mean image and its first and second derivatives.
+    The read noise is the temporal standard deviation of the median pixel of dark frames (insensitive to hot
+    pixels), after subtracting the median of each frame. The gain is obtained by photon transfer (Janesick
+    2007, Photon Transfer), as the slope of the variance of a pixel against its mean in frames with constant
+    flux. The variance is half the mean square of the difference between successive frames, so that slow
+    drifts have no effect. Changes of brightness and small movements common to a sub-aperture (without
+    `layout`: to an area of 16 x 16 px) are fitted and removed, in proportion to the mean image and its
+    first and second derivatives.
 
     Parameters
     ----------
     frames : (n, h, w) array, optional
-        ADU, at least 2 consecutive frames of a flux that moves by less than about 0.2 px.
+        Frames [ADU], at least 2 consecutive ones, with flux that moves by less than about 0.2 px.
     darks : (n, h, w) array, optional
-        ADU, at least 2 frames without flux. Their dark current's noise counts as read noise. Without them,
-        the read noise is that of the darkest pixels of `frames`, to about 10 % where these see some light.
+        Frames without flux [ADU], at least 2. The noise of their dark current is included in the read
+        noise. Without them, the read noise is that of the darkest pixels of `frames`, to about 10 % if
+        these get some flux.
     layout : Layout, optional
-        Use these sub-apertures of `frames`, each of which moves on its own, instead of the whole frame.
+        Sub-apertures of `frames` to use, each of which moves separately, instead of the whole frame.
     em_gain : float
-        Mean gain of the multiplication register, 1 without. Above 1 the variance of electrons is twice that
-        of photons (see `faintspot.simulate.Detector.excess_noise_factor`).
+        Mean gain of the multiplication register, 1 without one. Above 1 the variance of electrons is twice
+        that of photons (see `faintspot.simulate.Detector.excess_noise_factor`).
     dark_level_adu : float, optional
-        Level in the dark, where there are no `darks`. Default: the darkest percent of the frames' pixels,
-        which holds stray light too.
+        Dark level, if there are no `darks`. Default: that of the darkest percent of the pixels of the frames,
+        which includes stray light.
     range_adu : (float, float), optional
-        Use only pixels whose mean above the dark level lies in this range: below saturation, or one of two
-        gains of a camera.
+        Range of the mean above the dark level in which pixels are used: below saturation, or within one of
+        two gains of a camera.
 
     Raises
     ------
     InputError
-        If neither frames nor darks are given, or arrays are not finite or do not fit each other.
+        If neither frames nor darks are given, or arrays are not finite or inconsistent.
 
     Examples
     --------
@@ -154,7 +156,7 @@ def measure_detector(
     multiplication = number_between("em_gain", em_gain, 1.0)
     if frames is None:
         if darks is None:
-            raise InputError("frames, darks: expected at least one of them")
+            raise InputError("frames, darks: expected at least one of them, got neither")
         dark, read_noise = _measure_dark(_frames("darks", darks))
         return _result(dark, read_noise, None, (None, None), multiplication, [_BY_DARKS])
     stack = _frames("frames", frames)
@@ -186,14 +188,14 @@ def _frames(name: str, value: Any) -> Floats:
 
 
 def _measure_dark(darks: Floats) -> tuple[_Dark, _Value]:
-    """Measure the level of each pixel and the read noise of the median pixel."""
+    """Measure the dark level of each pixel and the read noise of the median pixel."""
     level = darks.mean(axis=0)
     drift = np.median(darks - level, axis=(1, 2))
     variance = np.var(darks - drift[:, None, None], axis=0, ddof=1)
     degrees = len(darks) - 1
     # The median of a chi-squared distribution lies below its mean.
     read_noise = math.sqrt(float(np.median(variance)) * degrees / float(chi2.median(degrees)))
-    # Of the median of many variances: 1.25 times that of their mean.
+    # Variance of the median of many variances: 1.25 times that of their mean.
     relative = 1.25 * math.sqrt(2 / (degrees * level.size))
     spread = 1.25 * 1.4826 * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
     return _Dark(level, float(np.median(level)), spread), _Value(read_noise, 0.5 * relative * read_noise)
@@ -214,13 +216,13 @@ def _dark_without_darks(frames: Floats, dark_level_adu: float | None) -> tuple[_
 
 
 def _read_noise_without_darks(curve: _Curve, line: _Line | None) -> _Value:
-    """Take the read noise from the darkest pixels, less the photon noise that the line gives their flux."""
+    """Estimate the read noise from the darkest pixels, less the photon noise that the line gives."""
     darkest = curve.mean <= np.quantile(curve.mean, _DARKEST_FOR_NOISE)
     # The median of a chi-squared distribution lies below its mean.
     correction = curve.degrees / float(chi2.median(curve.degrees))
     total = float(np.median((curve.variance / np.maximum(curve.share, 0.1))[darkest])) * correction
     photons = 0.0 if line is None else max(line.slope, 0.0) * float(np.mean(curve.mean[darkest]))
-    # Where photon noise would explain everything, the line does not hold for these pixels.
+    # If photon noise alone would explain the variance, the line is not valid for these pixels.
     variance = total - photons if 0 < photons < total else total
     relative = 1.25 * math.sqrt(2 / (curve.degrees * np.count_nonzero(darkest)))
     read_noise = math.sqrt(variance)
@@ -228,10 +230,10 @@ def _read_noise_without_darks(curve: _Curve, line: _Line | None) -> _Value:
 
 
 def _photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, order: int = 2) -> _Curve:
-    """Return the variance of every pixel once common changes of its tile are taken out.
+    """Return the variance of each pixel after removal of the common changes of its tile.
 
     The residual of a fit with orthonormal modes Q has the variance sum_j (1 - Q Q')_ij^2 v_j, which is
-    worked out for v = 1 (`share`) and v = light.
+    computed for v = 1 (`share`) and v = flux.
     """
     mean = frames.mean(axis=0)
     flux = np.broadcast_to(mean - dark_level, mean.shape)
@@ -257,7 +259,7 @@ def _photon_transfer(frames: Floats, dark_level: Any, layout: Layout | None, ord
 
 
 def _derivative(image: Floats, axis: int) -> Floats:
-    """Return the derivative per pixel: that of the quintic spline, which suits critically sampled spots."""
+    """Return the derivative per pixel of a quintic spline, which suits critically sampled spots."""
     coefficients = np.moveaxis(spline_filter1d(image, 5, axis=axis, mode="mirror"), axis, 0)
     c = np.pad(coefficients, ((2, 2), (0, 0)), mode="reflect")
     slope: Floats = (10 * (c[3:-1] - c[1:-3]) + c[4:] - c[:-4]) / 24
@@ -297,7 +299,7 @@ def _chosen(curve: _Curve, pixels: NDArray[np.bool_]) -> _Curve:
 
 
 def _halves(curve: _Curve) -> tuple[_Curve, _Curve]:
-    """Split the pixels where the fainter ones hold half of the flux."""
+    """Split the pixels so that the fainter ones have half of the flux."""
     order = np.argsort(curve.mean)
     collected = np.cumsum(np.maximum(curve.mean[order], 0.0))
     split = curve.mean[order][np.searchsorted(collected, 0.5 * collected[-1])]
@@ -305,12 +307,12 @@ def _halves(curve: _Curve) -> tuple[_Curve, _Curve]:
 
 
 def _fit(curve: _Curve) -> _Line | None:
-    """Fit variance = intercept * share + slope * flux; errors by leaving out groups of pixels in turn."""
+    """Fit variance = intercept * share + slope * flux; standard errors by jackknife over groups of pixels."""
     terms = np.stack([curve.share, curve.flux], axis=1)
     n = len(terms)
     if n < 2 * _GROUPS or np.ptp(curve.mean) == 0:
         return None
-    # Weights must not follow the noise of faint pixels: below the typical light they are all alike.
+    # Weights must not follow the noise of faint pixels: below the typical flux they are equal.
     bright = max(float(np.sum(np.square(curve.mean)) / max(np.sum(np.abs(curve.mean)), 1e-300)), 0.0)
     typical = np.maximum(curve.mean, bright)
     model: Any = np.full(n, np.inf)
@@ -346,7 +348,7 @@ def _result(
     notes: list[str],
     problem: str | None = None,
 ) -> DetectorMeasurement:
-    """Put the parts together; without frames there are no lines."""
+    """Combine the parts; without frames there are no lines."""
     gain = _gain(line, em_gain)
     faint, bright = (_gain(half, em_gain) for half in halves)
     in_electrons = None
@@ -370,7 +372,7 @@ def _result(
 
 
 def _gain(line: _Line | None, em_gain: float) -> _Value | None:
-    """Return electrons per ADU and its error: variance in ADU is excess * em_gain * flux / gain."""
+    """Return electrons per ADU and its error: the variance in ADU is excess * em_gain * flux / gain."""
     if line is None or line.slope <= 0:
         return None
     gain = (2.0 * em_gain if em_gain > 1 else 1.0) / line.slope
@@ -378,12 +380,12 @@ def _gain(line: _Line | None, em_gain: float) -> _Value | None:
 
 
 def _problem(line: _Line | None, coarse: _Line | None, halves: tuple[_Line | None, ...]) -> str | None:
-    """Say what keeps the gain from being believed, or None.
+    """Return the reason why the gain is not reliable, or None.
 
-    Where second derivatives of the image matter for what movements leave behind, third ones may too.
+    If second derivatives of the image affect the residuals of movements, third ones may do so, too.
     """
     if line is None or coarse is None or line.slope <= 3 * line.slope_error:
-        return "the variance does not rise with the flux: more flux or more frames are needed"
+        return "the variance does not increase with the flux: use more flux or more frames"
     second_order = coarse.slope - line.slope
     moving = second_order > max(_LARGEST_SECOND_ORDER * line.slope, 4 * line.slope_error)
     if moving or line.scatter > _LARGEST_SCATTER:
@@ -396,6 +398,6 @@ def _problem(line: _Line | None, coarse: _Line | None, halves: tuple[_Line | Non
     if difference <= max(4 * noise, _LARGEST_CURVATURE * line.slope):
         return None
     return (
-        "faint and bright pixels disagree about the gain: the flux moves or fluctuates too much, "
-        "pixels saturate or are cut off, or the camera has two gains"
+        "gains from faint and bright pixels disagree: the flux moves or fluctuates too much, "
+        "pixels saturate or are clipped, or the camera has two gains"
     )

@@ -1,4 +1,4 @@
-"""Images with a known truth: spots, detectors, whole sensors."""
+"""Simulated images with known spot positions: spots, detectors and whole sensors."""
 
 from faintspot.camera.detector import Detector
 from faintspot.simulate.frames import sensor_frames, subapertures

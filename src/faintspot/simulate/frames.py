@@ -14,7 +14,7 @@ from faintspot.camera.detector import Detector
 from faintspot.spots.shapes import image_shape, per_spot, spots
 from faintspot.spots.speckled import LARGEST_D_OVER_R0, speckled_images
 
-_BLOCK_PIXELS = 1 << 21  # pixels simulated at a time: bounds the memory of the double-precision means
+_BLOCK_PIXELS = 1 << 21  # pixels simulated at a time, to limit the memory of the double-precision means
 
 
 def subapertures(
@@ -34,35 +34,35 @@ def subapertures(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Return noisy sub-aperture images in photo-electrons and the true positions of their spots.
 
-    The images are `Detector.to_electrons` of the detector's read-out: background and dark current are in
-    them, not subtracted. The spots are those of `faintspot.spots.shapes`; flux_e, size, elongation and
-    angle_deg are one number each or one per sub-aperture.
+    The images are `Detector.to_electrons` of the read-out and include background and dark current. Spot
+    shapes are those of `faintspot.spots.shapes`; flux_e, size, elongation and angle_deg are one number each
+    or one per sub-aperture.
 
     Parameters
     ----------
     n : int
-        How many sub-apertures.
+        Number of sub-apertures.
     shape : (int, int)
         Rows and columns (ny, nx) of each image, px.
     flux_e : float or array_like, shape (n,)
-        Electrons that a spot in the middle of its image leaves within it. Farther out more flux is lost,
-        as behind a field stop; turbulence, which spreads the flux, loses more too.
+        Electrons within the image of a centred spot. Farther out more flux is lost, as with a field stop;
+        turbulence, which spreads the flux, increases the loss.
     profile, size, elongation, angle_deg
-        The spot's shape, see `faintspot.spots.shapes`.
+        Shape of the spots, see `faintspot.spots.shapes`.
     position_range_px : float
         True positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
-        True x and y in px, instead of random ones.
+        True x and y [px], instead of random ones.
     d_over_r0 : float
-        Side of the square sub-aperture in units of the Fried parameter, 0 to 10: each spot is speckled by
-        Kolmogorov turbulence whose own mean gradient is taken off, so that the mean gradient of its phase
-        is the true position. 0: no turbulence, and the draws of positions and noise are those without this
-        option. More needs profile "diffraction" and elongation 1.
+        Side of the square sub-aperture in units of the Fried parameter, 0 to 10. Each spot is speckled by
+        Kolmogorov turbulence whose own mean gradient is removed, so that the mean gradient of its phase is
+        the true position. 0: no turbulence; the draws of positions and noise are those without this option.
+        Values above 0 require profile "diffraction" and elongation 1.
     detector : Detector, optional
-        Default: 0.1 e- read noise and nothing else.
+        Default: 0.1 e- read noise and no other noise.
     rng : numpy.random.Generator, optional
-        Where positions, noise and turbulence come from, each from a generator of its own: the same seed
-        gives the same positions whatever the detector and the turbulence.
+        Generator from which separate ones for positions, noise and turbulence are spawned: the same seed
+        gives the same positions for any detector and turbulence.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def subapertures(
     Raises
     ------
     InputError
-        If a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of range or of the wrong shape.
 
     Examples
     --------
@@ -89,7 +89,7 @@ def subapertures(
     ny, nx = image_shape("shape", shape)
     turbulence = number_between("d_over_r0", d_over_r0, 0.0, LARGEST_D_OVER_R0)
     position_rng, noise_rng = spawn(rng, 2)
-    # Spawned only when needed: what a generator gives to later calls does not change without turbulence.
+    # Spawned only if needed, so that without turbulence later draws of the generator do not change.
     phase_rng = spawn(rng, 1)[0] if turbulence else None
     truth = _true_positions(positions, position_range_px, (n, 2), position_rng)
     camera = _camera(detector)
@@ -140,8 +140,8 @@ def sensor_frames(
 ) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Return frames of a whole Shack-Hartmann sensor in ADU and the true positions of their spots.
 
-    The flux of each spot stays within its own window, as behind a field stop. For more frames than fit
-    into memory, call it again with the same generator: the noise and positions go on.
+    The flux of each spot is confined to its own window, as with a field stop. For more frames than fit into
+    memory, call the function again with the same generator: noise and positions continue.
 
     Parameters
     ----------
@@ -152,32 +152,31 @@ def sensor_frames(
     frame_shape : (int, int)
         Rows and columns of the frame, px.
     n_frames : int
-        How many frames.
+        Number of frames.
     flux_e : float or array_like, shape (n,)
-        Electrons per frame that a spot in the middle of its window leaves within it.
+        Electrons per frame within the window of a centred spot.
     profile, size, elongation, angle_deg
-        The spot's shape, see `faintspot.spots.shapes`; one number each or one per sub-aperture.
+        Shape of the spots, see `faintspot.spots.shapes`; one number each or one per sub-aperture.
     position_range_px : float
-        True positions are uniform within plus and minus this, on each axis, anew in every frame, px.
+        True positions are uniform within plus and minus this on each axis [px], independently in each frame.
     positions : array_like, shape (n, 2) or (n_frames, n, 2), optional
-        True x and y in px from each window's centre, the same or another in every frame, instead of
-        random ones.
+        True x and y in px from the centre of each window, constant or for each frame, instead of random ones.
     detector : Detector, optional
-        Default: 0.1 e- read noise and nothing else. Its maps have the frame's shape.
+        Default: 0.1 e- read noise and no other noise. Maps have the shape of the frame.
     rng : numpy.random.Generator, optional
-        Where positions and noise come from, each from a generator of its own.
+        Generator from which separate ones for positions and noise are spawned.
 
     Returns
     -------
     frames : ndarray, shape (n_frames, rows, columns)
-        ADU, of the type that `Detector.expose` returns.
+        Frames [ADU], of the type that `Detector.expose` returns.
     truth : ndarray, float64, shape (n_frames, n, 2)
         True x and y, px.
 
     Raises
     ------
     InputError
-        If a value is not finite, out of its range or of the wrong shape, or a window leaves the frame.
+        If a value is not finite, out of range or of the wrong shape, or a window leaves the frame.
 
     Examples
     --------
@@ -221,7 +220,7 @@ def _whole_flux(
     elongation: NDArray[np.float64],
     angle_deg: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the flux of the whole, infinite spots that leave `flux_e` within their image when centred."""
+    """Return the flux of the infinite spots that have `flux_e` within their image when centred."""
     kinds, which = np.unique(np.stack([size, elongation, angle_deg], axis=1), axis=0, return_inverse=True)
     centred = spots(
         np.zeros((len(kinds), 2)),
@@ -236,7 +235,7 @@ def _whole_flux(
 
 
 def _camera(detector: Any) -> Detector:
-    """Return the detector to use; the default has 0.1 e- read noise and nothing else."""
+    """Return the detector; the default has 0.1 e- read noise and no other noise."""
     if detector is None:
         return Detector(read_noise_e=0.1)
     if not isinstance(detector, Detector):
@@ -247,7 +246,7 @@ def _camera(detector: Any) -> Detector:
 def _true_positions(
     positions: Any, position_range_px: float, shape: tuple[int, ...], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return the given positions, or uniform random ones, in that shape (..., n, 2)."""
+    """Return the given positions, or uniform random ones, with shape (..., n, 2)."""
     half = number_between("position_range_px", position_range_px, 0)
     if positions is None:
         return rng.uniform(-half, half, shape)
@@ -277,7 +276,7 @@ def _window_pixels(corners: Any, window: tuple[int, int], frame: tuple[int, int]
 def _place_windows(
     images: NDArray[np.float64], pixels: NDArray[np.int64], frame: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Add up the windows' flux in each frame; windows may overlap."""
+    """Add the flux of the windows to each frame; windows may overlap."""
     n_pixels = frame[0] * frame[1]
     where = pixels.ravel() + n_pixels * np.arange(len(images))[:, None]
     flux = np.zeros(len(images) * n_pixels)

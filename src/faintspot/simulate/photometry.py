@@ -1,4 +1,4 @@
-"""From a star's magnitude to electrons per sub-aperture and frame, and back."""
+"""Conversion of a star's magnitude to electrons per sub-aperture and frame, and back."""
 
 from __future__ import annotations
 
@@ -31,35 +31,35 @@ ZERO_POINTS = MappingProxyType(
 """Photons per second and m^2 of a star of magnitude 0 above the atmosphere, over the whole band."""
 
 DEFAULT_BAND = "R"
-DEFAULT_THROUGHPUT = 0.4  # atmosphere, telescope and the optics in front of the sensor
+DEFAULT_THROUGHPUT = 0.4  # atmosphere, telescope and the optics before the sensor
 DEFAULT_QUANTUM_EFFICIENCY = 0.9
 
 
 @dataclass(frozen=True)
 class Photometry:
-    """How many electrons a star leaves in a sub-aperture in a frame.
+    """Electrons from a star in a sub-aperture and a frame.
 
     electrons = zero_point * 10^(-0.4 magnitude) * area_m2 * frame_time_s * throughput * quantum_efficiency.
 
     Parameters
     ----------
     area_m2 : float
-        Of a sub-aperture at the telescope's entrance.
+        Area of a sub-aperture in the entrance pupil of the telescope.
     frame_time_s : float
         Exposure time of a frame.
     band : str
-        B, V, R, I, J, H or K: says the zero point where that is not given.
+        B, V, R, I, J, H or K; sets the zero point if that is not given.
     zero_point : float, optional
         Photons per second and m^2 of a star of magnitude 0 above the atmosphere, within the sensor's band.
     throughput : float
-        Fraction of the photons that reaches the detector: atmosphere, telescope, optics. Default 0.4.
+        Fraction of the photons that reaches the detector: atmosphere, telescope, optics. Default: 0.4.
     quantum_efficiency : float
-        Fraction of these that the detector counts. Default 0.9.
+        Fraction of these photons that is detected. Default: 0.9.
 
     Raises
     ------
     InputError
-        For a value out of range.
+        If a value is out of range.
 
     Examples
     --------
@@ -99,23 +99,23 @@ class Photometry:
         return flux * self.throughput * self.quantum_efficiency
 
     def electrons(self, magnitude: ArrayLike) -> NDArray[np.float64]:
-        """Return the electrons per sub-aperture and frame of stars of these magnitudes.
+        """Return the electrons per sub-aperture and frame for stars of the given magnitudes.
 
         Raises
         ------
         InputError
-            For magnitudes that are not finite.
+            If magnitudes are not finite.
         """
         stars: NDArray[np.float64] = finite_array("magnitude", magnitude).astype(np.float64)
         return np.asarray(self.electrons_at_zero * 10 ** (-0.4 * stars))
 
     def magnitude(self, electrons: ArrayLike) -> NDArray[np.float64]:
-        """Return the magnitudes of stars that leave so many electrons.
+        """Return the magnitudes of stars with the given electrons per sub-aperture and frame.
 
         Raises
         ------
         InputError
-            For electrons that are not above 0.
+            If electrons are not above 0.
         """
         flux = numbers_between("electrons", electrons, 0.0, math.inf, low_open=True)
         return np.asarray(-2.5 * np.log10(flux / self.electrons_at_zero))

@@ -1,7 +1,7 @@
-"""How well a spot's position can be measured at all: the Cramer-Rao bound, and photon efficiency.
+"""Cramer-Rao bound on the position of a spot, and the photon efficiency of estimators.
 
-The bound holds for estimators without bias. An estimator that knows that positions lie within some range
-can do better where the flux says little; see `prior_std_px`.
+The bound holds for unbiased estimators. An estimator that knows that positions lie within some range can have
+a smaller error at low flux; see `prior_std_px`.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from faintspot.spots.shapes import image_shape, position_array, spots
 Floats = NDArray[np.float64]
 
 MEAN_ABSOLUTE = math.sqrt(2 / math.pi)
-"""Mean absolute value of a normal distribution of standard deviation 1: R of an estimator at the bound."""
+"""Mean absolute value of a standard normal distribution: slope error of an estimator at a bound of 1 px."""
 
 _NOISES = ("exact", "gaussian")
-_SMALLEST_MEAN_E = 1e-6  # pixels with less flux say nothing about the position
-_LARGEST_TABLED_VARIANCE = 40.0  # above, the expansion of the information is good to 5e-4
-_SMALLEST_TABLED_NOISE_E = 0.05  # below, electrons are counted without error
-_BRACKET = 1e12  # largest and, inverted, smallest flux that photon_efficiency looks at, e-
+_SMALLEST_MEAN_E = 1e-6  # pixels with less flux carry no information on the position
+_LARGEST_TABLED_VARIANCE = 40.0  # above it, the expansion of the information is accurate to 5e-4
+_SMALLEST_TABLED_NOISE_E = 0.05  # below it, electrons are counted without error
+_BRACKET = 1e12  # largest and, inverted, smallest flux tried by photon_efficiency, e-
 _FLUX_STEPS_PER_DECADE = 12
 
 
 class SpotImages(Protocol):
-    """A measured or analytic spot: noiseless images at given positions, such as `faintspot.PSF`."""
+    """Object that provides noiseless spot images at given positions, such as `faintspot.PSF`."""
 
     def images(self, positions: Any, shape: tuple[int, int], flux_e: Any = 1.0) -> Floats:
         """Return images (n, ny, nx) of spots at positions (n, 2)."""
 
 
 class _Spot(NamedTuple):
-    """Images of a spot that leaves 1 e- in its window when centred, and their derivatives: (m, pixels)."""
+    """Images of a spot with 1 e- in its window when centred, and their derivatives: (m, pixels)."""
 
     image: Floats
     along_x: Floats
@@ -47,7 +47,7 @@ class _Spot(NamedTuple):
 
 
 class _Noise(NamedTuple):
-    """What blurs the flux of each pixel, in photo-electrons; maps are flattened: (pixels,)."""
+    """Noise of each pixel [photo-electrons]; maps are flattened: (pixels,)."""
 
     read_noise_e: Floats
     background_e: Floats
@@ -72,49 +72,48 @@ def cramer_rao(
     prior_std_px: float | None = None,
     noise: str = "exact",
 ) -> NDArray[np.float64]:
-    """Return the smallest standard error with which a spot's position can be measured without bias.
+    """Return the Cramer-Rao bound on the standard error of a spot's position.
 
-    It is the root of the diagonal of the inverse Fisher information of (x, y, flux, background). An estimator
-    with normally distributed errors at the bound has the slope error R = sqrt(2 / pi) times the mean of the
-    two axes.
+    The bound is the square root of the diagonal of the inverse Fisher information of (x, y, flux,
+    background). With normally distributed errors at the bound, the slope error R (mean absolute error) is
+    sqrt(2 / pi) times the mean of the two axes.
 
     Parameters
     ----------
     flux_e : float or array_like, any shape
-        Electrons that a spot in the middle of its image leaves within it, as in
-        `faintspot.simulate.subapertures`; above 0.
+        Electrons within the image of a centred spot, as in `faintspot.simulate.subapertures`; above 0.
     shape : (int, int)
         Rows and columns (ny, nx) of the image, at least 3 px each.
     profile, size, elongation, angle_deg
-        The spot, see `faintspot.spots.shapes`. Not used with `psf`.
+        Shape of the spot, see `faintspot.spots.shapes`. Ignored if `psf` is given.
     psf : object with a method ``images(positions, shape, flux_e)``, optional
-        The spot itself, such as a `faintspot.PSF`. Pixels where it is not positive are left out. Noise in a
-        learnt spot's wings adds to the apparent information where read noise is low.
+        PSF of the spot, such as a `faintspot.PSF`. Pixels in which it is not positive are ignored. Noise in
+        the wings of a learnt PSF increases the apparent information if the read noise is low.
     detector : Detector, optional
-        Its noise; the mean of background and dark current is known unless `unknown_background`. Converter
-        steps count as read noise of 1/12 ADU squared; full well and saturation are left out. Default: 0.1 e-
-        read noise and nothing else.
+        Detector that defines the noise; mean background and dark current are known unless
+        `unknown_background`. Quantisation counts as read noise of 1/12 ADU squared; full well and
+        saturation are ignored. Default: 0.1 e- read noise and no other noise.
     positions : array_like, shape (2,) or (m, 2)
-        x and y in px; the result is the mean over them.
+        x and y [px]; the result is the mean over the positions.
     position_range_px : float, optional
-        Positions uniform within plus and minus this on each axis, instead of `positions`.
+        Use positions uniform within plus and minus this on each axis, instead of `positions`.
     unknown_flux, unknown_background : bool
-        Whether they have to be measured along with the position.
+        Whether they are estimated along with the position.
     prior_std_px : float, optional
-        Standard deviation of a normal distribution around the true position that the estimator knows from
-        elsewhere: 1 / prior_std_px^2 is added to the information of x and y (van Trees 1968), so the result
-        never exceeds it. Positions uniform within +-a have a standard deviation a / sqrt(3); the bound is
-        then only a guide, since that distribution has edges (R without flux is a / 2, not 0.46 a).
+        Standard deviation of the prior of an estimator: a normal distribution around the true position.
+        Adds 1 / prior_std_px^2 to the information on x and y (van Trees 1968), so that the result never
+        exceeds it. Positions uniform within +-a have a standard deviation a / sqrt(3). The bound is then
+        only a guide, since that distribution has edges (without flux, R is a / 2, not 0.46 a).
     noise : {"exact", "gaussian"}
         "exact": information of Poisson electrons plus Gaussian read noise, summed over the number of
-        electrons. "gaussian": the sum over pixels of (dm/dx)^2 / variance; lower information at low flux,
-        the same with high flux. Behind a multiplication register both are the latter, with twice the photon
-        noise: not a strict bound where it sees single electrons, which could be counted.
+        electrons. "gaussian": sum over pixels of (dm/dx)^2 / variance, which is lower at low flux and equal
+        at high flux. With a multiplication register both are the latter, with twice the photon noise. This
+        is not a strict bound if single electrons can be distinguished and counted.
 
     Returns
     -------
     ndarray, float64, shape of flux_e + (2,)
-        Standard error along x and along y, px; infinite where the image holds no flux.
+        Standard error along x and y [px]; infinite if the image has no flux.
 
     Raises
     ------
@@ -155,31 +154,31 @@ def cramer_rao(
 
 
 def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any) -> NDArray[np.float64]:
-    """Return the share of its flux that an estimator would need if it reached the Cramer-Rao bound.
+    """Return the fraction of its flux that an estimator would need if it reached the Cramer-Rao bound.
 
-    (flux at which the bound's slope error R equals the estimator's) / (flux that the estimator used). 1 is
-    the limit; more means a bias towards the truth, by a prior for example.
+    This is (flux at which the slope error R of the bound equals that of the estimator) / (flux used). The
+    limit is 1; a larger value means a bias towards the truth, for example by a prior.
 
     Parameters
     ----------
     error_px : float or array_like
-        Slope error R of the estimator: mean of the absolute errors in x and y, px, above 0. For a root mean
-        square error per axis, multiply it by `MEAN_ABSOLUTE`.
+        Slope error R of the estimator: mean absolute error of x and y [px], above 0. Multiply a root mean
+        square error per axis by `MEAN_ABSOLUTE`.
     flux_e : float or array_like
-        Electrons that it used, counted as in `cramer_rao`; broadcast with `error_px`.
+        Electrons used, defined as in `cramer_rao`; broadcast with `error_px`.
     **conditions
         Spot, detector, positions and unknowns, as for `cramer_rao`. With `prior_std_px`, errors that the
-        prior alone attains have efficiency 0.
+        prior alone achieves have efficiency 0.
 
     Returns
     -------
     ndarray, float64, shape of error_px and flux_e broadcast
-        Solved on a grid of fluxes with interpolation; good to 1e-3.
+        Solved by interpolation on a grid of fluxes, accurate to 1e-3.
 
     Raises
     ------
     InputError
-        As `cramer_rao`, and when the bound reaches the error nowhere between 1e-12 and 1e12 e-.
+        As for `cramer_rao`, and if the bound does not reach the error between 1e-12 and 1e12 e-.
 
     Examples
     --------
@@ -204,7 +203,7 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
     steps = 3 + math.ceil(_FLUX_STEPS_PER_DECADE * math.log10(high / low))
     grid = np.geomspace(low, high, steps)
     bounds = slope_error(grid)
-    # A prior alone keeps the bound level up to some flux: the last level one is where the curve starts.
+    # With a prior, the bound is constant up to some flux: the curve starts at the last such point.
     first = int(np.argmax(bounds < bounds[0] * (1 - 1e-9))) - 1
     inverse = PchipInterpolator(-np.log(bounds[first:]), np.log(grid[first:]))
     needed = np.where(error >= bounds[0], 0.0, np.exp(inverse(-np.log(np.minimum(error, bounds[0])))))
@@ -213,7 +212,7 @@ def photon_efficiency(error_px: ArrayLike, flux_e: ArrayLike, **conditions: Any)
 
 
 def _bracket(slope_error: Any, smallest: float, largest: float, start: float) -> tuple[float, float]:
-    """Return two fluxes: slope errors above `largest` (unless a prior prevents it) and below `smallest`."""
+    """Return two fluxes with slope errors above `largest` (if the prior permits) and below `smallest`."""
     low = high = start
     while slope_error(np.array(low)) < 1.01 * largest and low > 1 / _BRACKET:
         low /= 10
@@ -225,7 +224,7 @@ def _bracket(slope_error: Any, smallest: float, largest: float, start: float) ->
 
 
 def _positions(positions: Any, position_range_px: float | None) -> Floats:
-    """Return positions (m, 2); for a range, the nodes of a regular grid that stands for it."""
+    """Return positions (m, 2); for a range, the nodes of a regular grid that represents it."""
     if position_range_px is None:
         array = np.asarray(positions)
         return position_array(array[None] if array.ndim == 1 else array)
@@ -236,10 +235,10 @@ def _positions(positions: Any, position_range_px: float | None) -> Floats:
 
 
 def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
-    """Return images and their derivatives by four-point differences, good to 1e-7 at this step."""
+    """Return images and their derivatives by four-point differences, accurate to 1e-7 at this step."""
     centred = float(np.sum(render(np.zeros((1, 2)))))
     if not centred > 0:
-        raise InputError("psf: expected images with light in them")
+        raise InputError("psf: expected images with flux, got none")
 
     def flat(shift: Floats) -> Floats:
         return np.reshape(render(positions + shift), (len(positions), -1)) / centred
@@ -249,7 +248,7 @@ def _with_derivatives(render: Any, positions: Floats, step: float) -> _Spot:
         for axis in np.eye(2) * step
     )
     image = flat(np.zeros(2))
-    # The wings of a learnt spot scatter around zero: where no flux is left its slope tells nothing.
+    # The wings of a learnt PSF scatter around zero; their slope carries no information there.
     illuminated = image > 0
     return _Spot(np.where(illuminated, image, 0.0), along_x * illuminated, along_y * illuminated)
 
@@ -261,7 +260,7 @@ def _noise(detector: Any, shape: tuple[int, int], exact: bool) -> _Noise:
     if not isinstance(detector, Detector):
         raise InputError(f"detector: expected a Detector or None, got {type(detector).__name__}")
     excess = detector.excess_noise_factor
-    # The detector's own account of its noise: electrons of the background are what is left of the variance.
+    # Take the background electrons from the variance that the detector itself reports.
     dark = detector.variance(np.zeros(shape))
     converter = detector.gain_e_per_adu**2 / 12 if detector.bits is not None else 0.0
     read_variance = (np.square(detector.read_noise_e) + converter) / detector.em_gain**2
@@ -283,7 +282,7 @@ def _standard_errors(
     stack = np.stack(derivatives, axis=1)
     information = np.einsum("map,mbp,mp->mab", stack, stack, weight, optimize=True)
     information[:, [0, 1], [0, 1]] += 1 / prior**2
-    # In units of each unknown's own error the matrix is well conditioned at any flux.
+    # In units of the error of each unknown, the matrix is well conditioned at any flux.
     scale = np.sqrt(np.diagonal(information, axis1=1, axis2=2))
     illuminated = np.all(scale > 0, axis=1)
     errors = np.full((len(scale), 2), prior)
@@ -295,9 +294,9 @@ def _standard_errors(
 
 
 def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:
-    """Return the Fisher information of each pixel's value about its mean, 1 / e-^2; (m, pixels)."""
+    """Return the Fisher information of each pixel value about its mean [1 / e-^2]; (m, pixels)."""
     if not noise.exact:
-        # The floor keeps pixels without any noise from dividing by zero.
+        # The floor avoids division by zero for noise-free pixels.
         variance = noise.excess * mean_e + np.square(noise.read_noise_e)
         return 1 / np.maximum(variance, _SMALLEST_MEAN_E)
     information = np.empty_like(mean_e)
@@ -308,11 +307,11 @@ def _pixel_information(mean_e: Floats, noise: _Noise) -> Floats:
 
 
 def poisson_gaussian_information(mean_e: Floats, read_noise_e: float) -> Floats:
-    """Return the Fisher information about the mean of Poisson electrons with Gaussian read noise, 1 / e-^2.
+    """Return the Fisher information about the mean of Poisson electrons with Gaussian read noise [1 / e-^2].
 
     With v = mean + read_noise^2 it tends to 1 / v + (read_noise^2 / v)^2 / (2 v^2) at large v, where the
-    second term is the little that the variance tells, and to 1 / mean at small read noise. Tabulated
-    between; good to 5e-4.
+    second term is the information in the variance, and to 1 / mean at low read noise. It is tabulated in
+    between, and accurate to 5e-4.
 
     Parameters
     ----------
@@ -335,7 +334,7 @@ def poisson_gaussian_information(mean_e: Floats, read_noise_e: float) -> Floats:
 
 @functools.lru_cache(maxsize=64)
 def _information_table(read_noise_e: float) -> Any:
-    """Return log information as a spline of log mean.
+    """Return a spline of the logarithm of the information against the logarithm of the mean.
 
     p(g) is a sum over electrons k of Poisson(k) Normal(g - k). Since d Poisson(k) / d mean is
     Poisson(k - 1) - Poisson(k), dp/dmean = p(g - 1) - p(g), and the information, the integral of its square
@@ -350,7 +349,7 @@ def _information_table(read_noise_e: float) -> Any:
     highest = _LARGEST_TABLED_VARIANCE + 10 * math.sqrt(_LARGEST_TABLED_VARIANCE) + 10 * read_noise_e
     lowest = -math.ceil(10 * read_noise_e) - 1
     values = np.arange(lowest * per_electron, math.ceil(highest) * per_electron) / per_electron
-    # More electrons than the largest value, so that p does not end before the integral does.
+    # More electrons than the largest value, so that p does not end before the range of integration.
     electrons = np.arange(math.ceil(highest + 10 * read_noise_e) + 3)
     poisson = np.exp(electrons * log_mean[:, None] - mean[:, None] - gammaln(electrons + 1))
     normal = np.exp(-0.5 * np.square((values - electrons[:, None]) / read_noise_e))

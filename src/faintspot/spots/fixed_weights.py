@@ -1,4 +1,4 @@
-"""Fixed weights: a slope as a linear combination of the pixels of a sub-aperture, for estimator "window"."""
+"""Fixed weights: slopes as linear combinations of the pixels of a sub-aperture, for estimator "window"."""
 
 from __future__ import annotations
 
@@ -16,48 +16,49 @@ from faintspot.base.npz import load_fields, save_fields
 Floats = NDArray[np.float64]
 
 _FIELDS = ("x", "y", "mean_spot", "flux", "index")
-_LARGEST = 1e6  # px, or fractions of the flux, for one pixel: beyond, float32 sums say nothing
+_LARGEST = 1e6  # px, or fractions of the flux, for one pixel: above it, float32 sums are meaningless
 _SMALLEST_GAIN = 0.02
 _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
-_SAME = 1e-6  # of the largest weight: what sums in float32 do not tell apart
-_RIDGE = 1e-6  # of the mean variance of a pixel: keeps the solution finite where there is no noise
+_SAME = 1e-6  # relative to the largest weight; smaller weights are ignored and not read
+_RIDGE = 1e-6  # relative to the largest weight: indistinguishable in float32 sums
+# relative to the mean variance of a pixel: keeps the solution finite without noise
 
 
 class WeightedCentre(NamedTuple):
     """Fixed weights as a centre of gravity c of weighted pixels: the slope is gain (c - reference)."""
 
     weights: Floats
-    """(n_kinds, ny, nx): of every pixel, at most 1."""
+    """Weight of each pixel, at most 1; shape (n_kinds, ny, nx)."""
     gain: Floats
-    """(n_kinds, 2): px, x and y, for a centre of gravity that moves by 1 px."""
+    """Slope in x and y [px] for a centre of gravity that moves by 1 px; shape (n_kinds, 2)."""
     reference: Floats
-    """(n_kinds, 2): centre of gravity where the slope is 0, px from the window's middle."""
+    """Centre of gravity for a slope of 0, px from the window centre; shape (n_kinds, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
 class FixedWeights:
     """Weights of the pixels of a sub-aperture whose sums are its slopes; immutable.
 
-    A spot whose image is g, in fractions of its flux, is at ``sum x (g - mean_spot)`` px from its reference
-    position, and the same in y. Hand-made weights, quad cells and the best linear estimate for a known
-    distribution of spots are all of this form.
+    A spot with image g, in fractions of its flux, is at ``sum x (g - mean_spot)`` px from its reference
+    position, and correspondingly in y. Hand-made weights, quad cells and the best linear estimate for a
+    known distribution of spots are all of this form.
 
     Parameters
     ----------
     x, y : (n_kinds, ny, nx) array, or (ny, nx)
-        px, for all of the flux in one pixel.
+        Weights [px] for fractions of the flux.
     mean_spot : (n_kinds, ny, nx) array
-        Fraction of the flux that is in each pixel of a spot at the reference.
+        Fraction of the flux in each pixel, for a spot at the reference position.
     flux : (n_kinds, ny, nx) array, optional
-        Weights whose sum is the flux. Default: 1 in every pixel where x or y count, over what of the mean
-        spot is there.
+        Weights whose sum is the flux. Default: 1 in every pixel with a weight in x or y, divided by the
+        part of the mean spot in these pixels.
     index : (n_subapertures,) array of int, optional
         Kind of each sub-aperture. Default: one kind for all.
 
     Raises
     ------
     InputError
-        For a value that is not finite or out of range, or arrays that do not fit together.
+        If a value is not finite or out of range, or arrays are inconsistent.
 
     Examples
     --------
@@ -102,7 +103,7 @@ class FixedWeights:
 
     @property
     def window(self) -> tuple[int, int]:
-        """ny, nx of the sub-apertures that they are for, px."""
+        """Height and width of the sub-apertures [px]."""
         return int(self.x.shape[1]), int(self.x.shape[2])
 
     def kinds(self, n_subapertures: int) -> NDArray[np.int64]:
@@ -111,7 +112,7 @@ class FixedWeights:
         Raises
         ------
         InputError
-            If they are for another number.
+            If the weights are for another number.
         """
         if self.index is None:
             return np.zeros(n_subapertures, np.int64)
@@ -124,12 +125,12 @@ class FixedWeights:
         return kinds
 
     def weighted_centre(self) -> WeightedCentre:
-        """Return the same as a weighted centre of gravity, divided by the flux of the frame.
+        """Return an equivalent weighted centre of gravity, divided by the flux of the frame.
 
         Raises
         ------
         InputError
-            If x and y do not follow from one map of weights: those of a Gaussian window do.
+            If x and y do not follow from one map of weights, as those of a Gaussian window do.
         """
         rows, columns = (np.arange(side) - 0.5 * (side - 1) for side in self.window)
         counted = (self.x != 0) | (self.y != 0) | (self.flux != 0)
@@ -137,7 +138,7 @@ class FixedWeights:
         gains, references = [], []
         for maps, along in ((self.x, columns), (self.y, rows[:, None])):
             moved = self.flux * along
-            # The best gain and offset of each kind, by least squares.
+            # Best gain and offset of each kind, by least squares.
             parts = [(a * b).sum(axis=(1, 2)) for a, b in _pairs(moved, self.flux)]
             seen = [(maps * part).sum(axis=(1, 2)) for part in (moved, self.flux)]
             determinant = parts[0] * parts[2] - parts[1] ** 2
@@ -151,8 +152,8 @@ class FixedWeights:
                 rest <= _SAME * np.abs(maps).max()
             ):
                 raise InputError(
-                    "weights: expected one map of weights whose centre of gravity is the slope, as of a "
-                    "Gaussian window, got others in x and y"
+                    "weights: expected x and y that follow from one map of weights, as those of a Gaussian "
+                    "window, got other ones"
                 )
             gains.append(gain)
             references.append(reference)
@@ -170,31 +171,31 @@ class FixedWeights:
         excess_noise: float = 1.0,
         background_e: float = 0.0,
     ) -> FixedWeights:
-        """Return the weights with the least mean square error among all that are linear in the pixels.
+        """Return the weights with the least mean square error among all linear estimates.
 
-        The linear minimum-mean-square estimate (e.g. Kay 1993, chapter 12) of a spot's position for the
-        spots of a sample, divided by its gain, so that it measures 1 px for a displacement of 1 px of this
-        sample's spots. A Gaussian window of any width is a special case.
+        Compute the linear minimum-mean-square estimate (e.g. Kay 1993, chapter 12) of the position for a
+        sample of spots, and divide it by its gain, so that a displacement of 1 px gives a slope of 1 px for
+        these spots. A Gaussian window of any width is a special case.
 
         Parameters
         ----------
         images : (n_spots, ny, nx) array
-            Images without noise, or nearly so, in any unit: of simulated residual wavefronts, or recorded in
+            Images with little or no noise, in any unit: simulated from residual wavefronts, or recorded at
             high flux.
         positions : (n_spots, 2) array
-            Of these spots, px from the reference: what a slope should be.
+            Positions of these spots, px from the reference: the slopes to be measured.
         flux_e, read_noise_e : float
-            Flux of a spot and read noise to be prepared for, photo-electrons.
+            Flux of a spot and read noise for which the weights are optimised [photo-electrons].
         excess_noise : float
-            Factor on the photon noise's variance.
+            Factor on the variance of the photon noise.
         background_e : float
-            Mean photo-electrons per pixel whose mean is taken off and whose noise stays.
+            Background per pixel [photo-electrons], whose mean is subtracted and whose noise remains.
 
         Raises
         ------
         InputError
-            For fewer than two spots, images without flux, arrays that do not fit together, or positions
-            that do not vary.
+            If there are fewer than two spots, images have no flux, arrays are inconsistent, or positions do
+            not vary.
         """
         spots = finite_array("images", images).astype(np.float64)
         truth = finite_array("positions", positions).astype(np.float64)
@@ -213,7 +214,7 @@ class FixedWeights:
         mean = flat.mean(axis=0)
         away, moved = flat - mean, truth - truth.mean(axis=0)
         if not np.all(moved.std(axis=0) > 0):
-            raise InputError("positions: expected spots that move in x and y, got the same position always")
+            raise InputError("positions: expected spots that move in x and y, got identical positions")
         variance = dark + excess_noise * expected * np.maximum(mean, 0.0)
         covariance = expected**2 * (away.T @ away) / len(flat)
         covariance[np.diag_indices_from(covariance)] += variance + _RIDGE * variance.mean()
@@ -238,7 +239,7 @@ class FixedWeights:
 
     @classmethod
     def load(cls, path: str | Path) -> FixedWeights:
-        """Read weights that `save` wrote.
+        """Read weights written by `save`.
 
         Raises
         ------
@@ -249,22 +250,22 @@ class FixedWeights:
 
 
 def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:
-    """Products of two maps that their normal equations need."""
+    """Return products of two maps, as needed for their normal equations."""
     return (first, first), (first, second), (second, second)
 
 
 def _flux_weights(values: dict[str, Any]) -> Floats:
-    """1 where x or y count, over what of the mean spot is there."""
+    """Return 1 in pixels with a weight in x or y, divided by the part of the mean spot in them."""
     counted = ((values["x"] != 0) | (values["y"] != 0)).astype(np.float64)
     there = (counted * values["mean_spot"]).sum(axis=(1, 2), keepdims=True)
     if np.any(there <= 0):
-        raise InputError("weights.mean_spot: expected flux in the pixels that count, got none")
+        raise InputError("weights.mean_spot: expected flux in the pixels with weights, got none")
     flux: Floats = counted / there
     return flux
 
 
 def _best_flux(mean: Floats, variance: Floats) -> Floats:
-    """Weights of the flux with the least noise, for a spot at its mean."""
+    """Return the weights of the flux with the least noise, for a spot at its mean position."""
     weights = np.maximum(mean, 0.0) / variance
     flux: Floats = weights / (weights @ mean)
     return flux

@@ -1,4 +1,4 @@
-"""The point-spread function (PSF) of a sensor's spots, super-sampled: analytic, given or learnt."""
+"""Super-sampled point-spread function (PSF) of a sensor's spots: analytic, given or learnt."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ Floats = NDArray[np.float64]
 
 _FIELDS = ("samples", "oversampling", "index")
 _ANALYTIC_OVERSAMPLING = 8
-_LARGEST_RADIUS_PX = 128.0  # the largest window seen from its opposite corner takes 91
-_LONGEST_SIDE = 4097  # beyond, singular values take minutes
+_LARGEST_RADIUS_PX = 128.0  # a window of the largest size needs 91 from corner to corner
+_LONGEST_SIDE = 4097  # above it, the singular value decomposition takes minutes
 _HIGHEST_RANK = 8
-_RANK_TOLERANCE = 2e-3  # of the peak: what the separable terms may leave out
+_RANK_TOLERANCE = 2e-3  # relative to the peak: largest error of the separable terms
 _BLOCK_PIXELS = 1 << 21
-_LARGEST_FRACTION = 1e6  # of a spot's flux in a pixel: beyond, samples cancel each other's light
+_LARGEST_FRACTION = 1e6  # of a spot's flux in a pixel: above it, samples cancel each other
 
 
 @dataclass(frozen=True, eq=False)
 class PSF:
     """An effective, super-sampled point-spread function, for a whole sensor or for each sub-aperture.
 
-    "Effective": integrated over the pixel (Anderson & King 2000, PASP 112, 1360). Between its nodes it is a
-    cubic spline; outside it is zero.
+    "Effective" means integrated over the pixel (Anderson & King 2000, PASP 112, 1360). The PSF is a cubic
+    spline between its nodes and zero outside them.
 
     Parameters
     ----------
     samples : (n_psfs, rows, columns) or (rows, columns) array
-        Fraction of a spot's flux that falls into a pixel whose centre is at offset (dx, dy) px from the
-        spot's position; node (r, c) is at dx = (c - (columns - 1) / 2) / oversampling and
-        dy = (r - (rows - 1) / 2) / oversampling. Odd numbers of rows and columns, at least 5. The sum must
-        be positive and is normalised: the flux of all pixels together is 1 on average.
+        Fraction of a spot's flux in a pixel whose centre is at offset (dx, dy) px from the position of the
+        spot. Node (r, c) is at dx = (c - (columns - 1) / 2) / oversampling and dy = (r - (rows - 1) / 2) /
+        oversampling. The numbers of rows and columns are odd, at least 5. The sum must be positive; it is
+        normalised so that the flux of all pixels together is 1 on average.
     oversampling : int
-        Nodes per pixel.
+        Number of nodes per pixel.
     index : (n_subapertures,) array of int, optional
-        Which of the PSFs each sub-aperture has. Default: all have the first; with as many PSFs as
-        sub-apertures give ``range(n)``.
+        PSF of each sub-aperture. Default: all have the first one. For as many PSFs as sub-apertures, use
+        ``range(n)``.
 
     Raises
     ------
     InputError
-        For samples that are not finite, of the wrong shape or without flux, or an index out of range.
+        If samples are not finite, have the wrong shape or no flux, or an index is out of range.
 
     Examples
     --------
@@ -108,7 +108,7 @@ class PSF:
             raise InputError(f"psf.index: expected the PSF of each sub-aperture, as there are {len(samples)}")
 
     def __repr__(self) -> str:
-        """Say how many there are, and how large; not every sample."""
+        """Return the number of PSFs and their size instead of all samples."""
         n, rows, columns = self.samples.shape
         size = f"{rows / self.oversampling:.3g} x {columns / self.oversampling:.3g} px"
         of = "" if self.index is None else f" for {len(self.index)} sub-apertures"
@@ -143,7 +143,7 @@ class PSF:
         nodes = (n, side * _ANALYTIC_OVERSAMPLING, side * _ANALYTIC_OVERSAMPLING)
         check_size("psf.samples", nodes, hint="give a smaller radius_px")
         samples = np.empty(nodes)
-        # A spot moved by a fraction of a pixel samples the nodes in between.
+        # A spot displaced by a fraction of a pixel samples the nodes in between.
         for row in range(_ANALYTIC_OVERSAMPLING):
             for column in range(_ANALYTIC_OVERSAMPLING):
                 moved = np.broadcast_to([-column * step, -row * step], (n, 2))
@@ -155,13 +155,13 @@ class PSF:
                     elongation=kinds[1],
                     angle_deg=kinds[2],
                 )
-        last = 1 - _ANALYTIC_OVERSAMPLING  # symmetric about the spot: as many nodes on either side
+        last = 1 - _ANALYTIC_OVERSAMPLING  # symmetric about the spot, with as many nodes on either side
         return cls(samples[:, :last, :last], _ANALYTIC_OVERSAMPLING, index)
 
     @cached_property
     def _spline(self) -> Floats:
-        """Spline coefficients, a border of zeros included so that the PSF falls smoothly to zero."""
-        from scipy.ndimage import spline_filter  # here, as below: importing it takes longer than first slopes
+        """Spline coefficients with a border of zeros, so that the PSF falls smoothly to zero."""
+        from scipy.ndimage import spline_filter  # imported here, as below: it takes longer than first slopes
 
         return np.stack([spline_filter(np.pad(plane, 2), 3, mode="mirror") for plane in self.samples])
 
@@ -178,12 +178,12 @@ class PSF:
         Parameters
         ----------
         positions : (n, 2) array
-            x and y, px from the image's centre.
+            x and y, px from the centre of the image.
         shape : (int, int)
         flux_e : float or (n,) array
-            Electrons of the whole spot.
+            Flux of the whole spot [electrons].
         which : int or (n,) array of int
-            Which PSF.
+            Index of the PSF.
 
         Returns
         -------
@@ -192,7 +192,7 @@ class PSF:
         Raises
         ------
         InputError
-            For positions that are not finite or of the wrong shape, a PSF that does not exist.
+            If positions are not finite or of the wrong shape, or a PSF does not exist.
         """
         from scipy.ndimage import map_coordinates
 
@@ -222,7 +222,7 @@ class PSF:
 
     @cached_property
     def fwhm_px(self) -> Floats:
-        """Full width at half maximum of the cuts through each PSF's peak, along x and y, (n_psfs, 2), px."""
+        """Full width at half maximum of the cuts through each PSF's peak along x and y, (n_psfs, 2) [px]."""
         widths = np.empty((len(self.samples), 2))
         for plane, found in zip(self.samples, widths, strict=True):
             row, column = np.unravel_index(np.argmax(plane), plane.shape)
@@ -231,12 +231,12 @@ class PSF:
         return widths
 
     def blurred(self, std_px: float) -> PSF:
-        """Return the PSF convolved with a Gaussian of that standard deviation, px.
+        """Return the PSF convolved with a Gaussian of the given standard deviation [px].
 
         Raises
         ------
         InputError
-            If it is negative or NaN.
+            If the standard deviation is negative or NaN.
         """
         std = number_between("std_px", std_px, 0.0, 100.0) * self.oversampling
         from scipy.ndimage import gaussian_filter
@@ -245,7 +245,7 @@ class PSF:
         return PSF(samples, self.oversampling, self.index)
 
     def index_of(self, n_subapertures: int) -> NDArray[np.int64]:
-        """Return the number of each sub-aperture's PSF.
+        """Return the index of the PSF of each sub-aperture.
 
         Raises
         ------
@@ -264,7 +264,7 @@ class PSF:
     def separable_terms(self) -> tuple[Floats, Floats]:
         """Profiles along x (n_psfs, rank, columns) and y (n_psfs, rank, rows); their products add up to PSFs.
 
-        By singular values, as few terms as leave less than 0.2 % of the peak out (at most 8).
+        The singular value decomposition is truncated at an error below 0.2 % of the peak (at most 8 terms).
         """
         u, s, vt = np.linalg.svd(self.samples, full_matrices=False)
         rank, peak = 1, self.samples.max(axis=(1, 2))
@@ -289,24 +289,24 @@ class PSF:
 
     @classmethod
     def load(cls, path: str | Path) -> PSF:
-        """Read what `save` wrote.
+        """Read a PSF written by `save`.
 
         Raises
         ------
         InputError
-            If it cannot be read or is no PSF.
+            If it cannot be read or is not a PSF.
         """
         return load_fields(cls, path, "a PSF", _FIELDS, optional=("index",))
 
 
 def _outer(u: Floats, s: Floats, vt: Floats, rank: int) -> Floats:
-    """Sum the first terms of singular-value decompositions."""
+    """Return the sum of the first terms of singular value decompositions."""
     product: Floats = (u[:, :, :rank] * s[:, None, :rank]) @ vt[:, :rank]
     return product
 
 
 def _half_maximum_width(profile: Floats, peak: int) -> float:
-    """Full width at half maximum of a sampled profile, interpolated linearly, in nodes."""
+    """Return the full width at half maximum of a sampled profile, interpolated linearly, in nodes."""
     half = 0.5 * profile[peak]
     width = 0.0
     for side in (profile[peak:], profile[peak::-1]):

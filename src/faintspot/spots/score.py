@@ -1,4 +1,4 @@
-"""A trained linear score: tables that turn the pixels around a spot into a correction of its position."""
+"""Trained linear score: tables that convert the pixels around a spot to a correction of its position."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from faintspot.base.npz import load_fields, save_fields
 from faintspot.spots.fixed_weights import FixedWeights
 
 STARTS = ("reference", "peak")
-_LARGEST_PX = 1e6  # of a table or an error: beyond any frame
-_BLOCK_IMAGES = 4096  # images worked on at a time: bounds the memory of the gathered tables
+_LARGEST_PX = 1e6  # for a table or an error: larger than any frame
+_BLOCK_IMAGES = 4096  # images processed at a time, to limit the memory of the gathered tables
 _FIELDS = ("tables", "flux_e", "standard_error_px", "steps_per_px", "start", "smoothing_px", "index")
 
 
@@ -25,34 +25,34 @@ _FIELDS = ("tables", "flux_e", "standard_error_px", "steps_per_px", "start", "sm
 class TrainedScore:
     """Tables of the trained linear score, made by `faintspot.train_estimator`; immutable.
 
-    A pass moves the position x to ``q + sum psi(u - q) g / F``: q is x rounded to a whole number of
-    table steps on both axes, g the image in electrons, u its pixel centres, F the expected flux, psi the
-    pass's table. Pixels beyond the table count nothing.
+    A pass changes the position x to ``q + sum psi(u - q) g / F``: q is x rounded to the grid of the table
+    on both axes, g the image in electrons, u its pixel centres, F the expected flux, psi the table of the
+    pass. Pixels outside the table are ignored.
 
     Parameters
     ----------
     tables : (n_kinds, n_classes, n_passes, 2, rows, columns) array
-        psi for x ([..., 0, :, :]) and for y ([..., 1, :, :]), px. Node (r, c) is for a pixel whose centre
-        lies ((c - (columns - 1) / 2) / steps_per_px, (r - (rows - 1) / 2) / steps_per_px) px from q; rows
-        and columns are odd. float32.
+        psi for x ([..., 0, :, :]) and for y ([..., 1, :, :]) [px]. Node (r, c) is for a pixel whose centre
+        is at ((c - (columns - 1) / 2) / steps_per_px, (r - (rows - 1) / 2) / steps_per_px) px from q; the
+        numbers of rows and columns are odd. float32.
     flux_e : (n_classes,) array
-        Flux that each class was trained for, increasing, electrons. Used is the class nearest in log flux.
+        Flux [electrons] for which each class was trained, increasing. The class nearest in log flux is used.
     standard_error_px : (n_kinds, n_classes, 2) array
-        Rms error in x and y, measured on samples that were not trained on.
+        Rms error in x and y, measured on samples not used for training.
     steps_per_px : int
-        Table steps per pixel; even, so that pixel centres fall on nodes.
+        Number of table steps per pixel; even, so that pixel centres fall on nodes.
     start : {"reference", "peak"}
-        Where the first pass starts: at the reference position, or at the largest pixel of the image smoothed
+        Starting point of the first pass: the reference position, or the largest pixel of the image smoothed
         by a Gaussian of standard deviation `smoothing_px`.
     smoothing_px : float
-        Only used with start "peak".
+        Width of the smoothing; only used with start "peak".
     index : (n_subapertures,) array of int, optional
         Kind of each sub-aperture. Default: one kind for all.
 
     Raises
     ------
     InputError
-        For a value that is not finite or out of range, or arrays that do not fit together.
+        If a value is not finite or out of range, or arrays are inconsistent.
 
     Examples
     --------
@@ -114,16 +114,16 @@ class TrainedScore:
 
     @property
     def passes(self) -> int:
-        """How many times the position is corrected."""
+        """Number of corrections of the position."""
         return int(self.tables.shape[2])
 
     def flux_class(self, flux_e: ArrayLike) -> NDArray[np.int64]:
-        """Return the class nearest in log flux for each flux (electrons); fluxes up to 0 give the faintest.
+        """Return the class nearest in log flux for each flux [electrons]; the faintest class if <= 0.
 
         Raises
         ------
         InputError
-            For a flux that is not finite.
+            If a flux is not finite.
         """
         flux = finite_array("flux_e", flux_e).astype(np.float64)
         borders = np.sqrt(self.flux_e[1:] * self.flux_e[:-1])
@@ -132,17 +132,17 @@ class TrainedScore:
     def standard_error(self, flux_e: float) -> NDArray[np.float64]:
         """Return the standard error of x and y at a flux, interpolated between the classes in log flux.
 
-        Beyond the classes it is that of the last one.
+        Outside the range of the classes it is that of the nearest one.
 
         Parameters
         ----------
         flux_e : float
-            Expected flux, electrons; above 0.
+            Expected flux [electrons], above 0.
 
         Returns
         -------
         (n_subapertures, 2) array, or (n_kinds, 2) without an index
-            Pixels.
+            Standard errors [px].
 
         Raises
         ------
@@ -163,30 +163,30 @@ class TrainedScore:
         reference: ArrayLike = 0.0,
         search_range_px: float | None = None,
     ) -> NDArray[np.float64]:
-        """Return the positions of spots: the plain reference for the fast kernel, in float64.
+        """Return the positions of spots, as a float64 reference implementation of the fast kernel.
 
         Parameters
         ----------
         images : (n, ny, nx) or (n_frames, n, ny, nx) array
-            Electrons, background subtracted. With an index, n is the number of sub-apertures.
+            Images [electrons], background subtracted. With an index, n is the number of sub-apertures.
         flux_e : float or array that broadcasts to (n,) or (n_frames, n)
-            Expected flux of the spots; values up to 0 leave the start as it is.
+            Expected flux of the spots; for values <= 0 the starting point is returned.
         start : array that broadcasts to (..., n, 2), optional
-            Positions to start from, such as predicted ones. Default: as `self.start` says.
+            Starting positions, such as predicted ones. Default: given by `self.start`.
         reference : array that broadcasts to (..., n, 2)
-            Reference positions, px from the window's centre.
+            Reference positions, px from the window centre.
         search_range_px : float, optional
-            Largest distance from the reference on each axis. Default: half the longer side of the window.
+            Maximum distance from the reference on each axis. Default: half the longer side of the window.
 
         Returns
         -------
         (..., n, 2) array
-            x and y in px from the window's centre.
+            x and y in px from the window centre.
 
         Raises
         ------
         InputError
-            For images that are not real and finite, or arrays of the wrong shape.
+            If images are not real and finite, or arrays have the wrong shape.
         """
         stack = image_stack("images", images).astype(np.float64)
         if stack.ndim not in (3, 4):
@@ -217,7 +217,7 @@ class TrainedScore:
     def _groups(
         self, leading: tuple[int, ...], classes: NDArray[np.int64]
     ) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
-        """Kind, flux class and numbers of images that share both, in blocks."""
+        """Yield kind, flux class and indices of images that share both, in blocks."""
         index = np.zeros(leading[-1], np.int64) if self.index is None else self.index
         if len(index) != leading[-1]:
             raise InputError(
@@ -241,7 +241,7 @@ class TrainedScore:
 
     @classmethod
     def load(cls, path: str | Path) -> TrainedScore:
-        """Read a score that `save` wrote.
+        """Read a score written by `save`.
 
         Raises
         ------
@@ -256,7 +256,7 @@ class TrainedScore:
 
 
 Score = TrainedScore | FixedWeights
-"""What an estimator applies that was learnt or made by hand."""
+"""Trained score or fixed weights applied by an estimator."""
 
 
 def load_score(path: str | Path) -> Score:
@@ -279,8 +279,8 @@ def table_sums(
     tables: NDArray[np.float32],
     steps_per_px: int,
 ) -> NDArray[np.float64]:
-    """Return the sums over the pixels of psi(u - q) times the images (n, ny, nx), for x and y: (n, 2)."""
-    padded = np.pad(tables, ((0, 0), (1, 1), (1, 1)))  # beyond the table: its border of zeros
+    """Return the sums of psi(u - q) times the images (n, ny, nx) over the pixels, for x and y: (n, 2)."""
+    padded = np.pad(tables, ((0, 0), (1, 1), (1, 1)))  # outside the table: its border of zeros
     (ny, nx), (side_y, side_x) = images.shape[1:], padded.shape[1:]
     rows = nodes_of_pixels(ny, rounded[:, 1], side_y, steps_per_px)[:, :, None]
     columns = nodes_of_pixels(nx, rounded[:, 0], side_x, steps_per_px)[:, None, :]
@@ -291,7 +291,7 @@ def table_sums(
 def nodes_of_pixels(
     n_pixels: int, position: NDArray[np.float64], n_nodes: int, steps_per_px: int
 ) -> NDArray[np.int64]:
-    """Node of each pixel centre in a table around a position: (n, n_pixels), clipped to its border."""
+    """Return the table node of each pixel centre around a position: (n, n_pixels), clipped to the border."""
     centres = np.arange(n_pixels) - 0.5 * (n_pixels - 1)
     nodes = np.rint((centres - position[:, None]) * steps_per_px).astype(np.int64) + (n_nodes - 1) // 2
     return np.clip(nodes, 0, n_nodes - 1)
@@ -300,10 +300,10 @@ def nodes_of_pixels(
 def smoothed_peak(
     images: NDArray[np.float64], smoothing_px: float, reference: NDArray[np.float64], search_range_px: float
 ) -> NDArray[np.float64]:
-    """Centre of the largest pixel of each smoothed image: (n, 2), px.
+    """Return the centre of the largest pixel of each smoothed image: (n, 2) px.
 
-    Only pixels count whose centre is within `search_range_px` + 0.5 of the reference, on both axes. The
-    Gaussian reaches 2.5 standard deviations; beyond the image there is no flux.
+    Only pixels whose centre is within `search_range_px` + 0.5 of the reference on both axes are considered.
+    The Gaussian is truncated at 2.5 standard deviations; the flux outside the image is taken to be 0.
     """
     n, ny, nx = images.shape
     reach = int(np.ceil(2.5 * smoothing_px))
@@ -322,7 +322,7 @@ def smoothed_peak(
 
 
 def _spread(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """A writable copy of finite numbers, broadcast to a shape."""
+    """Return a writable copy of finite numbers, broadcast to a shape."""
     array = finite_array(name, value).astype(np.float64)
     try:
         return np.broadcast_to(array, shape).copy()

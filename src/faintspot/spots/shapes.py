@@ -16,17 +16,17 @@ from faintspot.base.sizes import check_size
 Floats = NDArray[np.float64]
 
 SMALLEST_SIZE = 0.05
-"""The smallest spot size accepted, 0.1 px wide: the narrower a rotated spot, the more samples it takes."""
+"""Smallest spot size accepted, 0.1 px wide: narrower rotated spots need more samples."""
 
 FWHM_OF_SIZE_1_PX = {"diffraction": 1.772, "gaussian": 2.0}
 """Full width at half maximum of the optical spot of size 1, by profile."""
 
-_BLOCK_PIXELS = 1 << 15  # pixels worked on at a time: the temporary arrays stay in the processor's cache
+_BLOCK_PIXELS = 1 << 15  # pixels processed at a time: the temporary arrays stay in the cache
 _RIGHT_ANGLE_TOLERANCE_DEG = 1e-9
 
 
 class _Profile(NamedTuple):
-    """One axis of a spot of unit width and unit area."""
+    """Profile of one axis of a spot of unit width and unit area."""
 
     width_px: float  # unit width of a spot of size 1
     cumulative: Callable[[Floats], Floats]
@@ -34,7 +34,7 @@ class _Profile(NamedTuple):
 
 
 class _Shapes(NamedTuple):
-    """Position, flux, widths and angle of every spot, each of shape (n,)."""
+    """Position, flux, widths and angle of each spot, each of shape (n,)."""
 
     x: Floats
     y: Floats
@@ -48,8 +48,8 @@ class _Shapes(NamedTuple):
 
 
 def _sinc_squared_cumulative(u: Floats) -> Floats:
-    """Integral of sinc^2 from minus infinity to u: 1/2 + Si(2 pi u)/pi - u sinc^2(u), by parts."""
-    from scipy.special import sici  # here, as below: importing it takes 0.1 s, which slopes do not need
+    """Return the integral of sinc^2 from minus infinity to u: 1/2 + Si(2 pi u)/pi - u sinc^2(u), by parts."""
+    from scipy.special import sici  # imported here, as below: it takes 0.1 s and is not needed for slopes
 
     integral: Floats = 0.5 + sici(2 * np.pi * u)[0] / np.pi - u * np.sinc(u) ** 2
     return integral
@@ -92,23 +92,22 @@ def spots(
     elongation: ArrayLike = 1.0,
     angle_deg: ArrayLike = 0.0,
 ) -> NDArray[np.float64]:
-    """Return noiseless spot images: the mean electrons that each pixel collects.
+    """Return noiseless spot images: the mean number of electrons in each pixel.
 
-    Spots whose axes lie along the pixel grid are integrated over the pixels in closed form (round-off
-    only). Others are integrated numerically by Gauss-Legendre sampling of each pixel, with an error
-    below 1e-4 of the brightest pixel (measured: 5e-5 at size 1, less at most others).
+    Spots whose axes are parallel to the pixel grid are integrated over the pixels in closed form. Others are
+    integrated by Gauss-Legendre sampling of each pixel, with an error below 1e-4 of the brightest pixel
+    (measured: 5e-5 at size 1, less at most others).
 
     Parameters
     ----------
     positions : array_like, shape (n, 2)
-        x and y of each spot's centre, in px from the centre of its image. The position may lie outside
-        the image.
+        x and y of the spot centres, in px from the centre of the image. Positions may lie outside the image.
     shape : (int, int)
         Rows and columns (ny, nx) of each image, px.
     flux_e : float or array_like, shape (n,)
-        Electrons in the whole, infinite spot. What falls outside the image is lost, as behind a field
-        stop: a "diffraction" spot of size 1 at the centre of 16 x 16 px keeps 95 % of its flux.
-        To set the flux inside the image instead, divide it by the sums of the images of unit flux.
+        Electrons in the whole, infinite spot. Flux outside the image is lost, as with a field stop: a
+        "diffraction" spot of size 1 at the centre of 16 x 16 px keeps 95 % of its flux. To set the flux
+        inside the image instead, divide it by the sums of the images of unit flux.
     profile : {"diffraction", "gaussian"}
         "diffraction": the image behind a square lenslet of side d at wavelength lambda,
         sinc^2(x / w) sinc^2(y / w) with sinc(t) = sin(pi t) / (pi t) and w = lambda / d = 2 px * size;
@@ -116,9 +115,9 @@ def spots(
     size : float or array_like, shape (n,)
         Width in units of 2 px, at least 0.05.
     elongation : float or array_like, shape (n,)
-        Factor, at least 1, on the width along the spot's own x axis.
+        Factor, at least 1, on the width along the x axis of the spot.
     angle_deg : float or array_like, shape (n,)
-        Angle from the image's x axis to the spot's own x axis, counted from x towards y, degrees.
+        Angle from the x axis of the image to that of the spot, towards y [degrees].
 
     Returns
     -------
@@ -128,7 +127,7 @@ def spots(
     Raises
     ------
     InputError
-        If a value is not finite or out of its range, or an array has another shape.
+        If a value is not finite or out of range, or an array has another shape.
 
     Examples
     --------
@@ -161,7 +160,7 @@ def spots(
 
 
 def image_shape(name: str, shape: Any) -> tuple[int, int]:
-    """Return (rows, columns) as two whole numbers of at least 1, or raise InputError."""
+    """Return (rows, columns) as two integers of at least 1, or raise an InputError."""
     checked = numbers_between(name, shape, 1, 1 << 20, integer=True)
     if checked.shape != (2,):
         raise InputError(f"{name}: expected (rows, columns), got an array of shape {checked.shape}")
@@ -170,7 +169,7 @@ def image_shape(name: str, shape: Any) -> tuple[int, int]:
 
 
 def position_array(positions: Any) -> Floats:
-    """Return positions as float64 of shape (n, 2), or raise InputError."""
+    """Return positions as float64 of shape (n, 2), or raise an InputError."""
     checked = finite_array("positions", positions).astype(np.float64)
     if checked.ndim != 2 or checked.shape[1] != 2:
         raise InputError(f"positions: expected shape (n, 2) holding x and y, got {checked.shape}")
@@ -178,7 +177,7 @@ def position_array(positions: Any) -> Floats:
 
 
 def per_spot(name: str, value: Any, n_spots: int, low: float = -np.inf) -> Floats:
-    """Return one finite number of at least `low` for each spot, shape (n_spots,), or raise InputError."""
+    """Return one finite number >= `low` for each spot, shape (n_spots,), or raise an InputError."""
     checked = numbers_between(name, value, low)
     if checked.shape not in ((), (n_spots,)):
         raise InputError(f"{name}: expected one number or shape ({n_spots},), got {checked.shape}")
@@ -188,7 +187,7 @@ def per_spot(name: str, value: Any, n_spots: int, low: float = -np.inf) -> Float
 def _spot_shapes(
     positions: Any, flux_e: Any, size: Any, elongation: Any, angle_deg: Any, kind: _Profile
 ) -> _Shapes:
-    """Check what describes the spots and work out their widths."""
+    """Check the parameters of the spots and compute their widths."""
     checked = position_array(positions)
     n = len(checked)
     across = kind.width_px * per_spot("size", size, n, SMALLEST_SIZE)
@@ -202,7 +201,7 @@ def _pixel_centres(n: int) -> Floats:
 
 
 def _aligned_spots(spot: _Shapes, ny: int, nx: int, kind: _Profile) -> Floats:
-    """Integrate spots whose axes lie along rows and columns: the product of two closed forms."""
+    """Integrate spots whose axes are parallel to rows and columns: the product of two closed forms."""
     turned = np.rint(spot.angle / 90) % 2 == 1
     width_x = np.where(turned, spot.width_across, spot.width_along)
     width_y = np.where(turned, spot.width_along, spot.width_across)
@@ -212,7 +211,7 @@ def _aligned_spots(spot: _Shapes, ny: int, nx: int, kind: _Profile) -> Floats:
 
 
 def _axis_fractions(centre: Floats, width: Floats, n: int, kind: _Profile) -> Floats:
-    """Return the fraction of a one-dimensional spot that falls into each of n pixels, shape (spots, n)."""
+    """Return the fraction of a one-dimensional spot in each of n pixels, shape (spots, n)."""
     edges = np.arange(n + 1) - n / 2
     cumulative = kind.cumulative((edges - centre[:, None]) / width[:, None])
     # Round-off in the far wings must not turn into negative flux.
@@ -220,12 +219,12 @@ def _axis_fractions(centre: Floats, width: Floats, n: int, kind: _Profile) -> Fl
 
 
 def _samples(smallest_size: float) -> int:
-    """Return the Gauss-Legendre points per pixel and axis for an error below 1e-4 of the brightest pixel."""
+    """Return the Gauss-Legendre points per pixel and axis for an error below 1e-4 of the peak pixel."""
     return max(3, math.ceil(1 + 2 / smallest_size))
 
 
 def _rotated_spots(spot: _Shapes, ny: int, nx: int, kind: _Profile, samples: int) -> Floats:
-    """Integrate spots at any angle over the pixels by samples x samples Gauss-Legendre points in each."""
+    """Integrate spots at any angle over the pixels with samples x samples Gauss-Legendre points in each."""
     nodes, weights = np.polynomial.legendre.leggauss(samples)
     angle = np.deg2rad(spot.angle)
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]

@@ -1,4 +1,4 @@
-"""Short-exposure spots of a lenslet that sees turbulence: speckled, with a known position."""
+"""Short-exposure spots of a lenslet in turbulence: speckled, with a known position."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from faintspot.turbulence.von_karman import structure_function
 Floats = NDArray[np.float64]
 
 LARGEST_D_OVER_R0 = 10.0
-"""The largest sub-aperture accepted, in r0: four points of the phase's grid for each r0."""
+"""Largest sub-aperture side accepted, in r0: the phase grid has four points per r0."""
 
-# Points across the sub-aperture. The grid's image repeats itself every `points` lambda / d.
+# Points across the sub-aperture. The image of the grid is periodic with a period of `points` lambda / d.
 _FEWEST_POINTS, _MOST_POINTS = 24, 40
 _LARGEST_OUTER_SCALE = 1e5
 _TRUTHS = ("gradient", "centre_of_gravity")
-_BLOCK_POINTS = 1 << 18  # image samples worked on at a time: the temporary arrays stay in the cache
+_BLOCK_POINTS = 1 << 18  # image samples processed at a time: the temporary arrays stay in the cache
 
 
 class _PhaseModes(NamedTuple):
@@ -48,27 +48,27 @@ def speckled_spots(
     truth: str = "gradient",
     rng: np.random.Generator | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return noiseless short-exposure images behind square sub-apertures, and where their spots are.
+    """Return noiseless short-exposure images behind square sub-apertures, and the positions of their spots.
 
-    Each image has a phase of its own, drawn from its exact covariance over the sub-aperture: that of the
-    Kolmogorov structure function 6.88 (r / r0)^(5/3) (Fried 1966, JOSA 56, 1372) or, with an outer scale,
-    of von Karman turbulence. The amplitude is uniform (no scintillation). With d_over_r0 = 0 the images are
-    the "diffraction" spots of `faintspot.spots.shapes`.
+    The phase of each image is drawn from its exact covariance over the sub-aperture, that of the Kolmogorov
+    structure function 6.88 (r / r0)^(5/3) (Fried 1966, JOSA 56, 1372) or, with an outer scale, of von
+    Karman turbulence. The amplitude is uniform (no scintillation). With d_over_r0 = 0 the images are the
+    "diffraction" spots of `faintspot.spots.shapes`.
 
-    By default the mean gradient of the turbulence's phase is taken off and the random (or given) position
-    put in its place, so that positions have the range that was asked for whatever the turbulence.
+    By default, the mean gradient of the turbulent phase is replaced by the random (or given) position, so
+    that positions have the requested range at any strength of turbulence.
 
     Parameters
     ----------
     n : int
-        How many images.
+        Number of images.
     d_over_r0 : float or array_like, shape (n,)
         Side of the sub-aperture in units of the Fried parameter at the sensing wavelength, 0 to 10.
     shape : (int, int)
         Rows and columns (ny, nx) of each image, px.
     size : float or array_like, shape (n,)
-        lambda / d = 2 px * size, at least 0.05. Images wider than 40 lambda / d get too much of the flux in
-        their outskirts.
+        lambda / d = 2 px * size, at least 0.05. In images wider than 40 lambda / d too much of the flux is in
+        the outer parts.
     position_range_px : float
         Positions are uniform within plus and minus this, on each axis, px.
     positions : array_like, shape (n, 2), optional
@@ -78,14 +78,14 @@ def speckled_spots(
     outer_scale_d : float, optional
         Outer scale in units of the sub-aperture's side d, 0.1 to 1e5. Default: infinite (Kolmogorov).
     natural_tilt : bool
-        Whether the mean gradient of the turbulence itself is kept and adds to the position.
+        Whether the mean gradient of the turbulence itself is kept and added to the position.
     truth : {"gradient", "centre_of_gravity"}
-        "gradient": the mean gradient of the phase over the sub-aperture, which is what a wavefront sensor
-        is to measure, as the displacement it gives the spot. It is also the centre of gravity of all the
-        light, in and outside the image. "centre_of_gravity": that of the flux within the image, without
+        "gradient": mean gradient of the phase over the sub-aperture as a displacement of the spot. This is
+        the quantity that a wavefront sensor is to measure, and the centre of gravity of all flux in and
+        outside the image. "centre_of_gravity": centre of gravity of the flux within the image, without
         noise.
     rng : numpy.random.Generator, optional
-        Where positions and phases come from, each from a generator of its own.
+        Generator from which separate ones for positions and phases are spawned.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def speckled_spots(
     Raises
     ------
     InputError
-        If a value is not finite, out of its range or of the wrong shape.
+        If a value is not finite, out of range or of the wrong shape.
 
     Examples
     --------
@@ -143,9 +143,9 @@ def speckled_images(
     natural_tilt: bool = False,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    """Return images and the displacements by the mean gradients, as `speckled_spots`, which see.
+    """Return images and the displacements by the mean gradients; see `speckled_spots`.
 
-    The phases are the next draws of `rng`: images made in several calls are those of one call.
+    The phases are the next draws of `rng`, so that several calls give the same images as one call.
     """
     n = len(positions)
     ny, nx = image_shape("shape", shape)
@@ -181,7 +181,7 @@ def _outer_scale(value: Any) -> float:
 
 
 def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
-    """Return the points across the sub-aperture: the repeated images stay outside the window."""
+    """Return the points across the sub-aperture for which periodic images stay outside the window."""
     wanted = max(1.25 * window_lambda_over_d, 4 * d_over_r0)
     return int(np.clip(2 * math.ceil(wanted / 2), _FEWEST_POINTS, _MOST_POINTS))
 
@@ -190,8 +190,8 @@ def _points(window_lambda_over_d: float, d_over_r0: float) -> int:
 def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
     """Return the square root of the covariance of phases and mean gradients, for d = r0 = 1.
 
-    The mean gradient of a phase over a square is the difference of its means over opposite edges, exactly;
-    edges are therefore part of the covariance. The common piston of all points is taken off.
+    The mean gradient of a phase over a square is exactly the difference of its means over opposite edges,
+    which are therefore part of the covariance. The common piston of all points is removed.
     """
     line = (np.arange(points) + 0.5) / points - 0.5
     y, x = (axis.ravel() for axis in np.meshgrid(line, line, indexing="ij"))
@@ -215,7 +215,7 @@ def _phase_modes(points: int, outer_scale: float) -> _PhaseModes:
 
 
 def _draw(modes: _PhaseModes, strength: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Draw phases (n, points, points) without their mean gradient, and that gradient (n, 2), rad per d."""
+    """Draw phases (n, points, points) without their mean gradient, and that gradient (n, 2) [rad per d]."""
     noise = rng.standard_normal((len(strength), modes.phase.shape[1])) * strength[:, None]
     gradient = noise @ modes.gradient.T
     points = math.isqrt(len(modes.phase))
@@ -226,10 +226,10 @@ def _draw(modes: _PhaseModes, strength: Floats, rng: np.random.Generator) -> tup
 
 
 def _pixel_samples(smallest_width: float) -> tuple[Floats, Floats]:
-    """Return offsets in px and weights of the samples of a pixel along one axis (Gauss-Legendre).
+    """Return offsets [px] and weights of the samples of a pixel along one axis (Gauss-Legendre).
 
-    The image holds no frequency above 1 / width cycles per pixel; three samples at width 2 px integrate it
-    to 1e-4 of the brightest pixel.
+    The image has no frequency above 1 / width cycles per pixel; for a width of 2 px, three samples
+    integrate it to 1e-4 of the brightest pixel.
     """
     nodes, weights = np.polynomial.legendre.leggauss(2 + math.ceil(2 / smallest_width))
     return nodes / 2, weights / 2
@@ -243,10 +243,10 @@ def _intensities(
     nodes: Floats,
     weights: Floats,
 ) -> Floats:
-    """Return the pixel-integrated images (n, ny, nx) of phases displaced to the positions.
+    """Return the pixel-integrated images (n, ny, nx) of phases, displaced to the positions.
 
-    Each point of the phase is a square of constant phase: without turbulence that is the lenslet itself,
-    exactly, and its image is sinc^2. The displacement moves the image rather than the phase.
+    Each point is a square of constant phase. Without turbulence these form the lenslet exactly, and the
+    image is sinc^2. The displacement is applied to the image rather than to the phase.
     """
     points = phase.shape[-1]
     field = np.exp(1j * phase.astype(np.float32))
@@ -262,9 +262,9 @@ def _intensities(
 
 
 def _fourier(length: int, centre: Floats, width: Floats, points: int, nodes: Floats) -> NDArray[np.complex64]:
-    """Return the Fourier transform from the sub-aperture's points to the samples, shape (n, samples, points).
+    """Return the Fourier transform from sub-aperture points to image samples, shape (n, samples, points).
 
-    One axis of the image; samples are those of all pixels.
+    It is for one axis of the image and the samples of all pixels.
     """
     samples = ((np.arange(length) - (length - 1) / 2)[:, None] + nodes).ravel()
     angle = (samples - centre[:, None]) / width[:, None]  # in lambda / d
@@ -276,7 +276,7 @@ def _fourier(length: int, centre: Floats, width: Floats, points: int, nodes: Flo
 
 
 def _centres_of_gravity(images: Floats) -> Floats:
-    """Return the centre of gravity of each image, px from its middle."""
+    """Return the centre of gravity of each image, px from its centre."""
     ny, nx = images.shape[1:]
     total = images.sum(axis=(1, 2))
     x = images.sum(axis=1) @ (np.arange(nx) - (nx - 1) / 2)

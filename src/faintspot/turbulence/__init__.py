@@ -1,1 +1,1 @@
-"""Statistics of von Karman turbulence, as theory has them."""
+"""Statistics of von Karman turbulence."""

@@ -16,7 +16,7 @@ from faintspot.turbulence.von_karman import R0_WAVELENGTH_M, SPECTRUM
 Floats = NDArray[np.float64]
 
 KOLMOGOROV = math.inf
-"""Outer scale of Kolmogorov's spectrum."""
+"""Outer scale of the Kolmogorov spectrum."""
 
 _FEWEST_FRAMES = 20
 _FREQUENCIES = 600
@@ -26,19 +26,19 @@ _LOWEST, _HIGHEST = 1e-5, 60.0  # frequencies, in cycles per sub-aperture
 
 @dataclass(frozen=True)
 class Seeing:
-    """What the slopes of a stretch of frames say about the air."""
+    """Atmospheric parameters estimated from the slopes of a sequence of frames."""
 
     r0_m: float
-    """Fried parameter at 500 nm; NaN when the slopes vary no more than their noise."""
+    """Fried parameter at 500 nm; NaN if the slopes vary no more than their noise."""
     r0_x_m: float
-    """From the slopes along x alone."""
+    """Fried parameter from the slopes along x alone."""
     r0_y_m: float
     r0_kolmogorov_m: float
-    """What would come out without the outer scale, from the same slopes."""
+    """Fried parameter from the same slopes with an infinite outer scale."""
     slope_std_px: float
-    """Standard deviation of a slope without its noise, as it entered."""
+    """Standard deviation of a slope without noise, used for the estimate."""
     noise_std_px: float
-    """Standard deviation of a slope's noise."""
+    """Standard deviation of the slope noise."""
     frames: int
 
 
@@ -52,28 +52,28 @@ def slope_variance(
 ) -> float:
     """Return the variance of the wavefront's mean gradient over square sub-apertures for r0 = 1 m, rad^2.
 
-    Of von Karman turbulence, whose phase has the power spectral density
-    0.0229 r0^(-5/3) (f^2 + 1 / L0^2)^(-11/6); for another r0 (at 500 nm) multiply by r0^(-5/3). The
-    gradient of the optical path does not depend on the wavelength.
+    The power spectral density of the phase of von Karman turbulence is 0.0229 r0^(-5/3) (f^2 + 1 /
+    L0^2)^(-11/6); for another r0 (at 500 nm) multiply by r0^(-5/3). The gradient of the optical path does
+    not depend on the wavelength.
 
     Parameters
     ----------
     subaperture_m : float
     outer_scale_m : float
-        L0; infinite for Kolmogorov's spectrum, cut at 1e5 sub-apertures.
+        L0; infinite for the Kolmogorov spectrum, which is truncated at 1e5 sub-apertures.
     baseline_m : float, optional
-        Distance over which the gradient is taken. Default: the sub-aperture's side; one that is simulated
-        with n points across has n - 1 steps between them, (n - 1) / n of its side.
+        Distance over which the gradient is taken. Default: the side of the sub-aperture. In a simulation
+        with n points across it is (n - 1) / n of the side, since there are n - 1 steps between them.
     positions : (n, 2) array, optional
-        Centres x, y of n sub-apertures, m: the variance about their mean in each frame, averaged over them.
-        Default: the variance of one slope.
+        Centres x, y of n sub-apertures [m]: the result is the variance about their mean in each frame,
+        averaged over them. Default: the variance of one slope.
     along : two numbers
         Direction of the gradient, along a side of the sub-apertures.
 
     Raises
     ------
     InputError
-        For sizes that are not above 0, or positions of another shape.
+        If sizes are not above 0, or positions have another shape.
     """
     side = number_between("subaperture_m", subaperture_m, 0, low_open=True)
     if math.isnan(outer_scale_m) or outer_scale_m <= 0:
@@ -125,38 +125,39 @@ def estimate_r0(
     static_px: ArrayLike | None = None,
     remove_tip_tilt: bool = True,
 ) -> Seeing:
-    """Return r0 from slopes of the air alone, (frames, 2 n) px: all x, then all y.
+    """Return r0 estimated from slopes due to the atmosphere alone, (frames, 2 n) px: all x, then all y.
 
-    The slopes' variance is set equal to `slope_variance`. Noise, which differs from frame to frame, is taken
-    out by the covariance of each slope with itself one and two frames later: the variance without noise is
-    their extrapolation to no delay along a parabola, (4 C1 - C2) / 3.
+    The variance of the slopes is equated to `slope_variance`. Noise is independent between frames and is
+    removed by means of the covariances C1 and C2 of each slope with itself one and two frames later: the
+    variance without noise is their parabolic extrapolation to zero delay, (4 C1 - C2) / 3.
 
     Parameters
     ----------
     slopes_px : (frames, 2 n) array
-        As `pseudo_open_loop_slopes` returns them.
+        Slopes as returned by `pseudo_open_loop_slopes`.
     cells : (n, 2) array of int
         Row and column of each sub-aperture in the lenslet array.
     subaperture_m : float
         Side of a sub-aperture.
     pixel_scale_rad : float
-        Angle on the sky that a pixel sees.
+        Angle on the sky per pixel.
     outer_scale_m : float
-        Infinite: Kolmogorov's spectrum, which overestimates r0.
+        Outer scale; infinite for the Kolmogorov spectrum, which overestimates r0.
     baseline_m : float, optional
-        As `slope_variance`.
+        As for `slope_variance`.
     segment : (frames,) array of int, optional
-        Frames with the same number follow each other without a gap, as those of a measurement. Default: all.
+        Number of the continuous segment to which each frame belongs. Default: all frames are one segment.
     static_px : (2 n,) array, optional
-        Slopes that are no turbulence's, better known from a longer record. Default: the mean of the frames.
+        Slopes not due to turbulence, known better from a longer record. Default: mean of the frames.
     remove_tip_tilt : bool
-        Whether the mean over all sub-apertures is taken out of each frame, and out of the theory. It changes
-        so slowly that short records hold few independent values of it, and telescopes shake.
+        Whether the mean over all sub-apertures is removed from each frame, and from the theory. It changes
+        so slowly that short records have few independent values of it, and it is affected by telescope
+        vibration.
 
     Raises
     ------
     InputError
-        If shapes do not fit together, or there are fewer than 20 frames.
+        If shapes are inconsistent, or there are fewer than 20 frames.
     """
     slopes, places = _checked(slopes_px, cells)
     part = np.zeros(len(slopes), np.int64) if segment is None else np.asarray(segment)
@@ -197,13 +198,13 @@ def estimate_r0(
 
 
 def mean_r0(r0_m: ArrayLike) -> float:
-    """Return the r0 of steady air with the mean strength of turbulence, (mean of r0^(-5/3))^(-3/5)."""
+    """Return the r0 of constant turbulence with the mean strength, (mean of r0^(-5/3))^(-3/5)."""
     values = numbers_between("r0_m", r0_m, 0, low_open=True)
     return float(np.mean(values ** (-5 / 3)) ** (-3 / 5))
 
 
 def _array_factor(positions: tuple[tuple[float, ...], ...], x: Floats, y: Floats) -> Floats:
-    """Return |mean of exp(2 pi i f r)|^2: the part of the variance that all sub-apertures share."""
+    """Return |mean of exp(2 pi i f r)|^2: the part of the variance common to all sub-apertures."""
     total = np.zeros(x.shape, np.complex128)
     for across, up in positions:
         total += np.exp(2j * math.pi * (across * x + up * y))
@@ -234,7 +235,7 @@ def _checked_static(static_px: ArrayLike, n: int) -> Floats:
 
 
 def _lagged(axes: Floats, part: NDArray[np.int64], lag: int) -> Floats:
-    """Return the mean product of slopes `lag` frames apart of the same stretch, for x and for y."""
+    """Return the mean product of slopes `lag` frames apart within a segment, for x and y."""
     together = part[lag:] == part[:-lag]
     products: Floats = (axes[lag:][together] * axes[:-lag][together]).mean(axis=(0, 2))
     return products

@@ -1,9 +1,9 @@
-"""Covariances of slopes in von Karman turbulence that the wind carries over the telescope.
+"""Covariances of slopes in von Karman turbulence carried over the telescope by the wind.
 
 The mean gradient over a square is a difference of the phase along two of its edges, so that all covariances
-are sums of the phase's structure function D over pairs of edges: cov = 1/2 sum of signs times D. No spectrum
-is sampled and nothing repeats itself. Layers are frozen and independent: after a time t a layer is as it was,
-shifted by the wind.
+are sums of the phase structure function D over pairs of edges: cov = 1/2 sum of signs times D. No spectrum
+is sampled, and nothing is periodic. Layers are frozen and independent: after a time t, a layer is shifted
+by the wind and otherwise unchanged.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from faintspot.turbulence.von_karman import R0_WAVELENGTH_M, structure_function
 
 Floats = NDArray[np.float64]
 
-_SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations in outer scales of the table
+_SMALLEST, _LARGEST, _NODES = 1e-6, 1e3, 2000  # separations of the table in outer scales
 _DIRECTIONS = 8
 _POINTS = 6  # of the quadrature along half an edge
 
 
 @dataclass(frozen=True, eq=False)
 class SlopeTurbulence:
-    """The slopes of turbulence that a Shack-Hartmann sensor sees, as far as theory knows them.
+    """Turbulence and geometry that determine the slopes of a Shack-Hartmann sensor.
 
     Parameters
     ----------
     positions_m : (n, 2) array
-        x (along columns) and y (along rows) of the sub-apertures' centres.
+        x (along columns) and y (along rows) of the sub-aperture centres.
     subaperture_m : float
         Side of a sub-aperture.
     pixel_scale_rad : float
-        Angle on the sky that a pixel sees.
+        Angle on the sky per pixel.
     r0_m : float
         Fried parameter at 500 nm.
     outer_scale_m : float
-        L0; infinite: Kolmogorov's spectrum.
+        Outer scale L0; infinite for the Kolmogorov spectrum.
     fraction : (layers,) array
-        Strength of each layer; their ratios matter.
+        Strength of each layer; only ratios matter.
     wind_m_per_s : (layers, 2) array
         Velocity of each layer along x and y.
     """
@@ -67,21 +67,21 @@ class SlopeTurbulence:
 
     @property
     def px2_per_rad2_per_m2(self) -> float:
-        """Square of the slope in px of a gradient of 1 rad/m at 500 nm."""
+        """Squared slope [px] for a gradient of 1 rad/m at 500 nm."""
         return (R0_WAVELENGTH_M / (2 * math.pi) / self.pixel_scale_rad) ** 2
 
     def turned(self, factor: float, degrees: float) -> Self:
-        """Return the same with all winds as many times as fast and turned by an angle."""
+        """Return the same turbulence with all winds multiplied by a factor and rotated by an angle."""
         angle = math.radians(degrees)
         turn = factor * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         return replace(self, wind_m_per_s=np.asarray(self.wind_m_per_s) @ turn.T)
 
     def lagged_px2(self, frame_s: float) -> Floats:
-        """Return (3, 2 n, 2 n): `covariance_px2` for 0, 1 and 2 frames."""
+        """Return `covariance_px2` for delays of 0, 1 and 2 frames, (3, 2 n, 2 n)."""
         return np.array([self.covariance_px2(lag * frame_s) for lag in range(3)])
 
     def layers(self) -> list[Self]:
-        """Return each layer by itself, as strong as it is."""
+        """Return each layer separately, with its own strength."""
         part = np.asarray(self.fraction, np.float64) / np.sum(self.fraction)
         return [
             replace(
@@ -95,7 +95,7 @@ class SlopeTurbulence:
         ]
 
     def from_anywhere(self) -> Self:
-        """Return the same with winds of these speeds from all directions alike."""
+        """Return the same turbulence with winds of the same speeds, averaged over all directions."""
         angles = 2 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         around = np.column_stack([np.cos(angles), np.sin(angles)])
         speeds = np.hypot(*np.asarray(self.wind_m_per_s).T)
@@ -103,7 +103,7 @@ class SlopeTurbulence:
         return replace(self, fraction=np.repeat(self.fraction, _DIRECTIONS), wind_m_per_s=winds)
 
     def _of_layer(self, x: Floats, y: Floats) -> Floats:
-        """Return the covariance of gradients with such separations, rad^2 m^-2 for r0 = 1 m."""
+        """Return the covariance of gradients at the given separations [rad^2 m^-2] for r0 = 1 m."""
         offsets, which = np.unique(
             np.round(np.column_stack([x.ravel(), y.ravel()]), 9), axis=0, return_inverse=True
         )
@@ -121,7 +121,7 @@ def gradient_covariances(along: Floats, across: Floats, side_m: float, outer_sca
     along, across : array
         Separations along x and y, m.
     side_m : float
-        Of the squares.
+        Side of the squares.
     outer_scale_m : float
     """
     structure = _structure(outer_scale_m)
@@ -144,7 +144,7 @@ def phase_covariance_rad2(positions_m: Floats, r0_m: float, outer_scale_m: float
     r0_m : float
         Fried parameter at 500 nm.
     outer_scale_m : float
-        Of von Karman's spectrum; finite.
+        Outer scale of the von Karman spectrum; finite.
     """
     structure = _structure(outer_scale_m)
     x, y = (line[:, None] - line for line in positions_m.T)
@@ -153,7 +153,7 @@ def phase_covariance_rad2(positions_m: Floats, r0_m: float, outer_scale_m: float
 
 
 class _Structure:
-    """The structure function of the phase, rad^2, at the square of a separation, for r0 = 1 m."""
+    """Phase structure function [rad^2] of the squared separation, for r0 = 1 m."""
 
     def __init__(self, outer_scale_m: float) -> None:
         self._scale = outer_scale_m
@@ -175,10 +175,10 @@ def _structure(outer_scale_m: float) -> _Structure:
 
 
 def _same_axis(along: Floats, across: Floats, side: float, structure: _Structure) -> Floats:
-    """Return the covariance of gradients along the same axis: of parallel edges."""
+    """Return the covariance of gradients along the same axis, from parallel edges."""
     nodes, weights = np.polynomial.legendre.leggauss(2 * _POINTS)
     total = np.zeros(along.shape)
-    for half in (-0.5, 0.5):  # the density of differences between two edges' points is a triangle
+    for half in (-0.5, 0.5):  # the density of differences between points of two edges is a triangle
         place = half * side * (1 + nodes * np.sign(half))
         weight = 0.5 * weights * (1 - np.abs(place) / side)
         for node, part in zip(place, weight, strict=True):
@@ -189,7 +189,7 @@ def _same_axis(along: Floats, across: Floats, side: float, structure: _Structure
 
 
 def _both_axes(along: Floats, across: Floats, side: float, structure: _Structure) -> Floats:
-    """Return the covariance of a gradient along x with one along y, `along`, `across` apart."""
+    """Return the covariance of gradients along x and y at the separation `along`, `across`."""
     nodes, weights = np.polynomial.legendre.leggauss(_POINTS)
     total = np.zeros(along.shape)
     for on_x, weight_x in zip(0.5 * side * nodes, 0.5 * weights, strict=True):

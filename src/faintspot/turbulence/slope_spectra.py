@@ -1,8 +1,8 @@
-"""Cross-spectra of slopes in frozen turbulence, as the windowed Fourier transform of a record shows them.
+"""Cross-spectra of slopes in frozen turbulence, including the window of the Fourier transform.
 
-A layer with the wind v has the covariance cov(b - v t) between slopes of sub-apertures b apart, a time t
-later. Its windowed transform is exact, leakage included. Covariances come from tables, fine near the origin
-and coarse far away, for some outer scales; between these they are interpolated in the logarithm.
+For a layer with wind v, slopes of sub-apertures b apart have the covariance cov(b - v t) after a time t.
+Its windowed transform is exact, including leakage. Covariances are tabulated, finely near the origin and
+coarsely far from it, for some outer scales, and interpolated in the logarithm of the outer scale.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ _SPACING = 0.1  # of the table's grid, asinh(separation / side of a sub-aperture
 
 
 class SlopeSpectra:
-    """Cross-spectra of a sensor's slopes at some frequencies.
+    """Cross-spectra of the slopes of a sensor at selected frequencies.
 
-    Only pairs of sub-apertures that are apart in different ways are computed: rows of "distinct" spectra are
-    xx, xy and yy of each such separation, of which the opposite ones are the complex conjugates.
+    Only distinct separations of sub-apertures are computed: rows of "distinct" spectra are xx, xy and yy
+    for each of them; opposite separations have the complex conjugates.
 
     Parameters
     ----------
     site : SlopeTurbulence
-        Its positions, sub-aperture and pixel scale count; strength, outer scale and winds do not.
+        Positions, sub-aperture and pixel scale are used; strength, outer scale and winds are not.
     step_s : float
         Time between two values of a record.
     window : (length,) array
-        By which the record was multiplied before its transform; the sum of squares is 1.
+        Window by which the record was multiplied before its transform; the sum of squares is 1.
     bins : (frequencies,) array of int
-        Of the transform, frequency 1 / (length step_s) times.
+        Bins of the transform, at frequencies bins / (length step_s).
     reach_m : float
         Largest shift by the wind within a window.
     """
@@ -74,9 +74,9 @@ class SlopeSpectra:
         )
 
     def tables(self, outer_scale_m: float) -> tuple[Floats, Floats]:
-        """Return tables of the covariances xx, xy and yy of turbulence with r0 = 1 m, and their derivative.
+        """Return tables of the covariances xx, xy and yy of turbulence with r0 = 1 m, and their derivatives.
 
-        The derivative is by the logarithm of the outer scale.
+        The derivative is with respect to the logarithm of the outer scale.
         """
         place = (math.log(outer_scale_m) - _FIRST_LOG_SCALE) / _LOG_SCALE_STEP
         node = int(min(max(math.floor(place), 0), _SCALES - 2))
@@ -111,7 +111,7 @@ class SlopeSpectra:
         return np.asarray(self._transform @ both)
 
     def matrices(self, distinct: Complex) -> Complex:
-        """Return the cross-spectra (frequencies, 2 n, 2 n) of distinct ones."""
+        """Return the cross-spectra (frequencies, 2 n, 2 n) from the distinct ones."""
         full = distinct[:, self._which]
         np.conjugate(full, out=full, where=self._opposite)
         return full

@@ -1,4 +1,4 @@
-"""The von Karman model of atmospheric turbulence: structure function and power spectrum of the phase."""
+"""Von Karman model of atmospheric turbulence: structure function and power spectrum of the phase."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Floats = NDArray[np.float64]
 R0_WAVELENGTH_M = 500e-9
 """Wavelength at which the Fried parameter r0 is given."""
 SPECTRUM = 0.0229
-"""Factor of the power spectral density of the phase, SPECTRUM r0^(-5/3) (f^2 + 1 / L0^2)^(-11/6)."""
+"""Coefficient of the power spectral density of the phase, SPECTRUM r0^(-5/3) (f^2 + 1 / L0^2)^(-11/6)."""
 
 
 def structure_function(separation: Floats, outer_scale: float) -> Floats:
-    """Return the phase structure function for r0 = 1, rad^2; an infinite outer scale is Kolmogorov's.
+    """Return the phase structure function [rad^2] for r0 = 1; infinite outer scale: Kolmogorov.
 
     D(r) = 6.88 r^(5/3) (Fried 1966, JOSA 56, 1372), or with an outer scale D(r) = 2 (B(0) - B(r)) with B(r)
     proportional to L0^(5/3) (2 pi r / L0)^(5/6) K_5/6(2 pi r / L0) (Conan 2008, JOSA A 25, 526).
@@ -24,11 +24,11 @@ def structure_function(separation: Floats, outer_scale: float) -> Floats:
     Parameters
     ----------
     separation : array
-        In units of r0.
+        Separation in units of r0.
     outer_scale : float
         L0 in units of r0.
     """
-    from scipy.special import gamma, kv  # importing it takes 0.1 s, which slopes do not need
+    from scipy.special import gamma, kv  # imported here: it takes 0.1 s and is not needed for slopes
 
     if math.isinf(outer_scale):
         kolmogorov: Floats = 6.88 * separation ** (5 / 3)
