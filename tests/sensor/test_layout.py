@@ -45,7 +45,7 @@ class TestGrid:
     @pytest.mark.parametrize(
         ("words", "arguments"),
         [
-            ("no sub-aperture is lit", {"outer_radius": 1.0, "inner_radius": 2.0}),
+            ("no sub-aperture is illuminated", {"outer_radius": 1.0, "inner_radius": 2.0}),
             ("overlap", {"pitch": 3}),
             ("leaves the frame of 10 x 28", {"frame_shape": (10, 28)}),
             ("pixels = 1", {"pixels": 1}),
@@ -155,8 +155,8 @@ class TestSelection:
         ("words", "chosen"),
         [
             ("mask of 4, got 3", np.ones(3, bool)),
-            ("none is chosen", np.zeros(4, bool)),
-            ("none is chosen", slice(4, 9)),
+            ("got none", np.zeros(4, bool)),
+            ("got none", slice(4, 9)),
             ("= 4: expected a number from -4 to 3", [0, 4]),
             ("twice", [0, -4]),
             ("whole number", [0.5]),

@@ -1,1 +1,1 @@
-"""What the sensor is: where its sub-apertures are, its calibration, its settings."""
+"""Layout of the sub-apertures, and methods that find them in frames."""

@@ -1,7 +1,7 @@
-"""Follow spots that an aberration moves far from their nodes, from neighbour to neighbour.
+"""Match displaced spots to lattice nodes, from neighbour to neighbour.
 
-An aberration is smooth: the displacement of a spot is about what its neighbours' displacements extrapolate
-to. So nodes and spots are matched outwards from the largest part of the lattice in which neighbours agree.
+An aberration is smooth, so that the displacement of a spot can be extrapolated from its neighbours. Nodes and
+spots are matched outwards from the largest part of the lattice in which neighbours agree.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from scipy.spatial import cKDTree
 from faintspot.sensor.lattice import Lattice
 from faintspot.sensor.nodes import REACH
 
-# Parts of a pitch: how far a spot lies from its node where the matching starts, how much neighbours'
-# displacements may differ there, and how far a spot may lie from where its neighbours say that it is.
+# In pitches: largest distance of a spot from its node where the matching starts, largest difference between
+# neighbouring displacements there, and largest distance of a spot from the position extrapolated to it.
 _START, _AGREE, _NEAR = 0.3, 0.2, 0.3
-# A displacement and its gradient are fitted to so many neighbours, with Gaussian weights of this standard
-# deviation (pitches); the ridge (square pitches) makes the gradient of neighbours in a line solvable.
+# Number of neighbours to which a displacement and its gradient are fitted, and standard deviation (pitches)
+# of their Gaussian weights. The ridge (square pitches) keeps the fit to collinear neighbours solvable.
 _FITTED, _REACH, _RIDGE = 12, 1.5, 0.1
-_ROUNDS = 200  # more than any frame has rings of lenslets
+_ROUNDS = 200  # more than the number of rings of lenslets in any frame
 
 
 @dataclass(frozen=True, eq=False)
 class FollowedDrift:
-    """Displacements of spots, continued to any place by a plane through the nearest ones.
+    """Displacements of spots, extrapolated to any position by a plane through the nearest ones.
 
     Parameters
     ----------
     nodes, shifts : complex arrays (n,)
-        Places and displacements, x + 1j * y, px.
+        Positions and displacements, x + 1j * y [px].
     pitch_px : float
     """
 
@@ -42,7 +42,7 @@ class FollowedDrift:
     pitch_px: float
 
     def __call__(self, nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the displacements of spots whose nodes lie at x + 1j * y."""
+        """Return the displacements of spots with nodes at x + 1j * y."""
         distance, near = _tree(self.nodes).query(_xy(nodes), min(_FITTED, len(self.nodes)))
         distance, near = distance.reshape(len(nodes), -1) / self.pitch_px, near.reshape(len(nodes), -1)
         weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / _REACH**2)
@@ -57,7 +57,7 @@ class FollowedDrift:
         gradient_x = (yy * along - xy * across) / (xx * yy - xy**2)
         gradient_y = (xx * across - xy * along) / (xx * yy - xy**2)
         to = (nodes - middle) / self.pitch_px
-        # No farther than the fit reaches: a plane goes on for ever.
+        # No farther than the range of the fit, since a plane is unbounded.
         to *= np.minimum(1.0, 2.5 / np.maximum(np.abs(to), 1e-12))
         return np.asarray((weight * shifts).sum(axis=1) + gradient_x * to.real + gradient_y * to.imag)
 
@@ -70,7 +70,7 @@ def follow(
     Returns
     -------
     (Lattice, FollowedDrift) or None
-        None when fewer than four spots agree with a neighbour.
+        None if fewer than four spots agree with a neighbour.
     """
     for _ in range(3):
         cells = lattice.cells_inside(shape, -REACH * lattice.pitch_px)
@@ -88,7 +88,7 @@ def follow(
 
 
 def _matched(spots: NDArray[np.complex128], lattice: Lattice, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of the spot of every node, -1 where there is none."""
+    """Return the index of the spot of each node, -1 if there is none."""
     nodes = lattice.positions(cells)
     neighbours = lattice.neighbours(cells)
     tree = _tree(spots)
@@ -115,7 +115,7 @@ def _agreeing(
     neighbours: NDArray[np.int64],
     tolerance_px: float,
 ) -> NDArray[np.int64]:
-    """Keep the matches of the largest part of the lattice in which neighbours are displaced alike."""
+    """Keep the matches of the largest part of the lattice in which neighbouring displacements agree."""
     count = len(matched)
     first = np.repeat(np.arange(count), neighbours.shape[1])
     second = neighbours.ravel()
@@ -128,7 +128,7 @@ def _agreeing(
 
 
 def _each_once(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Leave a spot that several nodes have to the one that expects it nearest."""
+    """Assign a spot claimed by several nodes to the one with the nearest expected position."""
     order = np.lexsort((distance, matched))
     again = np.zeros(len(matched), dtype=bool)
     again[order[1:]] = matched[order[1:]] == matched[order[:-1]]

@@ -1,4 +1,4 @@
-"""A layout found in a frame, what was left out of it, and which of its spots are doubtful."""
+"""Layout found in a frame, with the lenslets and spots left out and the doubtful spots."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from faintspot.sensor.windows import Windows, find_windows
 
 @dataclass(frozen=True)
 class FoundLayout:
-    """A layout found in a frame, what was left out of it, and which of its spots are doubtful.
+    """Layout found in a frame, with the lenslets and spots left out and the doubtful spots.
 
     Parameters
     ----------
     layout : Layout
-        The lit sub-apertures whose windows lie within the frame.
+        Illuminated sub-apertures whose windows are within the frame.
     lenslets : LensletGrid
-        All lit lenslets, those at the edge too.
+        All illuminated lenslets, including those at the edge.
     cut : (n, 2) array
-        x, y of the lit lenslets that were left out because their window leaves the frame, px.
+        x, y of the illuminated lenslets omitted because their window leaves the frame [px].
     outside : (n, 2) array
-        x, y of the bright spots that lie outside all windows and belong to none of these lenslets, px.
+        x, y of the bright spots outside all windows that belong to none of these lenslets [px].
     clipped : (n_subapertures,) array of bool
-        True where the spot lies within its standard deviation (at least 1 px) of its window's edge.
+        True where the spot is within its standard deviation (at least 1 px) of the edge of its window.
     unlike : (n_subapertures,) array of bool
-        True where the spot is displaced unlike those of all its neighbours.
+        True where the displacement of the spot differs from those of all its neighbours.
     """
 
     layout: Layout
@@ -44,19 +44,19 @@ class FoundLayout:
     unlike: NDArray[np.bool_]
 
     def __getitem__(self, chosen: NDArray[np.bool_]) -> FoundLayout:
-        """Return it with only the chosen (n_subapertures,) sub-apertures."""
+        """Return the result for the chosen (n_subapertures,) sub-apertures only."""
         return replace(
             self, layout=self.layout[chosen], clipped=self.clipped[chosen], unlike=self.unlike[chosen]
         )
 
 
 def find_layout(frame: ArrayLike, **options: Any) -> FoundLayout:
-    """Find the sub-apertures of a frame, and say which were left out; see `Layout.from_frame`.
+    """Find the sub-apertures of a frame and list those left out; see `Layout.from_frame`.
 
     Raises
     ------
     InputError
-        If no regular array of spots is found, or no window lies within the frame.
+        If no regular array of spots is found, or no window is within the frame.
     """
     found = find_windows(frame, **options)
     grid, within = found.lenslets, found.within
@@ -72,14 +72,14 @@ def find_layout(frame: ArrayLike, **options: Any) -> FoundLayout:
 
 
 def _depth(found: Windows, spots: NDArray[np.float64], of_window: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how far (px) each spot lies inside the edge of the given window; negative outside."""
+    """Return the distance [px] of each spot inside the edge of its window; negative outside."""
     side = np.array(found.window[::-1])
     from_first = spots - found.corners[of_window, ::-1] + 0.5
     return np.asarray(np.minimum(from_first, side - from_first).min(axis=-1))
 
 
 def _outside(found: Windows) -> NDArray[np.float64]:
-    """Return the bright spots that no window, in the frame or cut by its edge, has inside."""
+    """Return the bright spots outside all windows, including windows cut by the edge of the frame."""
     spots = found.lenslets.elsewhere
     if len(spots) == 0:
         return spots
@@ -90,7 +90,7 @@ def _outside(found: Windows) -> NDArray[np.float64]:
 
 
 def _unlike(grid: LensletGrid) -> NDArray[np.bool_]:
-    """Return which spots are displaced unlike those of all their neighbours (two at least)."""
+    """Return which spots have displacements that differ from those of all (at least two) neighbours."""
     x, y = np.asarray(grid.spots - grid.centres - grid.drifts, np.float32).T
     n = len(x)
     flags = np.zeros((1, n), np.uint8)

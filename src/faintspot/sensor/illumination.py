@@ -1,10 +1,10 @@
-"""Which lenslets are lit: decided over the lattice as a whole, not spot by spot.
+"""Choice of the illuminated lenslets for the whole lattice at once, not spot by spot.
 
-Every node gives evidence, in standard deviations: does a spot stand out of the noise at the place where it
-should be, and does it have enough flux? Neighbours mostly agree, as a pupil is connected (a disk, an
-annulus, with spiders), so that disagreement costs something, and the lit set is the one of least cost
-altogether: a minimum cut of the lattice's graph, found exactly (Greig, Porteous & Seheult 1989, J. R. Stat.
-Soc. B 51, 271). A clear node is never outvoted; a column of doubtful ones is taken or left whole.
+Each node provides evidence, in standard deviations: a spot stands out of the noise at its expected
+position, and has enough flux. Neighbours mostly agree, since a pupil is connected (disk, annulus, spiders),
+so that a difference between neighbours has a cost. The chosen set has the least total cost, found exactly
+as a minimum cut of the lattice graph (Greig, Porteous & Seheult 1989, J. R. Stat. Soc. B 51, 271). Clear
+evidence of a node is never overruled; a column of doubtful nodes is included or excluded as a whole.
 """
 
 from __future__ import annotations
@@ -20,48 +20,49 @@ from faintspot.sensor.lattice import Lattice
 from faintspot.sensor.nodes import SEARCH, NodeFlux
 
 # Signal-to-noise ratio at which a spot is as likely as not: the highest of the 10 to 20 independent noise
-# values within the search area exceeds 3.5 in one unlit cell of 200.
+# values within the search area exceeds 3.5 in one dark cell of 200.
 _DETECTED = 3.5
-# The evidence of four neighbours (square) or six (hexagonal) together, in standard deviations, and the most
-# that one node gives. Neighbours decide about the doubtful; more than twice as much is never outvoted.
+# Weight of four (square) or six (hexagonal) neighbours together, in standard deviations, and maximum evidence
+# of one node. Neighbours decide on doubtful nodes; evidence of more than twice the weight is never overruled.
 _NEIGHBOURS, _CLEAR = 2.0, 5.0
-# A spot's place makes a peak of the noise at most this much more or less likely to be one.
+# Maximum factor by which the position of a peak changes the likelihood that it is a spot.
 _PLACED = 2.0
-# Smallest scatter of spots about their nodes (part of the pitch, per axis) that is reckoned with, whatever
-# that of the bright ones: aberrations of +-15 % of the pitch have 0.09, spots at the pupil's edge have more.
+# Lower limit of the assumed scatter of spots about their nodes (in pitches, per axis): aberrations of
+# +-15 % of the pitch have 0.09, and spots at the edge of the pupil have more than the bright ones.
 _SMALLEST_SHIFT = 0.12
-# Such aberrations, along both axes, and an error of the lattice move a spot this far from its node; what lies
-# beyond, at the rim of the search area (0.35), is mostly the flank of stray light.
+# Maximum displacement of a spot from its node by such aberrations along both axes and by an error of the
+# lattice. Peaks farther out, up to the search radius of 0.35, are mostly due to stray light.
 _FARTHEST, _RIM = 0.28, 0.02
-# Where the part of the reference flux is that divides lit from dark, when it is not given: around 0.3, within
-# a factor of 1.7. A lenslet of which half is lit counts as lit; what is scattered and reflected between
+# Fraction of the reference flux that separates illuminated from dark, if it is not given: around 0.3, within
+# a factor of 1.7. A half-illuminated lenslet counts as illuminated; light scattered and reflected between
 # lenslets is mostly less than 0.2.
 _FRACTIONS = (0.18, 0.5)
-# A lenslet that hangs on a single lit neighbour is a tip of the pupil when it has this part of the flux, else
-# a ghost.
+# A lenslet with a single illuminated neighbour is a tip of the pupil if it has this fraction of the flux,
+# otherwise a ghost.
 _TIP = 0.5
-# So small a share of the lenslets near the dividing flux is no reason to choose another.
+# Such a small share of lenslets near the dividing flux does not justify another one.
 _FEW = 0.02
-# Scatter of the logarithm of the flux of lit spots: what scintillation and speckle make of it.
+# Scatter of the logarithm of the flux of illuminated spots, due to scintillation and speckle.
 _SCATTER = (0.1, 0.6)
-# A part of the pupil that spiders cut off has at least this share of the largest part's lenslets (four
-# quadrants have 1 each); ghosts and cosmic rays have less.
+# Least size of a part of the pupil separated by spiders, relative to the largest part (1 for each of four
+# quadrants); ghosts and cosmic rays are smaller.
 _SHARE = 0.1
-# Fluxes within this factor of the dividing one may fall either way; more than this share of the lit lenslets
-# with such a flux, or this few standard deviations, are worth a word.
+# Lenslets with flux within this factor of the dividing flux are ambiguous; a warning is given if their share
+# of the illuminated ones exceeds this limit, or if spots are less significant than this.
 _CLOSE, _DOUBTFUL, _FAINT = 1.25, 0.05, 5.0
-# Peaks anywhere in the search area have a median distance from its middle of 0.25 pitch; spots have less.
+# Peaks distributed over the search area have a median distance of 0.25 pitch from its centre; spots have
+# less.
 _SCATTERED = 0.2
-# More dim ones among the lit lenslets than this may be a second, dimmer set of spots.
+# Share of dim lenslets among the illuminated ones above which there may be a second, dimmer set of spots.
 _DIM = 0.3
 _PASSES = 4
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """Which nodes are lit (n,), and why that may be wrong: one line, empty when it is clear.
+    """Illuminated nodes (n,), and the reason why the choice may be wrong: one line, empty if it is clear.
 
-    `least_flux` is the flux that divides lit from dark.
+    `least_flux` is the flux that separates illuminated from dark.
     """
 
     nodes: NDArray[np.bool_]
@@ -70,27 +71,27 @@ class Illumination:
 
 
 def find_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: float | None) -> Illumination:
-    """Decide which nodes are lit.
+    """Decide which nodes are illuminated.
 
     Parameters
     ----------
     spots : NodeLight
     lattice : Lattice
     illuminated_fraction : float, optional
-        The smallest flux of a lit lenslet, strictly, as a part of the median of those that are lit without
-        it. Default: the part between 0.18 and 0.5 that the fewest have, for most to be clear of it.
+        Smallest flux of an illuminated lenslet (exclusive), relative to the median flux of those found
+        without it. Default: the value between 0.18 and 0.5 with the fewest lenslets near it.
     """
     detected = _detection(spots)
     certain = detected > 1
     if not certain.any():
         return Illumination(certain, "", np.inf)
     choose = _Chooser(spots, detected, lattice)
-    # Dim spots outside the pupil may be as many as those in it: the start is among the bright ones.
+    # Dim spots outside the pupil may be as many as those in it: start from the bright ones.
     bright = float(np.quantile(spots.flux[certain], 0.8))
     fraction = _emptiest(spots.flux[detected > 0] / bright)
     illuminated, reference, scatter = choose.settled(bright, fraction)
     if not _spans(spots.cells[illuminated]):
-        # A row or two at the pupil's edge: the dimmer row must be lit, as one row makes no sensor.
+        # In one or two rows at the pupil's edge, the dimmer row must be illuminated: one row makes no sensor.
         fraction = _FRACTIONS[0]
         illuminated, reference, scatter = choose.settled(bright, fraction)
     if illuminated_fraction is not None:
@@ -104,14 +105,14 @@ def find_illumination(spots: NodeFlux, lattice: Lattice, illuminated_fraction: f
 
 @dataclass(frozen=True)
 class _Chooser:
-    """Chooses the lit nodes of these spots, with this evidence that they are there."""
+    """Selects the illuminated nodes from spots and the evidence for them."""
 
     spots: NodeFlux
     detected: NDArray[np.float64]
     lattice: Lattice
 
     def settled(self, reference: float, fraction: float) -> tuple[NDArray[np.bool_], float, float]:
-        """Return the lit nodes, the median of their flux, and the scatter of its logarithm."""
+        """Return the illuminated nodes, the median of their flux, and the scatter of its logarithm."""
         scatter = _SCATTER[1]
         for _ in range(_PASSES):
             illuminated = self.illuminated(reference, fraction, scatter)
@@ -124,7 +125,7 @@ class _Chooser:
         return illuminated, reference, scatter
 
     def illuminated(self, reference: float, fraction: float, scatter: float) -> NDArray[np.bool_]:
-        """Return the lit nodes, for a dividing flux of a part of the reference."""
+        """Return the illuminated nodes for a dividing flux that is a fraction of the reference."""
         neighbours = self.lattice.neighbours(self.spots.cells)
         links = _links(neighbours)
         relative = np.maximum(self.spots.flux / reference, 1e-6)
@@ -135,10 +136,10 @@ class _Chooser:
 
 
 def _detection(spots: NodeFlux) -> NDArray[np.float64]:
-    """Return the evidence that a spot is at each node: that something is there, and that it is in its place.
+    """Return the evidence for a spot at each node, from its significance and its position.
 
-    Spots scatter about their nodes as the certain ones do; peaks of noise lie anywhere in the search area,
-    those of stray light mostly at its rim.
+    Spots scatter about their nodes like the clear ones; noise peaks are uniform over the search area, and
+    peaks of stray light are mostly at its rim.
     """
     ratio = spots.signal_to_noise - _DETECTED
     certain = ratio > 1
@@ -155,12 +156,12 @@ def _detection(spots: NodeFlux) -> NDArray[np.float64]:
 
 
 def _emptiest(relative: NDArray[np.float64]) -> float:
-    """Return the part of the reference flux that the fewest nodes are near to, in the allowed range."""
+    """Return the fraction of the reference flux with the fewest nodes near it, in the allowed range."""
     fractions = np.geomspace(*_FRACTIONS, 13)
-    # Near: within a factor of 1.25 or so, about the scatter of equally lit lenslets.
+    # Near means within a factor of about 1.25, the scatter of equally illuminated lenslets.
     distance = np.log(np.maximum(relative[:, None], 1e-6) / fractions) / np.log(_CLOSE)
     crowd = np.exp(-0.5 * distance**2).sum(axis=0)
-    # A few nodes more or less do not matter: then it is the one nearest the middle of the range.
+    # Among values with almost the same number of nodes, use the one nearest the middle of the range.
     crowded = np.round(crowd / max(_FEW * len(relative), 0.1))
     return float(fractions[np.lexsort((np.abs(np.arange(13) - 6), crowded))[0]])
 
@@ -171,7 +172,7 @@ def _spans(cells: NDArray[np.int64]) -> bool:
 
 
 def _log_scatter(flux: NDArray[np.float64]) -> float:
-    """Return the robust standard deviation of the logarithm of the flux, within what is plausible."""
+    """Return the robust standard deviation of the logarithm of the flux, limited to plausible values."""
     logs = np.log(np.maximum(flux, 1e-300))
     return float(np.clip(1.4826 * np.median(np.abs(logs - np.median(logs))), *_SCATTER))
 
@@ -185,10 +186,9 @@ def _links(neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: float) -> NDArray[np.bool_]:
-    """Return the lit set of least cost: evidence against the lit and for the dark, and links between the two.
+    """Return the illuminated set of least cost: contrary evidence, and links between illuminated and dark.
 
-    It is the source's side of the minimum cut, source and sink being joined to the nodes by the evidence for
-    and against.
+    It is the source side of the minimum cut; evidence for and against joins the nodes to source and sink.
     """
     count = len(evidence)
     source, sink = count, count + 1
@@ -213,7 +213,7 @@ def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: f
 def _connected(
     illuminated: NDArray[np.bool_], links: NDArray[np.int64], bright: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return the lit nodes of the largest connected parts; a tip that hangs on one other must be bright."""
+    """Return the illuminated nodes of the largest connected parts, without faint tips with one neighbour."""
     degree = np.bincount(links[illuminated[links].all(axis=1)].ravel(), minlength=len(illuminated))
     illuminated = illuminated & ((degree >= 2) | ((degree == 1) & bright))
     joined = links[illuminated[links].all(axis=1)]
@@ -228,14 +228,14 @@ def _connected(
 def _doubt(
     spots: NodeFlux, illuminated: NDArray[np.bool_], detected: NDArray[np.float64], dividing_flux: float
 ) -> str:
-    """Say in one line when the answer may be wrong."""
+    """Return the reason why the result may be wrong, in one line."""
     count = int(np.count_nonzero(illuminated))
     if count == 0:
         return ""
     flux = spots.flux[illuminated]
     ratio = float(np.median(spots.signal_to_noise[illuminated]))
     if ratio < _FAINT:
-        return f"the spots stand only {ratio:.1f} standard deviations out of the noise; average more frames"
+        return f"the spots are only {ratio:.1f} standard deviations above the noise; average more frames"
     scattered = float(np.median(np.abs(spots.shifts[illuminated] - np.median(spots.shifts[illuminated]))))
     if scattered > _SCATTERED:
         return (
@@ -246,9 +246,9 @@ def _doubt(
     if np.count_nonzero(close) > max(1, _DOUBTFUL * count):
         return (
             f"{np.count_nonzero(close)} lenslets have about {dividing_flux / float(np.median(flux)):.2g} of "
-            "the median flux, which divides lit from dark: they may fall either way"
+            "the median flux, the limit between illuminated and dark, and may belong to either"
         )
     dim = int(np.count_nonzero(flux < 0.5 * np.quantile(flux, 0.8)))
     if dim > _DIM * count:
-        return f"{dim} of the lit lenslets have less than half of the bright ones' flux"
+        return f"{dim} of the illuminated lenslets have less than half of the flux of the bright ones"
     return ""

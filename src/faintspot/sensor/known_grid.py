@@ -1,4 +1,4 @@
-"""Sub-apertures of a grid whose place is known, and which of them are illuminated."""
+"""Sub-apertures of a grid at a known position, and the choice of the illuminated ones."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from faintspot.sensor.region import PupilRegion, Rectangle
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW, window_size
 
 _LIT_FRACTION = 0.3
-_BRIGHT = 0.95  # quantile of the flux, of which the cells are a part that give the median
+_BRIGHT = 0.95  # quantile of the flux, relative to which cells are selected for the median
 _CLOSE, _DOUBTFUL = 1.25, 0.05
-_NOISY = 0.2  # standard deviation of the dark cells' flux, in units of the median of the others
-# Without a dark level: dim cells are dark where the bright ones are this many of their standard deviations
-# above them. In fewer cells than this, or less far apart, as in 5 % of vignetted grids, both may be lit.
+_NOISY = 0.2  # standard deviation of the flux of the dark cells, in units of the median of the others
+# Without a dark level, dim cells are dark if the bright ones exceed them by this many of their standard
+# deviations. With fewer cells or a smaller difference, as in 5 % of vignetted grids, both may be illuminated.
 _APART, _FEWEST = 8.0, 36
 
 
 @dataclass(frozen=True)
 class KnownGrid:
-    """Illuminated sub-apertures of a grid whose place is known.
+    """Illuminated sub-apertures of a grid at a known position.
 
     Parameters
     ----------
     layout : Layout
-        The illuminated sub-apertures.
+        Illuminated sub-apertures.
     unlit : (n, ny, nx) array
-        Images of the others.
+        Images of the other sub-apertures.
     doubt : str
-        Why the choice may be wrong, in one line; empty when it is clear.
+        Reason why the choice may be wrong, in one line; empty if it is clear.
     """
 
     layout: Layout
@@ -57,20 +57,20 @@ def find_illuminated(
     Parameters
     ----------
     frame : (h, w) array
-        Mean of the frames; NaN where a pixel is bad.
+        Mean of the frames; NaN for bad pixels.
     shape : (int, int)
         Rows and columns of cells, which fill the frame or `roi`.
     pixels : int or (int, int), optional
-        Window in the middle of each cell. Default: all its whole pixels, at most 64.
+        Window at the centre of each cell. Default: all its whole pixels, at most 64.
     has_dark : bool
-        Whether the dark level is subtracted. Else the flux of the dimmest cells counts as none, where they
-        stand apart from the bright ones.
+        Whether the dark level is subtracted. Otherwise the flux of the dimmest cells is taken to be 0, if
+        they are clearly separated from the bright ones.
     illuminated_fraction : float, optional
-        Smallest flux of an illuminated cell, as a part of the median of the bright ones. Default 0.3.
+        Smallest flux of an illuminated cell, relative to the median of the bright ones. Default: 0.3.
     pupil : (x, y, radius) or (x, y, radius, inner radius), optional
-        Take the cells whose centres lie in this disk or annulus (px), whatever their flux.
+        Use the cells whose centres are in this disk or annulus [px], whatever their flux.
     roi : (x0, y0, x1, y1), optional
-        Columns x0 to x1 - 1 and rows y0 to y1 - 1, which the grid fills.
+        Columns x0 to x1 - 1 and rows y0 to y1 - 1 that the grid fills.
 
     Raises
     ------
@@ -122,10 +122,10 @@ def _whole_grid(
 
 
 def _illuminated(flux: NDArray[np.float64], fraction: float, has_dark: bool) -> tuple[NDArray[np.bool_], str]:
-    """Return which cells are illuminated, and why that may be wrong."""
+    """Return which cells are illuminated, and the reason why that may be wrong."""
     background = 0.0 if has_dark else _dark_level(flux)
     if np.isnan(background):
-        doubt = "no cell is clearly dark, all are taken; --dark or --pupil decides"
+        doubt = "no cell is clearly dark, all are used; give --dark or --pupil to select them"
         return np.ones(len(flux), dtype=bool), doubt
     above = flux - background
     bright = float(np.quantile(above, _BRIGHT))
@@ -142,13 +142,13 @@ def _illuminated(flux: NDArray[np.float64], fraction: float, has_dark: bool) -> 
     if close > max(1, _DOUBTFUL * np.count_nonzero(illuminated)):
         return (
             illuminated,
-            f"{close} cells have about {fraction:.2g} of the median flux, which divides lit from dark",
+            f"{close} cells have about {fraction:.2g} of the median flux, the illumination limit",
         )
     return illuminated, ""
 
 
 def _dark_level(flux: NDArray[np.float64]) -> float:
-    """Return the median of the dim cells (split after Otsu 1979); NaN where they may be illuminated, too."""
+    """Return the median of the dim cells (split after Otsu 1979); NaN if they may be illuminated, too."""
     if len(flux) < _FEWEST:
         return np.nan
     ordered = np.sort(flux)

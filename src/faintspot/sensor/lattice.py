@@ -1,13 +1,13 @@
-"""Which regular lattice the spots of a frame lie on, from the frame's power spectrum.
+"""Regular lattice of the spots of a frame, found in the frame's power spectrum.
 
-A lattice is kept as complex numbers: the node in row r and column c lies at
-origin + step * (c + r * ratio), real part x, imaginary part y, in frame pixels; ratio is 1j for a square
-lattice and exp(1j * pi / 3) for a hexagonal one. All positions have pixel i centred at i.
+A lattice is stored as complex numbers: the node in row r and column c is at origin + step * (c + r *
+ratio), with real part x and imaginary part y in frame pixels; ratio is 1j for a square lattice and exp(1j *
+pi / 3) for a hexagonal one. In all positions, pixel i is centred at i.
 
-A regular lattice has one pitch and one angle only, so the search has two dimensions: at every wave number
-and angle it looks at the weakest of the two (square) or three (hexagonal) first-order peaks. A stripe, an
-edge or a gradient makes one of them strong, only a lattice makes all of them strong. This needs no spot to
-be detected on its own.
+A regular lattice has one pitch and one angle, so that the search has two dimensions. The search evaluates
+the weakest of the two (square) or three (hexagonal) first-order peaks at each wave number and angle. A
+stripe, an edge or a gradient makes one of them strong, but only a lattice makes all of them strong. Single
+spots need not be detectable.
 """
 
 from __future__ import annotations
@@ -25,37 +25,39 @@ from numpy.typing import NDArray
 from faintspot.sensor.neighbours import neighbours_of
 
 RATIOS = {"square": 1j, "hexagonal": complex(np.exp(1j * np.pi / 3))}
-# The lines of a hexagonal lattice are sqrt(3) / 2 of its pitch apart and its steps lie 30 degrees off.
+# The lines of a hexagonal lattice are sqrt(3) / 2 of its pitch apart, and rotated by 30 degrees from its
+# steps.
 _STEPS = {"square": 1 + 0j, "hexagonal": complex(2 / np.sqrt(3) * np.exp(1j * np.pi / 6))}
 SMALLEST_PITCH_PX = 5.0
-# Spot widths that are looked for: a spot up to twice as wide or narrow as one of these is seen by it.
+# Spot widths searched for: each also detects spots up to twice as wide or narrow.
 _SCALES_PX = (1.0, 2.0, 4.0)
-# A candidate must have at least this share of the highest significance of its map, and there are at most
-# so many per map and geometry.
+# Minimum significance of a candidate relative to the highest of its map, and maximum number of candidates per
+# map and geometry.
 _CANDIDATE_SHARE = 0.1
 _CANDIDATES = 3
-# Minus the natural logarithm of the chance that noise alone makes one point of the map so high. It is low, as
-# noise often passes it: it only spares time. What decides is the comb score, in standard deviations of the
-# smoothed map (in 60 frames of noise, hot pixels or scattered spots it reached 5.3 once, else 4.5),
-# and whether lit lenslets are found on the lattice.
+# Minus the natural logarithm of the probability that noise alone gives such a high point of the map. The
+# limit is low and only saves time; noise often exceeds it. The decision is by the comb score, in standard
+# deviations of the smoothed map (in 60 frames of noise, hot pixels or scattered spots it reached 5.3 once,
+# otherwise 4.5), and by whether illuminated lenslets are found on the lattice.
 _SIGNIFICANT = 6.0
 _COMB_SCORE = 4.5
-# With three times that, no other map of spots need be looked at: kin of the true lattice are in each of them.
+# Above three times that score, other maps of spots are skipped: relatives of the true lattice are in all
+# maps.
 _CLEAR_SCORE = 3 * _COMB_SCORE
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """A regular lattice of nodes: see the module's first lines.
+    """Regular lattice of nodes, with positions as defined in the module docstring.
 
     Parameters
     ----------
     geometry : str
-        "square" or "hexagonal".
+        Geometry, "square" or "hexagonal".
     origin : complex
         Position of one node, x + 1j * y, px.
     step : complex
-        From a node to the next one in its row, px.
+        Vector from a node to the next one in its row [px].
     """
 
     geometry: str
@@ -64,26 +66,26 @@ class Lattice:
 
     @property
     def ratio(self) -> complex:
-        """The second lattice vector divided by the first."""
+        """Ratio of the second lattice vector to the first."""
         return RATIOS[self.geometry]
 
     @property
     def pitch_px(self) -> float:
-        """Distance between neighbouring nodes."""
+        """Distance between neighbouring nodes [px]."""
         return abs(self.step)
 
     @property
     def angle_deg(self) -> float:
-        """Angle of the step from +x towards +y."""
+        """Angle of the step from +x towards +y [degrees]."""
         return float(np.degrees(np.angle(self.step)))
 
     @property
     def wave(self) -> complex:
-        """Wave vector of the first of the strongest peaks in the power spectrum, cycles per px."""
+        """Wave vector of the first of the strongest peaks in the power spectrum [cycles per px]."""
         return complex(1 / np.conj(self.step / _STEPS[self.geometry]))
 
     def positions(self, cells: NDArray[np.int64]) -> NDArray[np.complex128]:
-        """Return where the nodes of the given (n, 2) rows and columns lie."""
+        """Return the positions of the nodes in the given (n, 2) rows and columns."""
         return self.origin + self.step * (cells[:, 1] + cells[:, 0] * self.ratio)
 
     def cells_inside(self, shape: tuple[int, ...], margin_px: float) -> NDArray[np.int64]:
@@ -104,7 +106,7 @@ class Lattice:
         return np.asarray(np.argwhere(inside) + np.array([row[0], column[0]]))
 
     def canonical(self, shape: tuple[int, ...]) -> Lattice:
-        """Return the same lattice with its angle in [-45, 45) or [-30, 30) and its origin near mid-frame."""
+        """Return the same lattice with angle in [-45, 45) or [-30, 30) and origin near the frame centre."""
         turn = 90.0 if self.geometry == "square" else 60.0
         angle = (self.angle_deg + turn / 2) % turn - turn / 2
         step = self.pitch_px * complex(np.exp(1j * np.radians(angle)))
@@ -115,7 +117,7 @@ class Lattice:
         return replace(self, step=step, origin=self.origin + step * complex(column + row * self.ratio))
 
     def fitted(self, cells: NDArray[np.int64], positions: NDArray[np.complex128]) -> Lattice:
-        """Return the lattice of least squared distance to spots (n,) x + 1j * y, those far off left out."""
+        """Return the least-squares fit of the lattice to spots (n,) x + 1j * y, with outliers removed."""
         nodes = cells[:, 1] + cells[:, 0] * self.ratio
         used = np.ones(len(nodes), dtype=bool)
         for _ in range(3):
@@ -127,11 +129,11 @@ class Lattice:
         return replace(self, origin=complex(origin), step=complex(step))
 
     def neighbours(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the (n, 4 or 6) indices of the neighbours of every cell, n where there is none."""
+        """Return the (n, 4 or 6) indices of the neighbours of each cell, n where there is none."""
         return neighbours_of(cells, self.geometry)
 
     def distance_px(self, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return how far from the node of its cell every pixel of these rows and columns lies: (y, x)."""
+        """Return the distance of every pixel (y, x) from the node of its cell."""
         offset = (x + 1j * y[:, None] - self.origin) / self.step
         offset -= np.rint(offset.imag / self.ratio.imag) * self.ratio
         return np.asarray(np.abs(offset - np.rint(offset.real)) * self.pitch_px)
@@ -140,23 +142,23 @@ class Lattice:
 def find_lattice(
     image: NDArray[np.float64], geometries: tuple[str, ...], pitch_range_px: tuple[float, float]
 ) -> tuple[Lattice, NDArray[np.float64]] | None:
-    """Return the lattice that the spots of a frame lie on and the map of them, or None when there is none.
+    """Return the lattice of the spots of a frame and the map of spots, or None if there is none.
 
     Parameters
     ----------
     image : array (ny, nx)
-        The frame without hot pixels.
+        Frame without hot pixels.
     geometries : tuple of str
-        The geometries to try.
+        Geometries to try.
     pitch_range_px : tuple of float
-        The smallest and the largest pitch to try.
+        Smallest and largest pitch to try.
     """
     highest, best = _COMB_SCORE, None
     for spots in _spot_maps(image):
         found = _candidates(spots, geometries, pitch_range_px)
         if not found:
             continue
-        # The same smoothing for all, about the size of the spots' own shifts, so that their scores compare.
+        # Equal smoothing, about the displacements of the spots, makes the scores comparable.
         smooth_px = 0.08 * min(lattice.pitch_px for lattice in found)
         smooth = scipy.ndimage.gaussian_filter(spots - spots.mean(), smooth_px)
         scatter = float(smooth.std())
@@ -170,10 +172,11 @@ def find_lattice(
 
 
 def _spot_maps(image: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Make maps of what looks like a spot, one per width, and one linear map for many very faint spots.
+    """Yield maps of spot-like features, one per width, and one linear map for many very faint spots.
 
-    The difference of two Gaussians takes the background away. What is left is taken above two standard
-    deviations, so that empty parts of the frame add little noise, and its logarithm, so that dim spots count.
+    The difference of two Gaussians removes the background. The map is thresholded at two standard
+    deviations, so that empty parts of the frame add little noise; its logarithm is used, so that dim spots
+    contribute.
     """
     for scale in _SCALES_PX:
         band = scipy.ndimage.gaussian_filter(image, scale) - scipy.ndimage.gaussian_filter(image, 4 * scale)
@@ -187,7 +190,7 @@ def _spot_maps(image: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
 
 
 def robust_std(values: NDArray[np.float64]) -> float:
-    """Return the standard deviation from the median absolute deviation; the plain one when that is 0."""
+    """Return the standard deviation from the median absolute deviation; the ordinary one if that is 0."""
     deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
     return deviation if deviation > 1e-9 * float(np.ptp(values)) else float(values.std())
 
@@ -195,10 +198,10 @@ def robust_std(values: NDArray[np.float64]) -> float:
 def _candidates(
     spots: NDArray[np.float64], geometries: tuple[str, ...], pitch_range_px: tuple[float, float]
 ) -> list[Lattice]:
-    """Return the lattices of the strongest peaks in the power spectrum of one map, and their coarser kin.
+    """Return the lattices of the strongest peaks in the power spectrum of one map, and related coarser ones.
 
-    The peaks of sharp spots are as strong in the higher orders as in the first, so that a peak may stand for
-    a lattice that is 1.4 (square), 1.7 (hexagonal), 2, 2.8 or 3.5 times as coarse.
+    For sharp spots, higher orders are as strong as the first, so that a peak may belong to a lattice 1.4
+    (square), 1.7 (hexagonal), 2, 2.8 or 3.5 times as coarse.
     """
     power, wave_numbers = _polar_power(spots, pitch_range_px)
     centred = spots - spots.mean()
@@ -218,7 +221,7 @@ def _candidates(
 
 
 def _peaks(profile: NDArray[np.float64], threshold: float) -> list[int]:
-    """Return where the few highest peaks of the significance against wave number are."""
+    """Return the indices of the few highest peaks of significance against wave number."""
     peaks = np.flatnonzero((profile >= scipy.ndimage.maximum_filter1d(profile, 7)) & (profile > threshold))
     kept: list[int] = []
     for peak in peaks[np.argsort(-profile[peaks])]:
@@ -232,20 +235,20 @@ def _polar_power(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the power at wave numbers (rows, cycles per px) and angles from 0 to 180 degrees (columns).
 
-    Every row is divided by the mean power that its median stands for, so that noise has an exponential
-    distribution of mean 1 whatever its spectrum.
+    Each row is divided by the mean power implied by its median, so that noise has an exponential
+    distribution of mean 1 for any spectrum.
     """
     size = int(scipy.fft.next_fast_len(2 * max(spots.shape), real=True))
     low, high = size / pitch_range_px[1], min(size / pitch_range_px[0] * 2 / np.sqrt(3), size / 2 - 2)
     radius = np.arange(low, max(high, low + 1), 0.5)
-    # Only wave numbers up to the highest are wanted, which are few when the smallest pitch is many pixels.
+    # Only wave numbers up to the highest are needed, which are few if the smallest pitch is many pixels.
     reach = int(np.ceil(radius[-1])) + 2
     rows = scipy.fft.rfft(np.asarray(spots - spots.mean(), dtype=np.float32), size)[:, : reach + 1]
     spectrum = scipy.fft.fft(rows, size, axis=0)
     half = np.abs(np.concatenate([spectrum[size - reach :], spectrum[: reach + 1]])) ** 2
-    # A lattice that is stretched a little has its two peaks at not quite the same wave number.
+    # A slightly stretched lattice has its two peaks at slightly different wave numbers.
     half = scipy.ndimage.maximum_filter(half, 3)
-    # A multiple of 6 so that 60 and 90 degrees are whole numbers of columns.
+    # A multiple of 6, so that 60 and 90 degrees are whole numbers of columns.
     n_angles = 6 * int(np.ceil(np.pi * radius[-1] / 6))
     angle = np.pi * np.arange(n_angles) / n_angles
     kx, ky = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
@@ -256,7 +259,7 @@ def _polar_power(
 
 
 def _significance(power: NDArray[np.float64], geometry: str) -> NDArray[np.float64]:
-    """Return minus the logarithm of the chance of the weakest first-order peak, per wave number and angle."""
+    """Return minus the log probability of the weakest first-order peak, per wave number and angle."""
     orders = 2 if geometry == "square" else 3
     turn = power.shape[1] // orders
     folded = power.reshape(power.shape[0], orders, turn)
@@ -264,10 +267,10 @@ def _significance(power: NDArray[np.float64], geometry: str) -> NDArray[np.float
 
 
 def _refined(centred: NDArray[np.float64], geometry: str, wave: complex) -> complex:
-    """Return the wave vector near `wave` at which the first-order peaks have the highest power together."""
+    """Return the wave vector near `wave` with the highest total power of the first-order peaks."""
     turns = _turns(geometry)
     y, x = (_tiles(n) for n in centred.shape)
-    # Sums over tiles with the phase of `wave` taken out: a small move of the wave vector needs no more.
+    # Sums over tiles with the phase of `wave` removed are sufficient for a small change of the wave vector.
     sums = [_tile_sums(centred, wave * turn) for turn in turns]
     unit = 0.25 / max(centred.shape)
 
@@ -288,14 +291,14 @@ def _refined(centred: NDArray[np.float64], geometry: str, wave: complex) -> comp
 
 
 def _turns(geometry: str) -> NDArray[np.complex128]:
-    """Return the directions of the first-order peaks, relative to the first of them."""
+    """Return the directions of the first-order peaks relative to the first one."""
     ratio = RATIOS[geometry]
     return np.array([1, ratio] if geometry == "square" else [1, ratio, ratio**2])
 
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The pixels of one axis in groups: their positions from mid-frame, the groups' starts and centres."""
+    """Pixels of one axis in groups: positions from the frame centre, and starts and centres of the groups."""
 
     pixels: NDArray[np.floating[Any]]
     starts: NDArray[np.int64]
@@ -312,9 +315,9 @@ def _tiles(n_pixels: int) -> _Tiles:
 
 
 def _tile_sums(centred: NDArray[np.float64], vector: complex) -> NDArray[np.complex128]:
-    """Return the sum over every tile of the image times exp(-2 pi i vector . position)."""
+    """Return the sum over each tile of the image times exp(-2 pi i vector . position)."""
     y, x = (_tiles(n) for n in centred.shape)
-    # Rows first, one real part at a time: the complex image is never made.
+    # Rows first, real and imaginary parts separately, to avoid a complex image.
     phase_y = 2 * np.pi * y.pixels[:, None] * vector.imag
     rows = np.add.reduceat(centred * np.cos(phase_y), y.starts) - 1j * np.add.reduceat(
         centred * np.sin(phase_y), y.starts
@@ -323,17 +326,17 @@ def _tile_sums(centred: NDArray[np.float64], vector: complex) -> NDArray[np.comp
 
 
 def _amplitude(centred: NDArray[np.float64], vector: complex) -> complex:
-    """Return the sum of the image times exp(-2 pi i vector . position), position from mid-frame."""
+    """Return the sum of the image times exp(-2 pi i vector . position), position from the frame centre."""
     y, x = (2 * np.pi * (np.arange(n) - (n - 1) / 2) for n in centred.shape)
     columns = np.cos(y * vector.imag) @ centred - 1j * (np.sin(y * vector.imag) @ centred)
     return complex(np.sum(columns * np.exp(-1j * x * vector.real)))
 
 
 def with_origin(centred: NDArray[np.float64], geometry: str, vector: complex) -> Lattice:
-    """Return the lattice of a wave vector, with the origin that the phases of the first two peaks give."""
+    """Return the lattice of a wave vector, with the origin given by the phases of the first two peaks."""
     waves = vector * _turns(geometry)[:2]
     phases = [-np.angle(_amplitude(centred, complex(wave))) / (2 * np.pi) for wave in waves]
-    # At a node, wave . position is the phase (in turns) of either peak.
+    # At a node, wave . position is the phase (in turns) of each peak.
     position = np.linalg.solve(np.column_stack([waves.real, waves.imag]), phases)
     middle = complex((centred.shape[1] - 1) / 2, (centred.shape[0] - 1) / 2)
     step = _STEPS[geometry] / np.conj(vector)
@@ -341,10 +344,10 @@ def with_origin(centred: NDArray[np.float64], geometry: str, vector: complex) ->
 
 
 def _comb_score(smooth: NDArray[np.float64], lattice: Lattice) -> float:
-    """Return the sum over the nodes divided by the root of their number.
+    """Return the sum over the nodes divided by the square root of their number.
 
-    It is highest for the true lattice: one that misses every second spot has half the sum on half the nodes,
-    one with a node between every two spots the same sum on twice the nodes.
+    It is highest for the true lattice: a lattice of every second spot has half the sum on half the nodes,
+    and one with an additional node between spots the same sum on twice the nodes.
     """
     at = lattice.positions(lattice.cells_inside(smooth.shape, 0.0))
     values = scipy.ndimage.map_coordinates(smooth, [at.imag, at.real], order=1, mode="nearest")

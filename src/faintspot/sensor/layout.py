@@ -1,4 +1,4 @@
-"""Layout: where each sub-aperture is on the detector."""
+"""Layout: positions of the sub-apertures on the detector."""
 
 from __future__ import annotations
 
@@ -30,44 +30,46 @@ if TYPE_CHECKING:
 GRID_KEYS = ("shape", "pixels", "outer_radius", "inner_radius", "pitch", "origin", "frame_shape")
 GEOMETRIES = ("square", "hexagonal")
 OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
-"""Fields that say how large things are on the sky and in the pupil."""
+"""Fields that define scales on the sky and in the pupil."""
 _MOST_LENSLETS = 1 << 20
 _LARGEST_PX = 1e9
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each sub-aperture is: one window of the same size for each lit lenslet.
+    """Positions of the sub-apertures: one window of the same size for each illuminated lenslet.
 
     Parameters
     ----------
     frame_shape : (int, int)
-        Height and width of a frame in pixels.
+        Height and width of a frame [px].
     window : (int, int)
-        Height and width of every sub-aperture in pixels, 2 (quad cells) to 64.
+        Height and width of each sub-aperture [px], 2 (quad cells) to 64.
     corners : (n, 2) array of int
-        Row and column of each window's first pixel.
+        Row and column of the first pixel of each window.
     centres : (n, 2) array, optional
-        x, y of each sub-aperture's centre in frame pixels (pixel i has its centre at i), from which positions
-        are measured, at most three times the window's longer side from its middle. Default: that middle.
+        x, y of each sub-aperture's centre in frame pixels (pixel i is centred at i), from which positions are
+        measured. The distance from the window centre is at most three times the longer side of the window.
+        Default: the window centre.
     cells : (n, 2) array of int, optional
         Row and column of each lenslet in its array, for maps.
     geometry : {"square", "hexagonal"}
     pitch_px : float, optional
         Distance between neighbouring lenslets.
     angle_deg : float
-        Angle of the lenslet array's rows from +x towards +y.
+        Angle of the rows of the lenslet array from +x towards +y.
     pixel_scale_arcsec : float, optional
-        Angle on the sky that a pixel of the detector sees: it makes angles of slopes.
+        Angle on the sky per detector pixel, which converts slopes to angles.
     subaperture_m, diameter_m : float, optional
-        Side of a sub-aperture (the lenslets' pitch) and diameter of the telescope, in the entrance pupil.
-        Either is enough for wavefronts in nm: the lit sub-apertures then span the pupil.
+        Side of a sub-aperture (the pitch of the lenslets) and diameter of the telescope, in the entrance
+        pupil. Either one is sufficient for wavefronts in nm: illuminated sub-apertures are then taken to
+        span the pupil.
 
     Raises
     ------
     InputError
-        For an empty layout, a window that leaves the frame, windows that overlap, a centre far from its
-        window, or more than 2^28 pixels or 2^20 lenslets.
+        If the layout is empty, a window leaves the frame, windows overlap, a centre is far from its window,
+        or there are more than 2^28 pixels or 2^20 lenslets.
 
     Examples
     --------
@@ -130,7 +132,7 @@ class Layout:
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        """Return a line: the arrays of a layout have hundreds of rows."""
+        """Return a one-line summary, since arrays of a layout have hundreds of rows."""
         pitch = "" if self.pitch_px is None else f", pitch_px={self.pitch_px:.4g}"
         return (
             f"<Layout: {len(self)} sub-apertures, frame_shape={self.frame_shape}, window={self.window}, "
@@ -147,33 +149,33 @@ class Layout:
         return len(self.corners)
 
     def __getitem__(self, chosen: Any) -> Layout:
-        """Return the layout of some of the sub-apertures, in the order given.
+        """Return the layout of some of the sub-apertures, in the given order.
 
         Parameters
         ----------
         chosen : (n,) array of bool, slice or list of int
-            Which sub-apertures: a mask of all, or their numbers.
+            Sub-apertures to select: a mask of all, or their numbers.
 
         Raises
         ------
         InputError
-            If the mask is not of this length, a number is out of range or twice there, or none is left.
+            If a mask has the wrong length, a number is out of range or repeated, or none is selected.
         """
         index = _index(chosen, len(self))
         return replace(
             self, corners=self.corners[index], centres=self.centres[index], cells=self.cells[index]
         )
 
-    __iter__ = None  # else Python would make one of __getitem__, which takes no single number
+    __iter__ = None  # otherwise Python would use __getitem__, which does not accept a single number
 
     @property
     def pixels(self) -> int:
-        """Number of pixels of one window."""
+        """Number of pixels of a window."""
         return self.window[0] * self.window[1]
 
     @property
     def offsets(self) -> NDArray[np.float64]:
-        """(n, 2): x, y of each sub-aperture's centre from the middle of its window, px."""
+        """Offsets x, y of the sub-aperture centres from the window centres, (n, 2) px."""
         return self.centres - (self.corners[:, ::-1] + 0.5 * (np.array(self.window[::-1]) - 1))
 
     @classmethod
@@ -198,22 +200,23 @@ class Layout:
         pixels : int or (int, int)
             Height and width of a window.
         outer_radius, inner_radius : float, optional
-            Of the pupil, in lenslets: a sub-aperture is lit when its centre is not farther than
-            `outer_radius` and not nearer than `inner_radius` from the middle of the grid. Default: all lit.
-            (7, 7) with 3.5 and 0.5 gives the 36 of a 4.2 m telescope with central obstruction.
+            Radii of the pupil in lenslets: a sub-aperture is illuminated if the distance of its centre from
+            the middle of the grid is between `inner_radius` and `outer_radius`. Default: all are
+            illuminated. (7, 7) with 3.5 and 0.5 gives the 36 sub-apertures of a 4.2 m telescope with
+            central obstruction.
         pitch : int or (int, int), optional
-            Rows and columns from one window to the next. Default: `pixels`.
+            Rows and columns between adjacent windows. Default: `pixels`.
         origin : (int, int)
-            Row and column of the first window's first pixel.
+            Row and column of the first pixel of the first window.
         frame_shape : (int, int), optional
-            Default: just large enough.
+            Default: the smallest frame that contains all windows.
         **optics
             pixel_scale_arcsec, subaperture_m and diameter_m, as for `Layout`.
 
         Raises
         ------
         InputError
-            If nothing is lit, or as for `Layout`.
+            If no sub-aperture is illuminated, or as for `Layout`.
         """
         check_keys("", optics, OPTICS, what="argument")
         n_rows, n_columns = pair_of_numbers("shape", shape, 1, _LARGEST_PX)
@@ -229,7 +232,9 @@ class Layout:
         distance = np.hypot(*(cells - 0.5 * (np.array([n_rows, n_columns]) - 1)).T)
         cells = cells[(distance <= outer) & (distance >= inner)]
         if len(cells) == 0:
-            raise InputError(f"outer_radius = {outer:g}, inner_radius = {inner:g}: no sub-aperture is lit")
+            raise InputError(
+                f"outer_radius = {outer:g}, inner_radius = {inner:g}: no sub-aperture is illuminated"
+            )
         if frame_shape is None:
             last = np.array(start) + (np.array([n_rows, n_columns]) - 1) * step + window
             frame_shape = (int(last[0]), int(last[1]))
@@ -238,7 +243,7 @@ class Layout:
 
     @classmethod
     def stacked(cls, n: int, window: tuple[int, int], offsets: NDArray[np.float64] | None = None) -> Layout:
-        """Return the layout of n images on top of each other, read as one tall frame.
+        """Return the layout of n images stacked into one tall frame.
 
         Parameters
         ----------
@@ -246,7 +251,7 @@ class Layout:
         window : (int, int)
             Height and width of an image.
         offsets : (n, 2) array, optional
-            x, y of each sub-aperture's centre from the middle of its image, px. Default 0.
+            x, y of each sub-aperture's centre from the centre of its image [px]. Default: 0.
         """
         ny, nx = window
         corners = np.column_stack([ny * np.arange(n), np.zeros(n, np.int64)])
@@ -270,28 +275,28 @@ class Layout:
         Parameters
         ----------
         frame : (h, w) or (n, h, w) array
-            A frame with spots, or several of the same field, which are averaged.
+            Frame with spots, or several of the same field, which are averaged.
         geometry : {"auto", "square", "hexagonal"}
         pitch_px : float, optional
-            Distance between neighbouring lenslets, when known (to 20 %).
+            Distance between neighbouring lenslets, if known (to 20 %).
         pixels : int or (int, int), optional
-            Window, or its height and width. Default: the largest square in which neighbours do not overlap; a
-            pitch that is a whole number within its error gives a window of that number.
+            Window, or its height and width. Default: the largest square windows that do not overlap; a
+            pitch that is an integer within its error gives windows of that size.
         bad_pixels : (h, w) array of bool, optional
-            True where a pixel must not be used.
+            True for pixels to ignore.
         move_windows : bool
-            Whether all windows may be moved alike, off the spots by up to 0.35 of their side, to save those
-            at the frame's edge. Centres of gravity are worse in such windows.
+            Whether all windows may be shifted together, by up to 0.35 of their side, to include spots at
+            the edge of the frame. Centres of gravity are less accurate in such windows.
         **options
             Passed on to `faintspot.sensor.lenslets.find_lenslets`.
 
         Returns
         -------
         Layout
-            Of the lit sub-apertures whose windows lie within the frame. Windows have the spots' mean lattice
-            in their middle, unless they were moved or follow spots that an aberration moves by more than a
-            quarter of the pitch; `centres` always holds the lattice.
-            `faintspot.sensor.found_layout.find_layout` says which lenslets and spots were left out.
+            Illuminated sub-apertures whose windows are within the frame. Windows are centred on the mean
+            lattice of the spots, unless they were shifted or follow spots that an aberration moves by more
+            than a quarter of the pitch; `centres` always contain the lattice.
+            `faintspot.sensor.found_layout.find_layout` lists the omitted lenslets and spots.
 
         Raises
         ------
@@ -313,7 +318,7 @@ class Layout:
 
     @classmethod
     def of_windows(cls, found: Windows) -> Layout:
-        """Return the layout of the windows that lie within the frame."""
+        """Return the layout of the windows within the frame."""
         grid, within = found.lenslets, found.within
         return cls(
             found.frame_shape,
@@ -333,13 +338,13 @@ class Layout:
 
     @classmethod
     def from_tables(cls, path: str | Path, document: Mapping[str, dict[str, Any]]) -> Layout:
-        """Make a layout from the tables of a configuration file."""
+        """Return the layout in the tables of a configuration file."""
         values = table_of(path, document, "layout")
         with errors_of_table(path, "layout"):
             return cls.from_table(values)
 
     def save(self, path: str | Path) -> None:
-        """Write the table [layout] of a configuration file (TOML); other tables stay as they are."""
+        """Write the table [layout] of a configuration file (TOML); preserve other tables."""
         save_tables(path, {"layout": self.to_table()})
 
     def to_table(self) -> dict[str, Any]:
@@ -348,12 +353,12 @@ class Layout:
 
     @classmethod
     def from_table(cls, values: Mapping[str, Any]) -> Layout:
-        """Make a layout from a table of a configuration file, which may hold those of `grid` as a table.
+        """Return the layout in a table of a configuration file, which may contain the arguments of `grid`.
 
         Raises
         ------
         InputError
-            For an unknown key, a missing or a bad value.
+            If a key is unknown, or a value is missing or invalid.
         """
         if "grid" not in values:
             check_fields("layout", cls, values)
@@ -369,7 +374,7 @@ class Layout:
             raise InputError(text if text.startswith("layout") else f"layout.grid.{text}") from None
 
     def images(self, frame: ArrayLike) -> NDArray[Any]:
-        """Cut the windows out of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""
+        """Return the windows of a frame (h, w) or frames (n, h, w): (n_subapertures, ny, nx) or (n, ...)."""
         array = np.asarray(frame)
         if array.shape[-2:] != self.frame_shape:
             raise InputError(f"frame: expected (height, width) = {self.frame_shape}, got {array.shape[-2:]}")
@@ -379,7 +384,7 @@ class Layout:
 
 
 def _index(chosen: Any, length: int) -> NDArray[np.int64]:
-    """Return the numbers of the chosen ones of so many sub-apertures."""
+    """Return the numbers of the selected sub-apertures."""
     if isinstance(chosen, slice):
         index = np.arange(length)[chosen]
     else:
@@ -398,7 +403,7 @@ def _index(chosen: Any, length: int) -> NDArray[np.int64]:
             if len(np.unique(index)) < len(index):
                 raise InputError("layout[...]: expected each sub-aperture once, got one twice")
     if len(index) == 0:
-        raise InputError("layout[...]: expected at least one sub-aperture, none is chosen")
+        raise InputError("layout[...]: expected at least one sub-aperture, got none")
     return np.asarray(index)
 
 
@@ -421,7 +426,7 @@ def _check_inside(corners: NDArray[np.int64], window: tuple[int, int], frame_sha
 
 
 def _check_centres(offsets: NDArray[np.float64], window: tuple[int, int]) -> None:
-    """Refuse centres that no spot of their window can belong to; aberrations may move spots by a pitch."""
+    """Raise an error for implausible centres; aberrations may move spots by a pitch."""
     away = np.abs(offsets).max(axis=1)
     if away.max() > 3 * max(window):
         raise InputError(
@@ -431,10 +436,10 @@ def _check_centres(offsets: NDArray[np.float64], window: tuple[int, int]) -> Non
 
 
 def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
-    """Windows share a pixel when their corners are less than a window apart on both axes."""
+    """Raise an error if windows share a pixel: corners less than a window apart on both axes."""
     if _on_a_grid(corners, window):
         return
-    from scipy.spatial import KDTree  # 0.2 s, which a plain grid does not need
+    from scipy.spatial import KDTree  # takes 0.2 s and is not needed for a regular grid
 
     apart, nearest = KDTree(corners / np.array(window)).query(corners / np.array(window), 2, p=np.inf)
     overlapping = np.flatnonzero(apart[:, 1] < 1 - 1e-9)
@@ -448,7 +453,7 @@ def _check_overlap(corners: NDArray[np.int64], window: tuple[int, int]) -> None:
 
 
 def _on_a_grid(corners: NDArray[np.int64], window: tuple[int, int]) -> bool:
-    """Whether these are cells of a grid whose lines are a window apart, none of them twice."""
+    """Return whether these are distinct cells of a grid whose lines are a window apart."""
     for axis, size in enumerate(window):
         if np.diff(np.unique(corners[:, axis])).min(initial=size) < size:
             return False

@@ -1,4 +1,4 @@
-"""Find the lenslets of a Shack-Hartmann sensor in a frame: geometry, pitch, angle, and which are lit."""
+"""Find the lenslets of a Shack-Hartmann sensor in a frame: geometry, pitch, angle and illumination."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from faintspot.sensor.nodes import (
 from faintspot.sensor.region import PupilRegion, Rectangle
 
 _FIT_PASSES = 4
-# A spot of this signal-to-noise ratio that is as bright as lit ones and this far (pitches) from all of them
-# belongs to another lenslet: a smooth aberration brings two spots no closer.
+# A spot with this signal-to-noise ratio that is as bright as those of illuminated lenslets and this far
+# (pitches) from all of them belongs to another lenslet: a smooth aberration brings no two spots closer.
 _CLEAR, _ELSEWHERE = 6.0, 0.5
-# Displacements are followed when that reaches so many of these spots, or half of them (one may be a ghost's),
-# and the spots lie this near (pitches, median) to where they are then expected, unlike peaks within spots.
+# Displacements are followed if that reaches so many of these spots, or half of them (one may be a ghost), and
+# the spots are this near (pitches, median) to their expected positions, unlike peaks within spots.
 _REACHED, _FOLLOWED = 4, 0.15
-# More of them than this share of the lit lenslets make the lattice doubtful; the rows that the frame's edge
-# cuts off a small array are fewer.
+# Share of such spots relative to illuminated lenslets above which the lattice is doubtful; rows cut off by
+# the edge of the frame in a small array are fewer.
 _PART_ELSEWHERE = 0.25
-# Its shape is like that of the lit ones: it explains at least this part of what it explains of theirs.
+# Minimum shape similarity: fraction of the squared flux explained, relative to illuminated spots.
 _LIKE = 0.6
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 _SMALLEST_GIVEN_PITCH_PX = 4
@@ -45,7 +45,7 @@ _SMALLEST_GIVEN_PITCH_PX = 4
 
 @dataclass(frozen=True)
 class LensletGrid:
-    """The lit lenslets of a sensor and the regular lattice that they lie on.
+    """Illuminated lenslets of a sensor and the regular lattice that fits them.
 
     Parameters
     ----------
@@ -54,26 +54,27 @@ class LensletGrid:
     pitch_px : float
         Distance between neighbouring lenslets.
     angle_deg : float
-        Angle of a row (column number growing) from +x towards +y, in [-45, 45) for a square and [-30, 30)
-        for a hexagonal lattice. Row numbers grow in the direction 90 or 60 degrees further towards +y.
+        Angle of a row (direction of increasing column number) from +x towards +y, in [-45, 45) for a square
+        and [-30, 30) for a hexagonal lattice. Row numbers increase in the direction 90 or 60 degrees
+        further towards +y.
     cells : int array (n, 2)
-        Row and column of every lit lenslet, ordered by row, then column; the smallest of each is 0.
+        Row and column of each illuminated lenslet, ordered by row, then column; the smallest of each is 0.
     centres : float array (n, 2)
-        x, y of the lattice's nodes in frame pixels, pixel i having its centre at i. They are the nodes of
-        the regular lattice that fits all spots best, not the positions of the spots.
+        x, y of the lattice nodes in frame pixels (pixel i is centred at i). They are the nodes of the regular
+        lattice that fits all spots best, not the positions of the spots.
     flux : float array (n,)
-        Flux above the local background in the frame's units, within 2.5 spot widths (standard deviations)
-        of the spot's peak, at most half a pitch.
+        Flux above the local background in the units of the frame, within 2.5 spot widths (standard
+        deviations) of the peak of the spot, at most half a pitch.
     drifts : float array (n, 2)
-        x, y from the centres to where a smooth aberration moves the spots, px; 0 where none was followed.
+        x, y displacement of the spots by a smooth aberration [px]; 0 where none was followed.
     spots : float array (n, 2)
-        x, y of each lit lenslet's spot in frame pixels.
+        x, y of the spot of each illuminated lenslet in frame pixels.
     spot_px : float
-        Standard deviation of the spots' shape.
+        Standard deviation of the spot shape.
     elsewhere : float array (m, 2)
-        x, y of the other spots that are as bright as those of lit lenslets.
+        x, y of other spots that are as bright as those of illuminated lenslets.
     doubt : str
-        Why the choice of lit lenslets may be wrong, in one line; empty when it is clear.
+        Reason why the choice of illuminated lenslets may be wrong, in one line; empty if it is clear.
     """
 
     geometry: str
@@ -99,50 +100,51 @@ def find_lenslets(
     pupil: Any = None,
     roi: Any = None,
 ) -> LensletGrid:
-    """Find the lenslet grid in a frame, without knowing anything about the sensor.
+    """Find the lenslet grid in a frame without prior knowledge of the sensor.
 
-    The lattice comes from the power spectrum of a map of everything that looks like a spot (see
-    faintspot.sensor.lattice), then from a robust least-squares fit to the spots at its nodes. Which lenslets
-    are lit is decided for all together (see faintspot.sensor.illumination):
-    a lit one has a spot that stands out of
-    the noise of its own cell, enough flux above its own background, and mostly lit neighbours. So lenslets at
-    the pupil's edge with low flux and those behind the central obstruction are left out, and so is one
-    whose node lies within 0.12 pitch of the frame's edge.
+    The lattice is found in the power spectrum of a map of spot-like features (see
+    faintspot.sensor.lattice), and refined by a robust least-squares fit to the spots at its nodes. The
+    illuminated lenslets are chosen all together (see faintspot.sensor.illumination). An illuminated lenslet
+    has a spot that stands out of the noise of its own cell, enough flux above its own background, and
+    mostly illuminated neighbours. Lenslets at the edge of the pupil with low flux and those behind the
+    central obstruction are therefore omitted. So are lenslets whose node is within 0.12 pitch of the edge
+    of the frame.
 
     Parameters
     ----------
     frame : array (ny, nx) or (n_frames, ny, nx)
-        One frame, or several that are averaged (each pixel's extreme values left out).
+        One frame, or several that are averaged (the extreme values of each pixel are ignored).
     geometry : str
         "auto", "square" or "hexagonal".
     pitch_px : float, optional
-        The pitch, known within 20 %.
+        Pitch, known within 20 %.
     bad_pixels : bool array (ny, nx), optional
-        Pixels to ignore; they may hold NaN. Hot pixels and cosmic rays are found without it.
+        Pixels to ignore, which may be NaN. Hot pixels and cosmic rays are also found without it.
     illuminated_fraction : float, optional
-        The smallest flux of a lit lenslet, as a part of the median of the lit ones. Default: the part between
-        0.18 and 0.5 that the fewest lenslets have.
+        Smallest flux of an illuminated lenslet, relative to the median of the illuminated ones. Default: the
+        value between 0.18 and 0.5 with the fewest lenslets near it.
     pupil : (x, y, radius) or (x, y, radius, inner radius), optional
-        In pixels: the lenslets whose nodes lie in this disk or annulus are taken, whatever their flux.
+        Disk or annulus in pixels: lenslets with nodes inside are used, whatever their flux.
     roi : (x0, y0, x1, y1), optional
-        Only columns x0 to x1 - 1 and rows y0 to y1 - 1 are looked at.
+        Part of the frame to use: columns x0 to x1 - 1 and rows y0 to y1 - 1.
 
     Returns
     -------
     LensletGrid
-        The lit lenslets.
+        Illuminated lenslets.
 
     Raises
     ------
     InputError
-        If the arguments are wrong, or when no lattice of at least four lit lenslets in two rows and two
+        If arguments are invalid, or no lattice of at least four illuminated lenslets in two rows and two
         columns stands out of the noise.
 
     Notes
     -----
-    In simulation, spots shifted at random by up to 15 % of the pitch per axis: the lattice was found in all
-    frames at a signal-to-noise ratio (of a spot in a matched filter) of 4 with 140 lenslets, in 14 of 16 at 5
-    with 40, and in 12 of 16 at 8 with 16 lenslets. At a ratio of 5 a sixth of the lit lenslets is missed.
+    In simulations with spots displaced randomly by up to 15 % of the pitch per axis, the lattice was found
+    in all frames at a signal-to-noise ratio (of a spot in a matched filter) of 4 with 140 lenslets, in 14
+    of 16 at 5 with 40, and in 12 of 16 at 8 with 16 lenslets. At a ratio of 5, one sixth of the illuminated
+    lenslets is missed.
     """
     one_of("geometry", geometry, ("auto", *RATIOS))
     if illuminated_fraction is not None:
@@ -204,7 +206,7 @@ def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float,
 
 
 def _nothing_found(image: NDArray[np.float64], pitch_range_px: tuple[float, float], geometry: str) -> str:
-    """Say in one line that there is no lattice, what there is, and what to try."""
+    """Return a one-line message that no lattice was found, with the range searched and what to try."""
     if np.ptp(image) == 0:
         return f"frame: every pixel is {image.flat[0]:g}, expected an image of lenslet spots"
     kind = "square or hexagonal" if geometry == "auto" else geometry
@@ -215,7 +217,7 @@ def _nothing_found(image: NDArray[np.float64], pitch_range_px: tuple[float, floa
 
 
 def _too_few(count: int, lattice: Lattice, pupil: PupilRegion | None) -> str:
-    """Say in one line that a lattice has too few lit lenslets."""
+    """Return a one-line message that a lattice has too few illuminated lenslets."""
     found = f"frame: a {lattice.geometry} lattice with a pitch of {lattice.pitch_px:.1f} px fits best, but "
     expected = "expected at least two rows of two"
     if pupil is not None:
@@ -229,7 +231,7 @@ def _be(count: int) -> str:
 
 
 def _checked(frame: Any, bad_pixels: Any) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Return frame or frames and a mask of bad pixels, which may hold NaN in the frame."""
+    """Return frame or frames and a mask of bad pixels, where the frame may be NaN."""
     frames = real_array("frame", frame, minimum_dimensions=2)
     if frames.ndim > 3:
         raise InputError(f"frame: expected (ny, nx) or (n_frames, ny, nx), got shape {frames.shape}")
@@ -257,7 +259,7 @@ def _clean_image(frames: NDArray[Any], bad: NDArray[np.bool_]) -> NDArray[np.flo
 
 
 def _robust_mean(frames: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the mean of a cube: of at most 12 group means, each pixel's two extremes left out."""
+    """Return the mean of a cube from at most 12 group means, without the two extremes of each pixel."""
     if frames.ndim == 2:
         return frames.astype(np.float64)
     groups = np.array_split(frames, min(len(frames), 12))
@@ -267,17 +269,17 @@ def _robust_mean(frames: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _hot_pixels(image: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the pixels of hot pixels and cosmic rays.
+    """Return a mask of hot pixels and cosmic rays.
 
-    The flux of a spot reaches at least three of a pixel's eight neighbours; a hot pixel reaches none and the
-    track of a cosmic ray two.
+    The flux of a spot extends to at least three of a pixel's eight neighbours; that of a hot pixel to none,
+    and the track of a cosmic ray to two.
     """
     padded = np.pad(image, 1, mode="edge")
     mean = (scipy.ndimage.uniform_filter(image, 3, mode="nearest") * 9 - image) / 8
     above = image - mean
     every = max(1, image.size // _MOST_FOR_NOISE)
     noise = robust_std(above.ravel()[::every])
-    # Two neighbours on its track leave three quarters of a pixel's excess over the mean of all eight.
+    # With two neighbours on a track, three quarters of a pixel's excess over the mean of all eight remain.
     row, column = np.nonzero(above > 0.75 * 5 * noise)
     around = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
     ring = np.sort(np.stack([padded[row + y, column + x] for y, x in around]), axis=0)
@@ -289,7 +291,7 @@ def _hot_pixels(image: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _median_of_good(image: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the median of the good pixels among the 5 x 5 around every bad one (elsewhere the image)."""
+    """Replace each bad pixel by the median of the good pixels in the 5 x 5 around it."""
     filled = image.copy()
     padded = np.pad(np.where(bad, np.nan, image), 2, constant_values=np.nan)
     y, x = np.nonzero(bad)
@@ -302,9 +304,10 @@ def _median_of_good(image: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArr
 
 @dataclass(frozen=True)
 class _Fit:
-    """A lattice fitted to the spots, what was measured at its nodes, and which are lit.
+    """Lattice fitted to the spots, with measurements at its nodes and their illumination.
 
-    `bright` are all spots as bright as the lit ones, `elsewhere` those of them that belong to no lit node.
+    `bright` are all spots as bright as the illuminated ones, `elsewhere` those of them at no
+    illuminated node.
     """
 
     lattice: Lattice
@@ -321,7 +324,7 @@ def _fitted(
     illuminated_fraction: float | None,
     pupil: PupilRegion | None,
 ) -> _Fit:
-    """Fit the lattice to the spots; where spots are left over, follow them from neighbour to neighbour."""
+    """Fit the lattice to the spots; if some are left over, follow them from neighbour to neighbour."""
     image = image - np.median(image)
     width_px = spot_width(image, lattice)
     for _ in range(_FIT_PASSES):
@@ -359,7 +362,7 @@ def _fitted(
 
 
 def _too_many(fit: _Fit) -> str:
-    """Say in one line when the lattice explains only a part of the flux."""
+    """Return a one-line warning if the lattice explains only a part of the flux."""
     count, illuminated = len(fit.elsewhere), int(np.count_nonzero(fit.illuminated.nodes))
     if count <= _PART_ELSEWHERE * illuminated:
         return ""
@@ -377,7 +380,7 @@ def _illuminated_of(
     everywhere: SpotFlux,
     drift: Drift = no_drift,
 ) -> _Fit:
-    """Decide which lenslets of a lattice are lit, and which bright spots belong to none of them."""
+    """Decide which lenslets of a lattice are illuminated, and which bright spots belong to none of them."""
     spots = measure_nodes(image, lattice, width_px, drift)
     illuminated = find_illumination(spots, lattice, illuminated_fraction)
     elsewhere = bright = np.empty(0, dtype=np.complex128)
@@ -390,6 +393,6 @@ def _illuminated_of(
 
 
 def _bright(spots: SpotFlux, illuminated: Illumination, likeness: float) -> NDArray[np.bool_]:
-    """Return which spots are as bright as those of lit lenslets, and about of their shape."""
+    """Return which spots are as bright as those of illuminated lenslets, and of similar shape."""
     clear = (spots.signal_to_noise > _CLEAR) & (spots.likeness > _LIKE * likeness)
     return np.asarray(clear & (spots.flux >= illuminated.least_flux))

@@ -1,4 +1,4 @@
-"""Which lenslets are neighbours."""
+"""Neighbouring lenslets in square and hexagonal arrays."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEAST_DIFFERENCE = 0.1
-"""Of the pitch: spots that differ by less are displaced alike."""
+"""Smaller differences between displacements of spots are treated as equal, in pitches."""
 
 _BESIDE = ((0, 1), (0, -1), (1, 0), (-1, 0))
 _DIAGONAL = ((1, -1), (-1, 1), (1, 1), (-1, -1))
 
 
 def neighbours_of(cells: NDArray[np.int64], geometry: str, *, diagonal: bool = False) -> NDArray[np.int64]:
-    """Return the (n, 4 or 6) indices of the neighbours of every cell, n where there is none.
+    """Return the (n, 4 or 6) indices of the neighbours of each cell, n where there is none.
 
-    With `diagonal` (n, 8) in square arrays, those that touch at a corner too.
+    With `diagonal` (n, 8), diagonal neighbours in square arrays are included.
     """
     steps = _BESIDE + _DIAGONAL[: 2 if geometry == "hexagonal" else 4 * diagonal]
     shifted = cells - cells.min(axis=0) + 1

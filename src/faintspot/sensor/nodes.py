@@ -1,8 +1,8 @@
-"""What light is at each node of a lattice: a spot's position, its flux, and how it stands out of the noise.
+"""Spots at the nodes of a lattice: positions, fluxes and significance.
 
-A spot is a bump on a local background, so its flux is measured against a plane that is fitted with it to the
-pixels of its cell, and its noise is that of the same pixels: haze, gradients, and the spots around it make no
-spot, and noise in one part of the frame hides none in another.
+The flux of a spot is measured above a plane fitted together with it to the pixels of its cell, and its
+noise is that of the same pixels. Haze, gradients and surrounding spots are therefore not taken for spots,
+and noise in one part of the frame does not hide spots in another.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from numpy.typing import NDArray
 
 from faintspot.sensor.lattice import Lattice, robust_std
 
-# A spot is looked for within this part of the pitch around its node: aberrations of +-15 % of the pitch per
-# axis and an error of the first lattice fit in, the neighbour's spot does not.
+# Search radius around a node, in pitches: it includes aberrations of +-15 % of the pitch per axis and an
+# error of the first lattice fit, but not the spots of neighbours.
 SEARCH = 0.35
-# A node this near to the frame's edge (part of the pitch) has its spot cut in two.
+# A node closer to the edge of the frame (in pitches) has its spot cut.
 _MARGIN = 0.12
-# Spots that are looked for anywhere are at least this far apart, along x or y; those of a node that lies
-# outside the frame are followed as far as `REACH`. Both in pitches.
+# Smallest distance between spots searched for anywhere, along x or y; spots of nodes outside the frame are
+# followed up to `REACH`. Both in pitches.
 _APART, REACH = 0.3, 1.5
-# A spot and its plane are fitted to the pixels within this part of the pitch: a little beyond half-way to the
-# neighbour, so that a plane is told from the top of a broad spot.
+# A spot and its plane are fitted to pixels within this distance, in pitches: slightly beyond half-way to the
+# neighbour, so that a plane is distinguished from the top of a broad spot.
 _CELL = 0.55
-# Peaks of this many standard deviations are spots when the width of the spots is measured.
+# Significance (standard deviations) above which peaks are used to measure the width of the spots.
 _CERTAIN = 4.0
-# Spot widths (standard deviation) that are tried: from the sharpest that pixels sample to a blur that fills
-# the cell, each 1.25 times the last. The peaks come from three of them, a factor of 2.5 or so apart: a filter
-# that is 1.6 times too wide or narrow keeps 0.9 of the signal-to-noise ratio.
+# Spot widths (standard deviation) to try: from the sharpest that pixels sample to a blur that fills the cell,
+# in steps of 1.25. Peaks are taken from three of them, about a factor of 2.5 apart: a filter that is 1.6
+# times too wide or narrow keeps 0.9 of the signal-to-noise ratio.
 _SHARPEST_PX, _BROADEST = 0.6, 0.25
 _WIDTHS, _STARTS = 9, (1, 4, 7)
-_MOST_FOR_WIDTH = 500  # spots; the width of so many is known far better than is needed
+_MOST_FOR_WIDTH = 500  # spots; their width is then known far more precisely than needed
 _MOST_FOR_NOISE = 50_000  # pixels; the robust deviation of so many is known to 1 %
 
 Drift = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
 
 
 def no_drift(nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return displacements of zero: spots are expected at their nodes."""
+    """Return displacements of zero, for spots expected at their nodes."""
     return np.zeros_like(nodes)
 
 
@@ -52,14 +52,14 @@ class SpotFlux:
     Parameters
     ----------
     positions : complex array
-        Tops of the peaks, x + 1j * y, px.
+        Positions of the peaks, x + 1j * y [px].
     flux, flux_noise : arrays
-        Flux above the local plane within 2.5 standard deviations of the spot's shape (at most half a
-        pitch), and its noise.
+        Flux above the local plane within 2.5 standard deviations of the spot shape (at most half a pitch),
+        and its noise.
     signal_to_noise : array
-        Of the fitted spot, by the noise of the cell itself.
+        Signal-to-noise ratio of the fitted spot, relative to the noise of its own cell.
     likeness : array
-        Part of the squared flux there that the spot's shape explains: little for cosmic rays and hot pixels.
+        Fraction of the squared flux explained by the spot shape: small for cosmic rays and hot pixels.
     """
 
     positions: NDArray[np.complex128]
@@ -77,9 +77,9 @@ class NodeFlux(SpotFlux):
     ----------
     cells : int array (n, 2)
     drifts : complex array
-        From the node to the place where its spot is expected, px.
+        Vectors from the nodes to the expected positions of the spots [px].
     shifts : complex array
-        From that place to the peak, in pitches.
+        Vectors from these positions to the peaks, in pitches.
     """
 
     cells: NDArray[np.int64]
@@ -90,16 +90,16 @@ class NodeFlux(SpotFlux):
 def measure_nodes(
     image: NDArray[np.float64], lattice: Lattice, width_px: float, drift: Drift = no_drift
 ) -> NodeFlux:
-    """Measure the spot of every node whose spot is expected inside the frame.
+    """Measure the spot of each node whose spot is expected inside the frame.
 
     Parameters
     ----------
     image : array (ny, nx)
     lattice : Lattice
     width_px : float
-        Standard deviation of the spots' shape.
+        Standard deviation of the spot shape.
     drift : function
-        Gives the expected displacements (px) of the spots of nodes at given positions, x + 1j * y.
+        Function that returns the expected displacements [px] of the spots of nodes at x + 1j * y.
     """
     band = _band(image, _haze(image, lattice), width_px)
     margin_px = _MARGIN * lattice.pitch_px
@@ -114,7 +114,7 @@ def measure_nodes(
 
 
 def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) -> SpotFlux:
-    """Measure all peaks of a frame that are clearly spots, wherever they lie."""
+    """Measure all peaks of a frame that are clearly spots, at any position."""
     band = _band(image, _haze(image, lattice), width_px)
     side = 2 * max(1, int(_APART * lattice.pitch_px)) + 1
     high = (band == scipy.ndimage.maximum_filter(band, side)) & (band > _CERTAIN * _noise(band, lattice))
@@ -123,7 +123,7 @@ def find_spots(image: NDArray[np.float64], lattice: Lattice, width_px: float) ->
 
 
 def inside_frame(at: NDArray[np.complex128], shape: tuple[int, ...], margin_px: float) -> NDArray[np.bool_]:
-    """Return which positions lie at least so many pixels within the centres of a frame's outer pixels."""
+    """Return which positions are at least a margin inside the centres of the outermost pixels of a frame."""
     x, y = at.real, at.imag
     inside = (np.minimum(x, y) >= margin_px) & (x <= shape[1] - 1 - margin_px)
     return np.asarray(inside & (y <= shape[0] - 1 - margin_px))
@@ -136,7 +136,7 @@ def _measured(
     width_px: float,
     peaks: NDArray[np.complex128],
 ) -> SpotFlux:
-    """Fit a spot on a plane to the pixels around each peak."""
+    """Fit a spot and a plane to the pixels around each peak."""
     offsets = _cell_offsets(lattice)
     values = _around(image, peaks, offsets)
     inside = ~np.isnan(values)
@@ -145,7 +145,7 @@ def _measured(
     numbers, inverse = _fits(values, inside, model)
     spot = model[:, 3]
     residual = np.where(inside, values - numbers @ model.T, 0.0)
-    # The noise is that of the background: where the spot is bright, its own shape differs from the model's.
+    # Use the noise of the background: for bright spots, residuals are dominated by the shape of the spot.
     weight = (1 - spot) ** 2
     variance = (residual**2 @ weight) / np.maximum(inside @ weight, 1e-12)
     variance += _coloured(image, band, lattice, width_px)
@@ -164,9 +164,9 @@ def _measured(
 
 
 def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
-    """Return the standard deviation (px) of the Gaussian that is most like the spots.
+    """Return the standard deviation [px] of the Gaussian that is most similar to the spots.
 
-    It is the one whose fits have the highest signal-to-noise ratio, summed over the spots there are.
+    It has the highest total signal-to-noise ratio of the fits, over all spots.
     """
     widest = max(1.2, _BROADEST * lattice.pitch_px)
     widths = np.geomspace(_SHARPEST_PX, widest, _WIDTHS)
@@ -186,22 +186,22 @@ def spot_width(image: NDArray[np.float64], lattice: Lattice) -> float:
         for width in widths:
             numbers, inverse = _fits(np.where(inside, values, 0.0), inside, _model(offsets, lattice, width))
             ratio = numbers[:, 3] / np.sqrt(inverse[:, 3, 3])
-            # The sum, as the right width also makes most spots stand out; clipped, for a cosmic ray in it.
+            # The sum also rewards a width that makes more spots significant; it is clipped for cosmic rays.
             score = float(np.minimum(ratio, 3 * np.median(ratio)).mean()) * len(certain)
             best = max(best, (score, float(width)))
     return best[1]
 
 
 def _haze(image: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
-    """Return the mean over a pitch around every pixel, in which regular spots are even."""
+    """Return the mean over a pitch around each pixel, to which regular spots contribute evenly."""
     haze = scipy.ndimage.uniform_filter(image, round(lattice.pitch_px), mode="nearest")
     return np.asarray(scipy.ndimage.uniform_filter(haze, 3, mode="nearest"))
 
 
 def _band(image: NDArray[np.float64], haze: NDArray[np.float64], width_px: float) -> NDArray[np.float64]:
-    """Return the smoothed image less the haze that its spots stand in.
+    """Return the smoothed image without the haze around the spots.
 
-    It is dark outside the frame: a mirrored spot would move the peak to the edge.
+    It is dark outside the frame: a mirrored spot would shift the peak to the edge.
     """
     smooth = scipy.ndimage.gaussian_filter(image, width_px, mode="constant", truncate=3.0)
     return np.asarray(smooth - haze)
@@ -234,7 +234,7 @@ def _around(
 def _peaks(
     band: NDArray[np.float64], lattice: Lattice, at: NDArray[np.complex128]
 ) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return the position and height of the highest pixel near every place."""
+    """Return position and height of the highest pixel near each position."""
     offsets = _disc(max(SEARCH * lattice.pitch_px, 1.5))
     values = _around(band, at, offsets)
     values = np.where(np.isnan(values), -np.inf, values)
@@ -252,8 +252,8 @@ def _model(offsets: NDArray[np.complex128], lattice: Lattice, width_px: float) -
 def _fits(
     values: NDArray[np.float64], inside: NDArray[np.bool_], model: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit the model to every cell: its numbers (n, 4) and the inverse normal matrix (n, 4, 4)."""
-    # A faint ridge keeps a cell that the frame's edge cuts to a line solvable.
+    """Fit the model to each cell; return parameters (n, 4) and inverse normal matrices (n, 4, 4)."""
+    # A small ridge keeps the fit solvable for cells cut to a line by the edge of the frame.
     ridge = 1e-9 * len(model) * np.eye(4)
     inverse = np.tile(np.linalg.inv(model.T @ model + ridge), (len(values), 1, 1))
     cut = np.flatnonzero(~inside.all(axis=1))
@@ -263,7 +263,7 @@ def _fits(
 
 
 def _subpixel(band: NDArray[np.float64], peaks: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return how far from the peak pixel the top of a parabola through it and its neighbours lies."""
+    """Return the offset from the peak pixel to the maximum of a parabola through it and its neighbours."""
     height, width = band.shape
     x = np.clip(peaks.real.astype(np.int64), 1, width - 2)
     y = np.clip(peaks.imag.astype(np.int64), 1, height - 2)
@@ -283,10 +283,10 @@ def _subpixel(band: NDArray[np.float64], peaks: NDArray[np.complex128]) -> NDArr
 def _coloured(
     image: NDArray[np.float64], band: NDArray[np.float64], lattice: Lattice, width_px: float
 ) -> float:
-    """Return the variance to add to that of the pixels for the noise that is not white, such as stripes.
+    """Return the additional pixel variance due to noise that is not white, such as stripes.
 
-    Smoothing leaves 1 / (2 sqrt(pi) width) of white noise; what it leaves beyond that is as much as white
-    noise of this variance would leave.
+    Smoothing leaves 1 / (2 sqrt(pi) width) of white noise. The excess after smoothing is expressed as the
+    variance of white noise that would leave as much.
     """
     smoothed = 2 * np.sqrt(np.pi) * width_px * _noise(band, lattice)
     return float(max(smoothed**2 - _noise(image, lattice) ** 2, 0.0))
@@ -295,8 +295,8 @@ def _coloured(
 def _noise(image: NDArray[np.float64], lattice: Lattice) -> float:
     """Return the standard deviation of the noise between the spots.
 
-    The wings of the spots are the same one step of the lattice away and the background changes evenly, so
-    that second differences over one step are noise.
+    The wings of spots are equal one step of the lattice away and the background changes linearly, so that
+    second differences over one step contain only noise.
     """
     row, column = round(lattice.step.imag), round(lattice.step.real)
     height, width = image.shape

@@ -1,4 +1,4 @@
-"""Where the sub-apertures are in the telescope's pupil: their outlines, and the circle around them."""
+"""Sub-apertures in the pupil of the telescope: their outlines, and the circle around them."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pupil:
-    """The disk of the telescope's pupil, as it lies on the lenslets."""
+    """Disk of the telescope pupil in the frame."""
 
     centre_px: tuple[float, float]
-    """x, y in the frame."""
+    """Centre x, y in the frame [px]."""
     radius_px: float
-    """Also in the frame: neighbouring lenslets are the layout's pitch apart there."""
+    """Radius in the frame [px]; neighbouring lenslets are one pitch of the layout apart."""
     radius_subapertures: float
-    """In sides of a sub-aperture."""
+    """Radius in sub-aperture sides."""
     radius_m: float | None
-    """In the entrance pupil; None when the layout does not say how large that is."""
+    """Radius in the entrance pupil; None if the layout does not give its size."""
 
 
 def pupil_of(layout: Layout) -> Pupil:
     """Return the disk of the pupil.
 
-    Its middle is that of the rectangle along the lattice's rows that holds all lit sub-apertures, and its
-    diameter the longer side, so that corners of a square array are outside; with both `subaperture_m` and
-    `diameter_m`, their ratio.
+    The centre is that of the rectangle along the rows of the lattice that contains all illuminated
+    sub-apertures. The diameter is its longer side, so that corners of a square array are outside; if both
+    `subaperture_m` and `diameter_m` are given, it is their ratio.
 
     Raises
     ------
     InputError
-        If these two make a disk in which not all centres of sub-apertures lie.
+        If these two give a disk that does not contain all centres of sub-apertures.
     """
     pitch = lenslet_pitch(layout)
     angle = np.deg2rad(layout.angle_deg)
@@ -69,14 +69,14 @@ def inside_pupil(layout: Layout, pupil: Pupil) -> NDArray[np.bool_]:
 
 
 def lenslet_pitch(layout: Layout) -> float:
-    """Return the distance of neighbouring lenslets, px; the window's side where it is not known."""
+    """Return the distance of neighbouring lenslets [px]; the side of the window if it is unknown."""
     return float(max(layout.window)) if layout.pitch_px is None else layout.pitch_px
 
 
 def lenslet_outlines(layout: Layout, part: float = 1.0) -> Floats:
     """Return the corners of each lenslet's square or hexagon in frame pixels, (n, 4 or 6, 2).
 
-    They go round from +x towards +y; `part` makes lenslets smaller, with gaps between them.
+    They are ordered from +x towards +y; `part` shrinks the lenslets, leaving gaps between them.
     """
     pitch = part * lenslet_pitch(layout)
     if layout.geometry == "hexagonal":

@@ -1,4 +1,4 @@
-"""Parts of a frame that somebody names: a pupil, a rectangle."""
+"""Regions of a frame given by the user: pupil and rectangle."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from faintspot.base.errors import InputError
 
 @dataclass(frozen=True)
 class PupilRegion:
-    """A disk or an annulus on the detector: centre x + 1j * y, outer and inner radius, px."""
+    """Disk or annulus on the detector: centre x + 1j * y, outer and inner radius [px]."""
 
     centre: complex
     radius: float
@@ -22,7 +22,7 @@ class PupilRegion:
 
     @classmethod
     def given(cls, value: Any) -> PupilRegion:
-        """Make one of (x, y, radius) or (x, y, radius, inner radius); InputError when it is neither."""
+        """Return the region (x, y, radius) or (x, y, radius, inner radius); raise InputError if invalid."""
         numbers = numbers_between("pupil", value)
         if numbers.ndim != 1 or len(numbers) not in (3, 4):
             raise InputError("pupil: expected x, y, radius and, for an annulus, the inner radius, in pixels")
@@ -32,11 +32,11 @@ class PupilRegion:
         return cls(complex(x, y), radius, inner)
 
     def moved(self, step: complex) -> PupilRegion:
-        """Return it moved by x + 1j * y."""
+        """Return the region moved by x + 1j * y."""
         return replace(self, centre=self.centre + step)
 
     def holds(self, at: NDArray[np.complex128]) -> NDArray[np.bool_]:
-        """Return which positions x + 1j * y lie in it."""
+        """Return which positions x + 1j * y are inside."""
         distance = np.abs(at - self.centre)
         return np.asarray((distance <= self.radius) & (distance >= self.inner))
 
@@ -52,7 +52,7 @@ class Rectangle:
 
     @classmethod
     def given(cls, value: Any, shape: tuple[int, ...]) -> Rectangle:
-        """Make one of (x0, y0, x1, y1), all of the frame for None; InputError when it is not in the frame."""
+        """Return the rectangle (x0, y0, x1, y1), or the frame for None; raise InputError if outside."""
         if value is None:
             return cls(0, 0, shape[1], shape[0])
         numbers = numbers_between("roi", value, integer=True)
@@ -68,5 +68,5 @@ class Rectangle:
 
     @property
     def slices(self) -> tuple[Any, ...]:
-        """What cuts it out of a frame or of several."""
+        """Slices that cut the rectangle out of one or several frames."""
         return (..., slice(self.y0, self.y1), slice(self.x0, self.x1))

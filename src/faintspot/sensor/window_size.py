@@ -1,4 +1,4 @@
-"""How large windows may be, and pairs of numbers such as their size."""
+"""Size limits of windows, and checks of pairs of numbers such as their size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def window_size(name: str, value: Any) -> tuple[int, int]:
 
 
 def pair_of_numbers(name: str, value: Any, low: float, high: float) -> tuple[int, int]:
-    """Two whole numbers, from one or two."""
+    """Return two whole numbers, from one or two."""
     array = numbers_between(name, value, low, high, integer=True)
     if array.ndim > 1 or array.size not in (1, 2):
         raise InputError(f"{name}: expected one or two whole numbers, got shape {array.shape}")

@@ -1,4 +1,4 @@
-"""Windows around the lenslets that were found: how large they are, and where each begins."""
+"""Windows around the lenslets found in a frame: size and position."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from faintspot.base.errors import InputError
 from faintspot.sensor.lenslets import LensletGrid, find_lenslets
 from faintspot.sensor.window_size import LARGEST_WINDOW, window_size
 
-# Windows may be spread this far from their spots to be a pixel larger: as far as rounding their corners to
-# whole pixels moves them anyway.
+# Windows may be moved this far from their spots to be a pixel larger: no more than the rounding of their
+# corners to whole pixels.
 _SPREAD_PX = 0.5
-_LARGEST_SHIFT = 0.35  # of a window's side, by which windows that may be moved are moved off their spots
+_LARGEST_SHIFT = 0.35  # of a window's side, by which `move_windows` may shift windows off their spots
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Windows of the lenslets that were found in a frame.
+    """Windows of the lenslets found in a frame.
 
     Parameters
     ----------
     frame_shape, window : (int, int)
     corners : (n, 2) array of int
-        Row and column of every window's first pixel.
+        Row and column of the first pixel of each window.
     within : (n,) array of bool
-        Whether it lies within the frame.
+        Whether the window is within the frame.
     lenslets : LensletGrid
-        All lit lenslets, those at the edge too.
+        All illuminated lenslets, including those at the edge.
     """
 
     frame_shape: tuple[int, int]
@@ -57,14 +57,14 @@ def find_windows(
     pixels : int or (int, int), optional
         Window, see `faintspot.Layout.from_frame`.
     move_windows : bool
-        Whether all windows may be moved off the spots to save those at the frame's edge.
+        Whether all windows may be shifted off the spots to include those at the edge of the frame.
     **options
         Passed on to `faintspot.sensor.lenslets.find_lenslets`.
 
     Raises
     ------
     InputError
-        If no regular array of spots is found, or no window lies within the frame.
+        If no regular array of spots is found, or no window is within the frame.
     """
     array = _finite_or_masked("frame", frame)
     window = None if pixels is None else window_size("pixels", pixels)
@@ -88,7 +88,7 @@ def find_windows(
 
 
 def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
-    """Return a real array of two or three dimensions, which may hold NaN."""
+    """Return a real array of two or three dimensions, which may contain NaN."""
     array = real_array(name, value, minimum_dimensions=2)
     if array.ndim > 3:
         raise InputError(f"{name}: expected (h, w) or (n, h, w), got shape {array.shape}")
@@ -96,7 +96,7 @@ def _finite_or_masked(name: str, value: ArrayLike) -> NDArray[Any]:
 
 
 def _largest_window(middles: NDArray[np.float64], pitch_px: float) -> tuple[int, int]:
-    """Return the largest square window in which neighbours do not overlap, spread by half a pixel at most."""
+    """Return the largest square window without overlap, with windows moved by at most half a pixel."""
     distances = np.asarray(cKDTree(middles).query(middles, k=2, p=np.inf)[0])[:, 1]
     clear = float(np.min(distances[np.isfinite(distances)], initial=pitch_px))
     side = int(np.rint(clear))
@@ -111,9 +111,9 @@ def _half_extent(middles: NDArray[np.float64]) -> float:
 
 
 def _spread(middles: NDArray[np.float64], window: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the middles far enough apart for the window, if half a pixel is enough for that.
+    """Return window centres far enough apart for the window, if half a pixel is sufficient.
 
-    Middles that lie a window or more apart keep that distance when they are rounded to whole pixels.
+    Centres at least a window apart keep that distance when rounded to whole pixels.
     """
     pairs = cKDTree(middles).query_pairs(max(window), p=np.inf, output_type="ndarray")
     apart = np.abs(middles[pairs[:, 0]] - middles[pairs[:, 1]]) / np.array(window)
@@ -125,7 +125,7 @@ def _spread(middles: NDArray[np.float64], window: tuple[int, int]) -> NDArray[np
 
 
 def _shift_inside(centres: NDArray[np.float64], side: int, length: int) -> NDArray[np.float64]:
-    """Move all windows alike along one axis, as little as saves the most at the edge."""
+    """Shift all windows along one axis, by the smallest shift that includes the most at the edge."""
     shifts = np.arange(-_LARGEST_SHIFT * side, _LARGEST_SHIFT * side + 0.25, 0.5)
     starts = np.floor(centres + shifts[:, None] - 0.5 * (side - 1) + 0.5)
     inside = np.count_nonzero((starts >= 0) & (starts + side <= length), axis=1)
