@@ -114,7 +114,7 @@ def write_atomically(path: str | Path, content: Content) -> None:
 
 
 def replace_file(path: Path, content: Content) -> None:
-    """Write a file like `write_atomically`, but raise an OSError as it is, for callers that convert it."""
+    """Write a file like `write_atomically`, but let an OSError pass, for callers that convert it."""
     # Each writer uses its own temporary name, since two may write the same file.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.new")
     try:

@@ -1,4 +1,4 @@
-"""How CUDA code is compiled."""
+"""Compilation of CUDA code."""
 
 from __future__ import annotations
 

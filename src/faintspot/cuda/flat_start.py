@@ -1,4 +1,4 @@
-"""Where the denoising of one sub-aperture by a warp begins: the dual field of a solution without structure.
+"""Starting point of the denoising by a warp: the dual field of a solution without structure.
 
 The start is that of `faintspot.kernels.flat_start`, which says how and why. Cosine transforms along x and
 eliminations along y happen in shared memory, a thread having a whole row or a whole column; from phi on, the

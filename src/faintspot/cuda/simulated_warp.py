@@ -18,7 +18,7 @@ _boards: NDArray[np.float32] = np.zeros((2, 32), np.float32)
 
 
 def _exchange(value: Any) -> NDArray[np.float32]:
-    """What all threads of the warp hold."""
+    """Return the values of all threads of the warp."""
     thread: Any = threading.current_thread()
     thread.turn = latest_messages = 1 - getattr(thread, "turn", 0)
     _boards[latest_messages, cuda.threadIdx.x] = value

@@ -1,4 +1,4 @@
-"""How the pixels of a sub-aperture are shared out among the 32 threads of a warp."""
+"""Distribution of the pixels of a sub-aperture over the 32 threads of a warp."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What the threads of a warp do together: exchange a number, add up, find the extremes.
+"""Communication between the threads of a warp: exchange, sum and extremes.
 
-Numba's simulator knows no shuffles, so there each of these has a twin with the same meaning. Everything else
-in this room is the same code on the GPU and in the simulator.
+Numba's simulator does not support shuffles; equivalent functions replace them there. All other code is the
+same on the GPU and in the simulator.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A constant per sub-aperture beside the spot: a dark level that nobody vouches for, a sky that changes.
+"""Constant background fitted along with the spot, for an unknown dark level or a changing sky.
 
 The image's mean is F f + b. b enters linearly and carries no noise of its own (that of a known background is
 in VARIANCE), so it needs no steps: with B the sums of a model's derivatives with the constant, eliminating b
@@ -46,7 +46,7 @@ from faintspot.kernels.spot_rows import (
     WEIGHT_VARIANCE,
 )
 
-_LEAST_LEFT = 1e-5  # of the information on the flux: less is round-off, the spot looks like a constant
+_LEAST_LEFT = 1e-5  # of the information on the flux: below it is round-off, and the spot resembles a constant
 
 
 @compiled

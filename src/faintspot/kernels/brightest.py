@@ -43,7 +43,7 @@ def _tally(lanes: Any, image: Any, at: Any, pivot: Any, count: Any, total: Any) 
 
 @compiled
 def _sum_above(lanes: Any, image: Any, pixels: Any, pivot: Any) -> Any:
-    """Number and sum of the pixels above the pivot; four sums that do not wait for each other."""
+    """Return number and sum of the pixels above the pivot, in four independent sums."""
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
     n0 = n1 = n2 = n3 = s0 = s1 = s2 = s3 = zero
@@ -60,7 +60,7 @@ def _sum_above(lanes: Any, image: Any, pixels: Any, pivot: Any) -> Any:
 
 @compiled
 def _range_and_sum(lanes: Any, image: Any, pixels: Any) -> Any:
-    """Smallest and largest pixel, and the sum of all."""
+    """Return the smallest and the largest pixel, and the sum of all."""
     width = width_of(lanes)
     low = high = other_low = other_high = load(lanes, image, 0)
     total = other_total = splat(lanes, 0.0)
@@ -77,7 +77,7 @@ def _range_and_sum(lanes: Any, image: Any, pixels: Any) -> Any:
 
 @compiled
 def _middle(lanes: Any, low: Any, high: Any) -> Any:
-    """A number in [low, high), for low < high: about in their middle."""
+    """Return a number in [low, high), for low < high, near the middle."""
     half = splat(lanes, 0.5)
     middle = maximum(half * low + half * high, low)
     return select(middle < high, middle, low)
@@ -128,7 +128,7 @@ def _bracket(lanes: Any, image: Any, pixels: Any, rank: Any, low: Any, high: Any
 
 @compiled
 def _ends(lanes: Any, image: Any, pixels: Any, low: Any, high: Any) -> Any:
-    """The smallest pixel above low, and the largest that is not above high."""
+    """Return the smallest pixel above low, and the largest one not above high."""
     width = width_of(lanes)
     most, least = splat(lanes, math.inf), splat(lanes, -math.inf)
     first, last = most, least
@@ -201,7 +201,7 @@ def subtract_background(lanes: Any, image: Any, pixels: Any, lane_values: Any, l
 
 @inlined
 def _from_middle(lanes: Any, i: Any, n: Any) -> Any:
-    """Position of pixel i of n, px."""
+    """Return the position of pixel i of n [px]."""
     return splat(lanes, i - 0.5 * (n - 1))
 
 
@@ -220,7 +220,7 @@ def _store_centre(lanes: Any, total: Any, moment_x: Any, moment_y: Any, lane_val
 
 @compiled
 def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any) -> None:
-    """Sum of what is left of every lane's image by THRESHOLD and SUBTRACT, and its centre of gravity.
+    """Write the flux after THRESHOLD and SUBTRACT in each lane, and its centre of gravity.
 
     (0, 0) where the sum is not positive.
     """
@@ -242,7 +242,7 @@ def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any
 
 @compiled
 def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, lane_values: Any) -> None:
-    """As `centre_of_gravity`, and its standard error: the propagated noise of the pixels that are left.
+    """Write the centre of gravity and its standard error, the propagated noise of the remaining pixels.
 
     That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured; `image` may be denoised.
     """
@@ -281,7 +281,7 @@ def _store_error(
     """Write a standard error, from the noise's moments about the window's middle."""
     width = width_of(lanes)
     at = load(lanes, lane_values, position * width)
-    # Within a pixel, where in it the flux is, is not known: px^2 / 12.
+    # The position of the flux within a pixel is unknown: px^2 / 12.
     around = multiply_add(noise, multiply_add(at, at, splat(lanes, 1.0 / 12.0)), second)
     around = multiply_add(first, splat(lanes, -2.0) * at, around)
     store(lane_values, error * width, square_root(maximum(around, splat(lanes, 0.0))) * inverse)

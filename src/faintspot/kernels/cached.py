@@ -1,4 +1,4 @@
-"""Compiled kernels on disk, where that can be; where it cannot, a warning says so once, and work goes on."""
+"""Disk cache of compiled kernels; if it cannot be used, a warning is given once."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def kernel_cache(function: Callable[..., Any], stamp: Any) -> Any:
 
 
 def cache_folder() -> Path | None:
-    """Return where compiled kernels are kept; None where nowhere."""
+    """Return the folder of the compiled kernels, or None if there is none."""
     try:
         return Path(FunctionCache(kernel_cache).cache_path)
     except RuntimeError:
@@ -38,14 +38,14 @@ def cache_folder() -> Path | None:
 
 
 class _KernelCache(FunctionCache):
-    """Numba's cache, except that a disk that is full, read-only or damaged ends nothing."""
+    """Numba's cache, tolerant of a disk that is full, read-only or damaged."""
 
     def __init__(self, function: Callable[..., Any], stamp: Any) -> None:
         super().__init__(function)
         self._cache_file = _KernelFiles(self._cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, *arguments: Any) -> Any:
-        """Return what is kept; None, and forget it, where it cannot be read: it is compiled anew then."""
+        """Return the cached code, or discard it and return None if it cannot be read."""
         kept = None
         try:
             kept = super().load_overload(*arguments)
@@ -57,7 +57,7 @@ class _KernelCache(FunctionCache):
         return kept
 
     def save_overload(self, *arguments: Any) -> None:
-        """Keep machine code if that can be done."""
+        """Store machine code if possible."""
         try:
             super().save_overload(*arguments)
         except OSError as error:
@@ -81,7 +81,7 @@ class _KernelFiles(IndexDataCacheFile):
 
 @cache
 def _tell_once() -> None:
-    """Say, to who listens to this module's logger, why it takes longer this time."""
+    """Log that this run takes longer because kernels are compiled."""
     logging.getLogger(__name__).info("compiling what this machine has not used yet; later runs start at once")
 
 

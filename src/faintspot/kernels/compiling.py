@@ -1,4 +1,4 @@
-"""How kernels are compiled: once per machine, kept on disk, anew whenever any kernel's source changes.
+"""Compilation of kernels: once per machine, cached on disk, and repeated when a kernel source changes.
 
 Numba makes machine code of every function, and optimises it anew with every function that calls it, which
 took half of the time of compiling a pipeline. Here a kernel is optimised and becomes machine code once, where
@@ -23,7 +23,7 @@ from faintspot.kernels.cached import kernel_cache
 
 @cache
 def _kernels_stamp() -> tuple[tuple[float, int], ...]:
-    """Modification time and size of every source file that a kernel may have inlined."""
+    """Return modification time and size of every source file that a kernel may inline."""
     package = Path(__file__).parent.parent
     sources = sorted([*package.glob("kernels/*.py"), package / "base/checks.py", package / "base/flags.py"])
     return tuple(_stamp(source) for source in sources)
@@ -53,13 +53,13 @@ def compiled(function: Callable[..., Any]) -> Any:
 
 
 def compiled_with(function: Callable[..., Any], source: str) -> Any:
-    """Compile as `compiled` does a function that calls one of another package, whose source file is given."""
+    """Compile like `compiled` a function that calls one of another package, whose source file is given."""
     inside = Path(source).is_relative_to(Path(__file__).parent)
     return _kernel(function, () if inside else (Path(source),), _nrt=False)
 
 
 def allocating(function: Callable[..., Any]) -> Any:
-    """Compile as `compiled` does what makes arrays."""
+    """Compile like `compiled` a function that allocates arrays."""
     return _kernel(function)
 
 

@@ -1,4 +1,4 @@
-"""Which spots of a frame are probably wrong: cut by their window's edge, or unlike all their neighbours."""
+"""Flags of spots that are probably wrong: cut by the window edge, or unlike all their neighbours."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ neighbours move independently, about 1 spot in 1000 differs by as much."""
 
 
 class Expected(NamedTuple):
-    """Where spots may be."""
+    """Expected positions of the spots."""
 
     zero: Any
     """(2, n) float32: reference positions x and y, px from the windows' middles."""
@@ -59,7 +59,7 @@ def flag_doubtful(x: Any, y: Any, flags: Any, expected: Any, differences: Any) -
 
 @compiled
 def _median(values: Any, largest: Any) -> Any:
-    """Median of those of the values that are not negative, by bisection to 2^-16 of the largest."""
+    """Return the median of the non-negative values, by bisection to 2^-16 of the largest."""
     least, most = np.float32(0.0), largest
     for _ in range(16):
         middle = np.float32(0.5) * (least + most)

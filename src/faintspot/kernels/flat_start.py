@@ -1,4 +1,4 @@
-"""Where the denoising of a group begins: the dual field of a solution without any structure left.
+"""Starting point of the denoising of a group: the dual field of a solution without structure.
 
 Where the strength is close to the image's own rms, the solution is nearly flat and div p nearly g / lambda
 everywhere; p then has to carry light across the whole image, for which sweeps that start from zero, one pixel

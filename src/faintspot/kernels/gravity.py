@@ -45,18 +45,18 @@ STRENGTH, TOLERANCE, LIMIT, RANK, SUBTRACT, FLOOR, LEVEL = range(COMMON_ROWS, CO
 SETTING_ROWS = COMMON_ROWS + 7
 
 NOTHING, SMOOTH, DENOISE = range(3)
-"""What is done before the background subtraction."""
+"""Steps before the background subtraction."""
 
 
 class GravityTables(NamedTuple):
-    """What the kernel reads beside the settings; None, a type of its own, where that step is not compiled."""
+    """Tables of the kernel; None, a separate type, for a step that is not compiled."""
 
     flat_start: Any = None
     """From `flat_start_table`: images are denoised."""
     algorithm: Any = None
-    """Of the denoising, see `denoise_group`."""
+    """Algorithm of the denoising, see `denoise_group`."""
     taps: Any = None
-    """(n_subapertures, 2, 1 + reach) float32: of the smoothing along x and y, the central one first."""
+    """Taps of the smoothing along x and y, central tap first: (n_subapertures, 2, 1 + reach) float32."""
 
 
 class GravityScratch(NamedTuple):
@@ -142,7 +142,7 @@ def _first_step(
 
 @compiled
 def _read_settings(width: Any, first: Any, settings: Any, denoiser: Any, counts: Any, centroid: Any) -> None:
-    """Copy what the lanes' sub-apertures are set to."""
+    """Copy the settings of the lanes' sub-apertures."""
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
         denoiser[total_variation.STRENGTH * width + lane] = settings[STRENGTH, s]
@@ -175,7 +175,7 @@ def _flag_lane(
     s = min(first + lane, settings.shape[1] - 1)
     counts, centroid = own.counts, own.centroid
     bits = scratch.flags[lane]
-    if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
+    if not bits & TOO_MANY_BAD_PIXELS:  # no other flag is set then
         if counts[total_variation.INFEASIBLE * width + lane]:
             bits |= INFEASIBLE_STRENGTH
         if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:
@@ -188,7 +188,7 @@ def _flag_lane(
 
 @compiled
 def lightless(ny: Any, nx: Any, bits: Any, flux: Any, floor: Any, x: Any, y: Any) -> Any:
-    """NO_FLUX where nothing usable was left of an image that is not invalid for another reason, else 0.
+    """Return NO_FLUX if an otherwise valid image has no usable flux, else 0.
 
     A nearly flat image leaves round-off only; negative pixels can throw a centroid out of its window.
     """

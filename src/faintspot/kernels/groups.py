@@ -47,7 +47,7 @@ STAGE_ROWS = 3
 
 
 class Source(NamedTuple):
-    """Where the pixels of a block of frames come from."""
+    """Pixels of a block of frames, and their calibration."""
 
     lanes: Any
     """Lanes: W sub-apertures at once."""
@@ -64,7 +64,7 @@ class Source(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What is done to them."""
+    """Processing of a block of frames: settings, prior and tables."""
 
     settings: Any
     """(n_variants, rows, n_subapertures) float32."""
@@ -73,7 +73,7 @@ class Task(NamedTuple):
     prior: Any
     """(1 or n_frames, 2, n_subapertures) float32: predicted x and y, px from the reference position."""
     tables: Any
-    """What else the estimator's own kernel reads: a NamedTuple."""
+    """Further tables of the estimator's kernel: a NamedTuple."""
 
 
 class Group(NamedTuple):
@@ -83,7 +83,7 @@ class Group(NamedTuple):
     ny: Any
     nx: Any
     frame: Any
-    """Its number in the block."""
+    """Index of the frame in the block."""
     first: Any
     """Number of the first sub-aperture; the last group of a frame repeats its last one to fill the lanes."""
     settings: Any
@@ -110,11 +110,11 @@ class Scratch(NamedTuple):
     iterations: Any
     """(W,) int64: written by the estimator's kernel."""
     own: Any
-    """Of the estimator's kernel."""
+    """Scratch memory of the estimator's kernel."""
 
 
 class SlopeArrays(NamedTuple):
-    """Results, (n_frames, n_subapertures) each; what they are: see `faintspot.Slopes`."""
+    """Results, each (n_frames, n_subapertures); defined in `faintspot.Slopes`."""
 
     x: Any
     y: Any
@@ -179,7 +179,7 @@ def store_stage(width: Any, image: Any, stage: Any, first: Any) -> None:
 
 @compiled
 def within(slope: Any, reach: Any) -> Any:
-    """Keep a slope within the allowed range."""
+    """Clip a slope to the allowed range."""
     return min(max(slope, -reach), reach)
 
 
@@ -307,7 +307,7 @@ def flux_of_groups(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) 
 
 @compiled
 def flux_above_edges(source: Any, start: Any, stop: Any, scratch: Any, flux: Any) -> None:
-    """As `flux_of_groups`, above the mean of the outermost pixels of each sub-aperture."""
+    """Sum the pixels of each sub-aperture like `flux_of_groups`, above the mean of its outermost pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
     n = source.corners.shape[0]

@@ -1,4 +1,4 @@
-"""What the processor offers: vector width, and scratch memory aligned to it."""
+"""Capabilities of the processor: vector width, and scratch memory aligned to it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ENVIRONMENT = "FAINTSPOT_SIMD_WIDTH"
 
 
 def _native_width() -> int:
-    """float32 numbers in one vector register of the processor that is compiled for."""
+    """Return the number of float32 values in one vector register of the target processor."""
     features = compile_target().features
     if {"avx512f", "avx512vl"} <= features:
         return 16
@@ -31,7 +31,7 @@ def _lanes(dtype: str, width: int) -> Lanes:
 
 
 def lanes_for(dtype: DTypeLike, width: int | None = None) -> Lanes:
-    """The vector to compute with: W sub-apertures at once in float32, half of that in float64.
+    """Return the vector type to compute with: W sub-apertures in float32, half as many in float64.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def lanes_for(dtype: DTypeLike, width: int | None = None) -> Lanes:
 
 
 def aligned_zeros(size: int, dtype: DTypeLike) -> NDArray[Any]:
-    """A zeroed array that starts on a cache line: loads of whole vectors then never straddle two."""
+    """Return a zeroed array aligned to a cache line, so that loads of whole vectors never straddle two."""
     itemsize = np.dtype(dtype).itemsize
     memory = np.zeros(size + 64 // itemsize, dtype)
     start = (-memory.ctypes.data % 64) // itemsize

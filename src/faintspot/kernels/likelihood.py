@@ -113,7 +113,7 @@ def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lan
 
 @compiled
 def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
-    """As `_separable_sums`, for a PSF of several separable terms."""
+    """Sum as `_separable_sums`, for a PSF of several separable terms."""
     width = width_of(lanes)
     rank, padded = profiles.shape[1], profiles.shape[3]
     zero = splat(lanes, 0.0)

@@ -1,4 +1,4 @@
-"""Numbers by which processes, and threads, tell each other what is there, seen in the order that this needs.
+"""Atomic loads and stores for signalling between processes and threads (acquire/release).
 
 Who sees a number that `store` wrote, through `load` or `look_at`, also sees all that was written before it.
 `fence` is for memory that is written anew while others may read it: it stands between saying so and writing,

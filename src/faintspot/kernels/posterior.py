@@ -37,13 +37,13 @@ BROAD_FROM = (
 
 @compiled
 def _share(position: Any, spacing: Any, low: Any, high: Any) -> Any:
-    """How much of a grid point's cell lies within the allowed positions."""
+    """Return the fraction of a grid point's cell within the allowed positions."""
     return min(position + 0.5 * spacing, high) - max(position - 0.5 * spacing, low)
 
 
 @compiled
 def _log_likelihood(lanes: Any, rows: Any, lane: Any, tables: Any, table: Any, position: Any) -> Any:
-    """Sum of the image times the table of a position."""
+    """Return the sum of the image times the table of a position."""
     width = width_of(lanes)
     count = rows.shape[0] * rows.shape[1]
     at = (table * tables.shape[1] + position) * count * width

@@ -38,7 +38,7 @@ class Lanes:
 
     @cached_property
     def _numba_type_(self) -> LanesKind:
-        """Where Numba's dispatcher looks for the type first, which saves microseconds in every call."""
+        """Type looked up first by Numba's dispatcher, which saves microseconds in every call."""
         return LanesKind(self.dtype, self.width)
 
 

@@ -46,8 +46,9 @@ LEAST_SIGNIFICANCE = 1.0
 SMALLEST_VARIANCE = 1e-4
 """Electrons squared: keeps the weights finite where there is no noise."""
 MOST_MODEL_ERROR_E = 300.0
-"""Electrons: the square of a model error counts no more than this over the flux, so that in high flux
-dark wings, where a PSF is least known, do not get all the weight."""
+"""Electrons: the squared model error is limited to this value over the flux. At high flux, the dark wings,
+where a PSF is least known, then do not dominate the weights.
+"""
 BRIGHT = 2.0
 """Times the expected flux from which on that of the window is believed instead, if it is significant."""
 _LIT_FRACTION = 0.2  # of the expected flux: what is surely less is no flux
@@ -57,7 +58,7 @@ _BROAD = 0.5  # standard deviation, in units of the grid's spacing, above which 
 
 
 class ModelTables(NamedTuple):
-    """What the kernels read that follow a profile: of weighted and fitted estimators."""
+    """Tables of the kernels that use a profile: weighted and fitted estimators."""
 
     steps: Any
     round_electrons: Any
@@ -71,26 +72,26 @@ class ModelTables(NamedTuple):
 
 
 class PosteriorTables(NamedTuple):
-    """What the kernel reads that begins at the posterior's mean."""
+    """Tables of the kernel that starts from the mean of the posterior."""
 
     fit: Any
     """ModelTables."""
     logarithms: Any
-    """As `constants`, `grid` and `spacing`: see `posterior_of_group`."""
+    """Arguments `constants`, `grid` and `spacing` of `posterior_of_group`."""
     constants: Any
     grid: Any
     spacing: Any
 
 
 class ScoreTables(NamedTuple):
-    """What the kernel of a trained score reads."""
+    """Tables of the kernel of a trained score."""
 
     passes: Any
     from_peak: Any
     """Whether to begin with the smoothed image's peak instead of the predicted position."""
     taps: Any
     score: Any
-    """As `steps_per_px` and `margin`: see `apply_score`."""
+    """Arguments `steps_per_px` and `margin` of `apply_score`."""
     steps_per_px: Any
     margin: Any
 
@@ -440,7 +441,7 @@ def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
         error_x = lane_values[spot_rows.ERROR_X * width + lane]
         error_y = lane_values[spot_rows.ERROR_Y * width + lane]
         flux = lane_values[spot_rows.FLUX * width + lane]
-        if not bits & TOO_MANY_BAD_PIXELS:  # which says it all
+        if not bits & TOO_MANY_BAD_PIXELS:  # no other flag is set then
             expected = settings[FLUX, s] if expects_flux else np.float32(-1.0)
             illuminated = _is_illuminated(width, lane, expected, lane_values)
             if not (error_x + error_y < math.inf and illuminated and abs(flux) < math.inf):

@@ -1,4 +1,4 @@
-"""Where a spot is, roughly: the brightest pixel of the image smoothed by a Gaussian."""
+"""Starting point of a fit: the brightest pixel of the image smoothed by a Gaussian."""
 
 from __future__ import annotations
 

@@ -22,14 +22,14 @@ LOOKS_BETWEEN_STOPS = 1024  # at the progress, between two looks at whether to g
 
 
 class Arrival(NamedTuple):
-    """How far a frame has arrived, as another process says it."""
+    """Number of rows of a frame that have arrived, as written by another process."""
 
     cells: Any
     """int64 array in shared memory."""
     frame_cell: Any
-    """Where in it the number of the frame that arrives is."""
+    """Index of the cell with the number of the arriving frame."""
     rows_cell: Any
-    """Where its rows so far are."""
+    """Index of the cell with the number of rows that have arrived."""
     control: Any
     """int64 array: waiting ends when the number at `stop_cell` is not 0."""
     stop_cell: Any
@@ -37,7 +37,7 @@ class Arrival(NamedTuple):
 
 @intrinsic
 def breathe(typing_context: Any) -> Any:
-    """Leave the processor's other thread some room while waiting, where it has an instruction for that."""
+    """Yield to the other hardware thread while waiting, if the processor has an instruction for it."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         if "x86" in llvm.get_process_triple():
@@ -50,7 +50,7 @@ def breathe(typing_context: Any) -> Any:
 
 @compiled
 def rows_are_there(progress: Any, frame_cell: Any, rows_cell: Any, frame: Any, rows: Any) -> Any:
-    """Whether so many rows of a frame, or a later frame, have arrived."""
+    """Return whether the given number of rows of a frame, or a later frame, have arrived."""
     arriving = look_at(progress, frame_cell)
     if arriving != frame:
         return arriving > frame

@@ -47,7 +47,7 @@ def _extrapolate(lanes: Any, state: Any, place: Any, current: Any, previous: Any
 
 @inlined
 def bounded_square(lanes: Any, px: Any, py: Any) -> Any:
-    """|p|^2, but at least four: what `store_projected` divides by."""
+    """Return |p|^2, at least four: the divisor in `store_projected`."""
     return maximum(multiply_add(px, px, py * py), splat(lanes, 4.0))
 
 
@@ -130,7 +130,7 @@ def _turn(
 
 @inlined
 def _no_work(lanes: Any, norm: Any, place: Any) -> Any:
-    """What the first turn of all finds: steps that are zero, of a pixel that is written again."""
+    """Return the initial steps of zero for a pixel that is written again later."""
     zero, four = splat(lanes, 0.0), splat(lanes, 4.0)
     nothing = zero, zero, zero, zero
     bounded = zero, zero, four, zero, zero, four
@@ -218,10 +218,11 @@ def _update_last_row(lanes: Any, state: Any, rows: Any, target: Any, nx: Any) ->
 def sweep_fgp(
     lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, momentum: Any, inverse: Any
 ) -> Any:
-    """One accelerated projected-gradient iteration on every pixel; return ||div q||^2 per lane.
+    """Make one accelerated projected-gradient iteration on each pixel; return ||div q||^2 per lane.
 
-    `current` (0 or 2) says where the current p is; the new one replaces the other. `inverse` is 1 / lambda;
-    `rows` has room for 3 (nx + 1) vectors: qx, qy and step * v of every pixel of one row, side by side.
+    `current` (0 or 2) is the position of the current p; the new p replaces the other version. `inverse`
+    is 1 / lambda. `rows` has space for 3 (nx + 1) vectors: qx, qy and step * v of each pixel of one
+    row.
     """
     width = width_of(lanes)
     line = nx * STATE_VECTORS * width
@@ -247,11 +248,13 @@ def sweep_fgp(
 
 @compiled
 def sweep_chambolle(lanes: Any, state: Any, rows: Any, ny: Any, nx: Any, current: Any, inverse: Any) -> Any:
-    """One iteration of "chambolle" on every pixel; return ||div p||^2 per lane, of the new p.
+    """Make one "chambolle" iteration on each pixel; return ||div p||^2 per lane, of the new p.
 
-    With the norm of the p before, one iteration late, the multiplier would oscillate near infeasibility.
+    With the norm of the previous p, one iteration late, the multiplier would oscillate near
+    infeasibility.
 
-    `rows` has room for ny * nx vectors: v of the whole image. Meant to be compared with, not to be fast.
+    `rows` has space for ny * nx vectors: v of the whole image. It is a reference for comparison, not
+    optimised.
     """
     width = width_of(lanes)
     step, half_step = splat(lanes, CHAMBOLLE_STEP), splat(lanes, 0.5 * CHAMBOLLE_STEP)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Target(NamedTuple):
-    """What machine code is made for."""
+    """Target of the machine code."""
 
     triple: str
     """Such as x86_64-unknown-linux-gnu."""
@@ -22,7 +22,7 @@ class Target(NamedTuple):
 
 @cache
 def compile_target() -> Target:
-    """Ask Numba, not the machine: LLVM ends the process where code uses a feature that the target lacks."""
+    """Return Numba's target, not the machine's: LLVM aborts if code uses a feature that the target lacks."""
     from numba.core.registry import cpu_target
 
     triple, cpu, features = cpu_target.target_context.codegen().magic_tuple()

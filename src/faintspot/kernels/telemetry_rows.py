@@ -1,4 +1,4 @@
-"""What is published of a frame beside its slopes, in one pass."""
+"""Telemetry of a frame other than its slopes, computed in one pass."""
 
 from __future__ import annotations
 

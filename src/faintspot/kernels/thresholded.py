@@ -34,7 +34,7 @@ _WITHIN = 1.0 / 12.0  # of the flux in a pixel, where in it is not known: px^2
 
 
 class RowTables(NamedTuple):
-    """What the kernel reads beside the settings."""
+    """Tables that the kernel reads in addition to the settings."""
 
     pixels: Any
     """Lanes: of pixels in a row; their number divides nx."""

@@ -252,12 +252,12 @@ def denoise_group(
     algorithm : None or bool
         FGP or CHAMBOLLE.
     lowers : bool
-        Whether a strength above HIGHEST_STRENGTH is lowered, which INFEASIBLE then says.
+        Whether a strength above HIGHEST_STRENGTH is lowered, as indicated by INFEASIBLE.
     table : array
         From `flat_start_table`.
     ny, nx : int
     image, output : (ny * nx * W,) arrays
-        Input, kept as it is, and result: all lanes of a pixel side by side.
+        Input, which is not modified, and result: all lanes of a pixel side by side.
     state, rows : arrays
         Scratch of STATE_VECTORS * ny * nx * W and (ny * nx + 2 * nx + 3) * W numbers.
     lane_values : (LANE_ROWS * W,) array

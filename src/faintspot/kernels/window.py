@@ -48,13 +48,13 @@ DARK_X, DARK_Y, PHOTON_X, PHOTON_Y, DARK_FLUX, PHOTON_FLUX = range(COMMON_ROWS +
 SETTING_ROWS = COMMON_ROWS + 11
 
 X, Y, FLUX = range(3)
-"""Which weights, of those of a pixel."""
+"""Indices of the weights of a pixel."""
 LEAST_SIGNIFICANCE = 1.0
 """Flux of a frame that is less significant than this many standard deviations divides nothing."""
 
 
 class WindowTables(NamedTuple):
-    """What the kernel reads beside the settings."""
+    """Tables that the kernel reads in addition to the settings."""
 
     weights: Any
     """(n_groups, rows, columns, 3, W) float32: of the pixels that count."""
