@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.estimators import estimators, registry
@@ -54,20 +55,17 @@ def blocks() -> list[Any]:
     ]
 
 
-@pytest.fixture
-def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Return what pages take for granted: a sensor, frames of it, files of slopes and a recorded night."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_kinds", estimators())  # a copy: a page registers an estimator of its own
-    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+@pytest.fixture(scope="module")
+def assumed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """What pages take for granted: a folder with slopes a recorded night, a sensor and its frames."""
+    folder = tmp_path_factory.mktemp("pages")
+    shutil.copytree(ROOT / "examples", folder / "examples")
     rng = np.random.default_rng(1)
     layout = fs.Layout.grid((7, 7), pixels=16, outer_radius=3.5, inner_radius=0.5)
     calibration = fs.Calibration(dark=100.0, gain_e_per_adu=2.0, read_noise_e=3.0)
     dithered = 0.2 * np.sin(2 * np.pi * np.arange(1000) * 0.13)[:, None, None]
-    electrons, truth = fs.simulate.sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+    electrons, truth = frames_of(
+        layout,
         1000,
         flux_e=400.0,
         positions=dithered + rng.uniform(-0.3, 0.3, (1000, len(layout), 2)),
@@ -79,9 +77,9 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     pipeline = fs.SlopePipeline(layout, settings, calibration)
     slopes = pipeline(frames)
     for ending in ("npz", "fits", "zarr"):
-        write_slopes(tmp_path / f"slopes.{ending}", frames[:20], layout, calibration)
-    write_night(tmp_path / "night", layout)
-    return {
+        write_slopes(folder / f"slopes.{ending}", frames[:20], layout, calibration)
+    write_night(folder / "night", layout)
+    return folder, {
         "fs": fs,
         "np": np,
         "layout": layout,
@@ -96,6 +94,18 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         "pipeline": pipeline,
         "slopes": slopes,
         "n": len(layout),
+    }
+
+
+@pytest.fixture
+def names(
+    assumed: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, Any]:
+    """A page's own copy of it."""
+    monkeypatch.chdir(shutil.copytree(assumed[0], tmp_path / "page"))
+    monkeypatch.setattr(registry, "_kinds", estimators())  # a copy: a page registers an estimator of its own
+    return {
+        name: value.copy() if isinstance(value, np.ndarray) else value for name, value in assumed[1].items()
     }
 
 

@@ -15,6 +15,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.simulated import frames_of
 from tests.test_documentation import PAGES, ROOT
 
 import faintspot as fs
@@ -105,9 +106,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     layout = fs.Layout.grid(
         (14, 14), pixels=16, outer_radius=7, inner_radius=2, origin=(16, 16), frame_shape=(256, 256)
     )
-    electrons, _ = fs.simulate.sensor_frames(
-        layout.corners, layout.window, layout.frame_shape, 4, flux_e=3000.0, rng=rng
-    )
+    electrons, _ = frames_of(layout, 4, flux_e=3000.0, rng=rng)
     frames = (electrons / 1.9 + rng.normal(100.0, 2.0, electrons.shape)).astype(np.uint16)
     for name in ("frames", "night", "reference"):
         fits.writeto(folder / f"{name}.fits", frames)

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.algorithms.image_cases import refused
 from tests.estimator_cases import (
     Case,
     assert_same,
@@ -21,6 +20,7 @@ from tests.estimator_cases import (
     settings_of,
     with_options,
 )
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.estimators import estimators

@@ -66,7 +66,7 @@ def signal(wfs: StandIn, frame: Any, source: int = 0) -> np.ndarray:
     return np.asarray(wfs.wfs_integrate(src=frame, sh_data=wfs.sh_data[f"src_{source}"]))
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ["tv", "window", "map"])
 def test_every_estimator_has_the_tools_unit_and_order(name: str) -> None:
     wfs = StandIn()
     oopao.attach(wfs, ESTIMATORS[name], READ_NOISE, psf=PSF)

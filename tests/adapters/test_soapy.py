@@ -55,7 +55,7 @@ def wfs(monkeypatch: pytest.MonkeyPatch) -> StandIn:
     return StandIn()
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ["tv", "window", "map"])
 def test_every_estimator_has_the_tools_unit_and_order(wfs: StandIn, name: str) -> None:
     soapy.attach(wfs, ESTIMATORS[name], READ_NOISE, psf=PSF)
     wfs.iMat, wfs.config.eReadNoise = True, 1.0  # a frame of an interaction matrix

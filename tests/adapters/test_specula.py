@@ -88,7 +88,7 @@ class TestRealTool:
             assert set(ours.outputs) == set(theirs.outputs)
             assert np.ptp(expected) > 0.2
 
-    @pytest.mark.parametrize("name", ESTIMATORS)
+    @pytest.mark.parametrize("name", ["tv", "window", "map"])
     def test_every_estimator_has_the_tools_unit_and_order(self, subapertures: Any, name: str) -> None:
         computer = self.made(subapertures, name, calibrating=True)
         slopes = self.slopes(computer, frame_of(images(5e5))) * (SIDE / 2)

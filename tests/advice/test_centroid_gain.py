@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.advice.advice_cases import LAYOUT
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.advice.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
@@ -16,10 +17,8 @@ PSF = fs.PSF.analytic(size=1.0)
 
 def frames(flux_e: float, count: int = 20) -> np.ndarray:
     """Frames in ADU."""
-    made, _ = fs.simulate.sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
+    made, _ = frames_of(
+        LAYOUT,
         count,
         flux_e=flux_e,
         position_range_px=0.5,

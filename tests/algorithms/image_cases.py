@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-
-import faintspot as fs
 
 KINDS: dict[str, Callable[[np.random.Generator, tuple[int, int]], NDArray[Any]]] = {
     "normal": lambda rng, shape: rng.normal(size=shape),
@@ -60,17 +56,6 @@ def largest(stack: NDArray[Any]) -> NDArray[np.float64]:
     """Largest magnitude of each image."""
     magnitudes: NDArray[np.float64] = np.max(np.abs(np.asarray(stack, np.float64)), axis=(-2, -1))
     return magnitudes
-
-
-@contextmanager
-def refused(*words: str) -> Iterator[None]:
-    """Expect an InputError of one line that holds all these words."""
-    with pytest.raises(fs.InputError) as caught:
-        yield
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message, message
 
 
 BAD_IMAGES: list[tuple[Any, str]] = [

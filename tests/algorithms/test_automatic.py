@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 from faintspot.algorithms.automatic import (
     METHODS,

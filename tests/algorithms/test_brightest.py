@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
-from tests.algorithms.image_cases import BAD_IMAGES, images, refused
+from tests.algorithms.image_cases import BAD_IMAGES, images
+from tests.refusals import refused
 
 import faintspot as fs
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from tests import naive
-from tests.algorithms.image_cases import BAD_IMAGES, images, refused
+from tests.algorithms.image_cases import BAD_IMAGES, images
+from tests.refusals import refused
 
 import faintspot as fs
 

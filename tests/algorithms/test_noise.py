@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import BAD_IMAGES, refused
+from tests.algorithms.image_cases import BAD_IMAGES
+from tests.refusals import refused
 
 from faintspot.algorithms.noise import pixel_noise, suggested_strength
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 from faintspot.algorithms.spot_width import seen_spots
 from faintspot.simulate import Detector, subapertures

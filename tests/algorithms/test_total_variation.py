@@ -7,7 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from tests import naive
-from tests.algorithms.image_cases import BAD_IMAGES, images, largest, refused, spread
+from tests.algorithms.image_cases import BAD_IMAGES, images, largest, spread
+from tests.refusals import refused
 from tests.shared_data import shared_file
 
 import faintspot as fs

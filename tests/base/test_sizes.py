@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.ao_loop.configuration import LoopConfiguration
@@ -106,11 +107,8 @@ CASES: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     make, words = CASES[name]
-    with pytest.raises(fs.InputError) as caught:
+    with refused(*words):
         make(tmp_path)
-    assert "\n" not in str(caught.value)
-    for word in words:
-        assert word in str(caught.value)
 
 
 def test_large_grids_are_quick_enough_to_make() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.simulate import Detector
@@ -259,9 +260,8 @@ def test_bad_detectors_are_named_in_one_line(options: dict[str, Any], named: str
 )
 def test_bad_flux_is_refused_in_one_line(options: dict[str, Any], mean_e: Any) -> None:
     for method in (Detector(**options).expose, Detector(**options).variance):
-        with pytest.raises(InputError, match="mean_e") as caught:
+        with refused("mean_e"):
             method(mean_e)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("rng", [7, np.random.RandomState(1), np.random])

@@ -2,19 +2,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.camera.hot_pixels import find_hot_pixels
-from faintspot.simulate import Detector, sensor_frames
+from faintspot.simulate import Detector
 
 
 def test_hot_pixels_among_spots_are_found_and_spots_are_not() -> None:
     layout = fs.Layout.grid((6, 6), pixels=16)
     hot = [(5, 5, 200.0), (34, 46, 400.0), (95, 0, 150.0), (60, 23, 300.0)]
-    frames, _ = sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+    frames, _ = frames_of(
+        layout,
         1,
         flux_e=3000.0,
         detector=Detector(read_noise_e=3.0, hot_pixels=hot),

@@ -54,11 +54,7 @@ BAD_FRAMES: list[tuple[str, Callable[[Path], Any], tuple[str, ...]]] = [
     ("header.fits", lambda path: path.write_text("SIMPLE but not FITS"), ("FITS",)),
     ("complex.npy", saved(lambda: np.ones((3, 32, 32), complex)), ("real numbers", "complex128")),
     ("text.npy", saved(lambda: np.full((3, 32, 32), "a")), ("real numbers", "<U1")),
-    (
-        "objects.npy",
-        saved(lambda: np.full((3, 32, 32), None), allow_pickle=True),
-        ("objects",),
-    ),
+    ("objects.npy", saved(lambda: np.full((3, 32, 32), None), allow_pickle=True), ("objects",)),
     ("large.npy", saved(lambda: np.ones((3, 33, 32))), ("33 x 32", "32 x 32", "faintspot.toml")),
     ("4d.npy", saved(lambda: np.ones((2, 3, 32, 32))), ("(frames, height, width)", "(2, 3, 32, 32)")),
     ("1d.npy", saved(lambda: np.ones(32)), ("(frames, height, width)", "(32,)")),

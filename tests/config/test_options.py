@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.config.options import Options, PerSubaperture, check_lengths, is_auto, option

@@ -8,6 +8,7 @@ import sys
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.config.written_changes import parse_changes, parse_subapertures
@@ -30,9 +31,8 @@ def test_parsing_changes() -> None:
     "texts", [[], ["noise_std"], ["=2"], ["noise_std="], ["noise_std=1,,2"], ["rule=a", "rule=b"]]
 )
 def test_changes_that_cannot_be_parsed(texts: list[str]) -> None:
-    with pytest.raises(InputError) as caught:
+    with refused():
         parse_changes(texts)
-    assert "\n" not in str(caught.value)
 
 
 def test_parsing_subapertures() -> None:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.estimators import Estimator, estimator_named, estimators, register, registry

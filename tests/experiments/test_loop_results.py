@@ -14,11 +14,7 @@ from faintspot.ao_loop.files import (
     make_folder,
 )
 from faintspot.base.errors import InputError
-from faintspot.experiments.loop_results import (
-    BudgetResult,
-    InterleavedResult,
-    MagnitudeResult,
-)
+from faintspot.experiments.loop_results import BudgetResult, InterleavedResult, MagnitudeResult
 
 
 def magnitude_result() -> MagnitudeResult:

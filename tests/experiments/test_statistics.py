@@ -78,11 +78,7 @@ def test_statistics_of_a_known_estimator() -> None:
     """gain 0.6, offsets 0.1 and -0.2, noise 0.2 px: 5 standard errors, 6e-7 for each of them."""
     found, truth = gained(20_000, 1)
     statistics = slope_statistics(found[:, 0], found[:, 1], truth)
-    expected = {
-        "gain": 0.6,
-        "rms": np.sqrt(0.16 / 3 + 0.04 + 0.025),
-        "corrected_rms": 0.2 / 0.6,
-    }
+    expected = {"gain": 0.6, "rms": np.sqrt(0.16 / 3 + 0.04 + 0.025), "corrected_rms": 0.2 / 0.6}
     for name, value in expected.items():
         estimate = getattr(statistics, name)
         assert abs(estimate.value - value) < 5 * estimate.standard_error, name
@@ -133,10 +129,7 @@ def test_perfect_slopes() -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [
-        ({"valid": [True]}, "valid: expected shape (3,)"),
-        ({"outlier_px": 0}, "outlier_px = 0"),
-    ],
+    [({"valid": [True]}, "valid: expected shape (3,)"), ({"outlier_px": 0}, "outlier_px = 0")],
 )
 def test_bad_statistics(options: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError) as error:

@@ -16,12 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import InputError
-from faintspot.experiments.store import (
-    MemoryStore,
-    ZarrStore,
-    fingerprint_of,
-    kind_of_store,
-)
+from faintspot.experiments.store import MemoryStore, ZarrStore, fingerprint_of, kind_of_store
 
 pytest.importorskip("zarr")
 

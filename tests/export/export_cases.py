@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.pipeline import configuration
-from faintspot.simulate import sensor_frames
 
 LAYOUT = fs.Layout((30, 41), (8, 8), np.array([[2, 3], [2, 21], [12, 12], [22, 33]]))
 OFF_CENTRE = fs.Layout(
@@ -29,14 +29,8 @@ CALIBRATION = fs.Calibration(
 def frames(count: int) -> NDArray[np.float32]:
     """Return frames, ADU, of spots of 400 electrons that move."""
     rng = np.random.default_rng(3)
-    electrons, _ = sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
-        count,
-        flux_e=400.0,
-        positions=rng.uniform(-0.7, 0.7, (count, len(LAYOUT), 2)),
-        rng=rng,
+    electrons, _ = frames_of(
+        LAYOUT, count, flux_e=400.0, positions=rng.uniform(-0.7, 0.7, (count, len(LAYOUT), 2)), rng=rng
     )
     dark, scale = CALIBRATION.maps(LAYOUT.frame_shape)
     return np.asarray(electrons / scale + dark, np.float32)

@@ -13,6 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from tests.cli.cli_cases import Commands
 from tests.io.telemetry_files import ATTRIBUTES, IMAGE, RECORD, N, images_of, records_of
+from tests.refusals import refused
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.io import open_frames, read_aot, read_slopes, read_telemetry, write_aot
@@ -74,9 +76,7 @@ def test_ours_bit_for_bit(tmp_path: Path, reference: Any) -> None:
 def test_ours_is_measured_as_it_was(tmp_path: Path, run: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(2)
     images = images_of(10, 20)
-    frames, _ = fs.simulate.sensor_frames(
-        LAYOUT.corners, LAYOUT.window, LAYOUT.frame_shape, 2, flux_e=300.0, rng=rng
-    )
+    frames, _ = frames_of(LAYOUT, 2, flux_e=300.0, rng=rng)
     images["raw"] = frames
     settings = fs.Settings("tv", noise_std=1.5, keep_brightest=9)
     path = own(tmp_path, images, settings=configuration.to_text(settings), reference=REFERENCE.tolist())
@@ -99,9 +99,7 @@ def test_ours_with_calibration_and_psf(
 ) -> None:
     """An estimator that needs the read noise and the spot: slopes are those of the recording, bit for bit."""
     images = images_of(10, 20)
-    images["raw"], _ = fs.simulate.sensor_frames(
-        LAYOUT.corners, LAYOUT.window, LAYOUT.frame_shape, 2, flux_e=300.0, rng=np.random.default_rng(2)
-    )
+    images["raw"], _ = frames_of(LAYOUT, 2, flux_e=300.0, rng=np.random.default_rng(2))
     settings = fs.Settings("ml")
     dark = np.random.default_rng(3).normal(0, 0.1, LAYOUT.frame_shape)
     parts = fs.Calibration(dark, read_noise_e=1.5), fs.PSF.analytic(size=1.2, radius_px=5)
@@ -318,9 +316,8 @@ def test_what_is_no_aot_file(tmp_path: Path) -> None:
         read_aot(path, "WFS7")
     content = path.read_bytes()
     path.write_bytes(content.replace(b"AOT_SOURCES", b"AOT_SAUCES "))
-    with pytest.raises(fs.InputError, match="not valid") as error:
+    with refused("not valid"):
         read_aot(path)
-    assert "\n" not in str(error.value)
     path.write_bytes(content[: len(content) // 3])
     with pytest.raises(fs.InputError, match=r"not valid|not as AOT"):
         read_aot(path)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.io.frame_files import FORMATS, assert_message, cube, save
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.io import open_frames
@@ -47,9 +48,8 @@ class TestDamageInAStream:
         for path in (packed, stored):
             with open_frames([path]) as source:
                 source.block(0, 10)
-                with pytest.raises(InputError) as error:
+                with refused(path.name, "frame 10 ", "damaged", "CRC"):
                     source.block(10, 11)
-                assert_message(error, path.name, "frame 10 ", "damaged", "CRC")
 
     def test_file_cut_while_it_is_read(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.npy", cube())
@@ -62,9 +62,8 @@ class TestDamageInAStream:
     def test_zip_and_store(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.deflated.npz", cube())
         path.write_bytes(path.read_bytes()[:-100])
-        with pytest.raises(InputError) as error:
+        with refused("a.deflated.npz", ".npz"):
             open_frames([path])
-        assert_message(error, "a.deflated.npz", ".npz")
         store = save(tmp_path / "v3.zarr", cube())
         chunk = store / "c" / "1" / "0" / "0"
         chunk.write_bytes(chunk.read_bytes()[:20])
@@ -74,9 +73,8 @@ class TestDamageInAStream:
                 source.block(4, 8)
         assert_message(error, "v3.zarr", "frames 4 to 7", "damaged")
         (store / "zarr.json").write_text("{")
-        with pytest.raises(InputError) as error:
+        with refused("v3.zarr"):
             open_frames([store])
-        assert_message(error, "v3.zarr")
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if not name.endswith("zarr")])
@@ -126,7 +124,6 @@ def test_nothing_in_a_store_is_unpickled(tmp_path: Path, codecs: dict[str, Any],
             return Path.touch, (made,)
 
     (path / "0.0.0").write_bytes(pickle.dumps(Hostile()))
-    with pytest.raises(InputError) as error, open_frames([path]) as source:
+    with refused("a.zarr"), open_frames([path]) as source:
         source.block(0, 1)
-    assert_message(error, "a.zarr")
     assert not made.exists()

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.io.frame_files import FORMATS, assert_message, cube, save
+from tests.io.frame_files import FORMATS, cube, save
+from tests.refusals import refused
 from tests.shared_data import shared_file
 
 from faintspot.base.errors import InputError, MissingExtraError
@@ -23,7 +24,7 @@ zarr = pytest.importorskip("zarr")
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("dtype", ["int16", "float32", "uint16", "uint8", "int32"])
+@pytest.mark.parametrize("dtype", ["int16", "float32", "uint8"])
 def test_blocks_of_every_format_are_the_frames(tmp_path: Path, name: str, dtype: str) -> None:
     frames = cube(dtype=dtype)
     with open_frames([save(tmp_path / f"a.{name}", frames)]) as source:
@@ -51,9 +52,8 @@ def test_fortran_order_image_in_npz(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", frame)
     np.testing.assert_array_equal(read_array(tmp_path / "a.npz"), frame)
     np.savez(tmp_path / "b.npz", np.asfortranarray(cube()))
-    with pytest.raises(InputError) as error:
+    with refused("b.npz:arr_0", "Fortran order", "ascontiguousarray"):
         open_frames([tmp_path / "b.npz"])
-    assert_message(error, "b.npz:arr_0", "Fortran order", "ascontiguousarray")
 
 
 @given(st.data())
@@ -164,16 +164,14 @@ class TestFits:
     def test_truncated_file(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.fits", cube(100, 20, 20))
         path.write_bytes(path.read_bytes()[:40_000])
-        with pytest.raises(InputError) as error:
+        with refused("a.fits: truncated", "82880", "40000"):
             open_frames([path])
-        assert_message(error, "a.fits: truncated", "82880", "40000")
 
     def test_truncated_tile_compressed_file(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.fits.fz", cube(100, 20, 20))
         path.write_bytes(path.read_bytes()[:-40_000])
-        with pytest.raises(InputError) as error:
+        with refused("truncated"):
             open_frames([path])
-        assert_message(error, "truncated")
 
     def test_damaged_tile(self, tmp_path: Path) -> None:
         path = tmp_path / "a.fits.fz"
@@ -181,30 +179,25 @@ class TestFits:
         content = bytearray(path.read_bytes())
         content[40_000:50_000] = bytes(10_000)
         path.write_bytes(content)
-        with pytest.raises(InputError) as error, open_frames([path]) as source:
+        with refused("a.fits.fz", "frames", "damaged"), open_frames([path]) as source:
             for _ in source.blocks(0, 100, 10):
                 pass
-        assert_message(error, "a.fits.fz", "frames", "damaged")
 
     def test_no_such_extension_no_image_no_fits(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.fits", cube())
-        with pytest.raises(InputError) as error:
+        with refused("'SCI'", "PRIMARY"):
             open_frames([path], key="SCI")
-        assert_message(error, "'SCI'", "PRIMARY")
         table = fits.BinTableHDU.from_columns([fits.Column("a", "E", array=np.zeros(3))], name="TAB")
         fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "t.fits")
         for key in (None, "TAB"):
-            with pytest.raises(InputError) as error:
+            with refused("t.fits", "image"):
                 open_frames([tmp_path / "t.fits"], key=key)
-            assert_message(error, "t.fits", "image")
         (tmp_path / "b.fits").write_bytes(b"SIMPLE  but no header" * 300)
-        with pytest.raises(InputError) as error:
+        with refused("b.fits", "FITS"):
             open_frames([tmp_path / "b.fits"])
-        assert_message(error, "b.fits", "FITS")
         (tmp_path / "c.fits.gz").write_bytes(gzip.compress(b"no header" * 300))
-        with pytest.raises(InputError) as error:
+        with refused("c.fits.gz", "FITS"):
             open_frames([tmp_path / "c.fits.gz"])
-        assert_message(error, "c.fits.gz", "FITS")
 
     def test_zero_frames(self, tmp_path: Path) -> None:
         unit = fits.PrimaryHDU(np.zeros((1, 4, 4), np.int16))
@@ -214,9 +207,8 @@ class TestFits:
         (tmp_path / "a.fits").write_bytes(
             content.replace(b"NAXIS3  =                    1", b"NAXIS3  =                    0")
         )
-        with pytest.raises(InputError) as error:
+        with refused("at least one frame", "(0, 4, 4)"):
             open_frames([tmp_path / "a.fits"])
-        assert_message(error, "at least one frame", "(0, 4, 4)")
 
 
 class TestRefused:
@@ -242,9 +234,8 @@ class TestRefused:
             np.save(path, array, allow_pickle=True)
         else:
             np.savez(path, frames=array)
-        with pytest.raises(InputError) as error:
+        with refused(path.name, *parts):
             open_frames([path])
-        assert_message(error, path.name, *parts)
 
     def test_paths(self, tmp_path: Path) -> None:
         (tmp_path / "empty.fits").touch()
@@ -264,9 +255,8 @@ class TestRefused:
             "cut.npy:frames": "without a name",
         }
         for name, part in cases.items():
-            with pytest.raises(InputError) as error:
+            with refused(name.partition(":")[0], part):
                 open_frames([tmp_path / name])
-            assert_message(error, name.partition(":")[0], part)
         with pytest.raises(InputError, match="at least one file"):
             open_frames([])
 
@@ -276,20 +266,17 @@ class TestRefused:
         group.create_array("one", data=cube())
         group.create_array("two", data=cube())
         for path in (tmp_path / "a.npz", tmp_path / "a.zarr"):
-            with pytest.raises(InputError) as error:
+            with refused(path.name, "one", "two", f"{path.name}:NAME"):
                 open_frames([path])
-            assert_message(error, path.name, "one", "two", f"{path.name}:NAME")
-            with pytest.raises(InputError) as error:
+            with refused(path.name, "three"):
                 open_frames([f"{path}:three"])
-            assert_message(error, path.name, "three")
             with open_frames([path], key="two") as source:
                 assert source.n_frames == 11
 
     def test_other_size_and_range(self, tmp_path: Path) -> None:
         a, b = save(tmp_path / "a.npy", cube()), save(tmp_path / "b.npy", cube(2, 6, 9))
-        with pytest.raises(InputError) as error:
+        with refused("b.npy", "6 x 9", "a.npy", "6 x 8"):
             open_frames([a, b])
-        assert_message(error, "b.npy", "6 x 9", "a.npy", "6 x 8")
         with open_frames([a]) as source:
             for start, stop in [(-1, 2), (3, 3), (5, 12)]:
                 with pytest.raises(InputError, match="expected 0 to 11"):
@@ -353,6 +340,5 @@ def test_zip_with_other_files_in_it(tmp_path: Path) -> None:
 def test_more_pixels_than_a_frame_may_have(tmp_path: Path) -> None:
     """Of one byte each they are less memory than is allowed; what is made of them is more."""
     np.lib.format.open_memmap(tmp_path / "map.npy", "w+", np.uint8, (1 << 14, 1 << 15))  # no disk is used
-    with pytest.raises(InputError) as error:
+    with refused("16384 x 32768"):
         read_array(tmp_path / "map.npy")
-    assert "16384 x 32768" in str(error.value)

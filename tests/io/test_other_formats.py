@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import scipy.io
 from PIL import Image
-from tests.io.frame_files import assert_message, cube, save
+from tests.io.frame_files import cube, save
+from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.io import open_frames, read_array
@@ -22,17 +23,15 @@ class TestHdf5:
     def test_several_data_sets_are_listed(self, tmp_path: Path) -> None:
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file["camera/sky"], file["camera/bias"], file["time"] = cube(), cube(3), np.arange(11)
-        with pytest.raises(InputError) as error:
+        with refused("camera/bias, camera/sky, time", "a.h5:NAME"):
             open_frames([tmp_path / "a.h5"])
-        assert_message(error, "camera/bias, camera/sky, time", "a.h5:NAME")
         for key in ("camera/sky", "/camera/sky"):
             with open_frames([f"{tmp_path / 'a.h5'}:{key}"]) as source:
                 np.testing.assert_array_equal(source.block(2, 9), cube()[2:9])
         with open_frames([tmp_path / "a.h5"], key="camera/bias") as source:
             assert source.n_frames == 3
-        with pytest.raises(InputError) as error:
+        with refused("no array 'camera'"):
             open_frames([f"{tmp_path / 'a.h5'}:camera"])
-        assert_message(error, "no array 'camera'")
 
     def test_many_are_not_all_listed(self, tmp_path: Path) -> None:
         with h5py.File(tmp_path / "a.h5", "w") as file:

@@ -135,7 +135,7 @@ def test_killed_again_and_again(tmp_path: Path, name: str) -> None:
     package = Path(faintspot.__file__).parents[1]
     root = Path(__file__).resolve().parents[2]
     seen = [0]
-    for attempt in range(3):
+    for attempt in range(2):
         arguments = [sys.executable, "-c", KILLED, str(path), str(package), str(root)]
         with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
             assert process.stdout is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +70,7 @@ def test_what_was_appended_is_read(store: TelemetryStore) -> None:
     assert without.raw.shape == (0, *SHAPE)
 
 
-def test_commands_are_read_and_earlier_stores_have_none(store: TelemetryStore) -> None:
+def test_commands_are_read_and_stores_of_engines_without_a_loop_have_none(store: TelemetryStore) -> None:
     telemetry = read_telemetry(store.path)
     assert (telemetry.loop.tolist(), telemetry.commands.shape) == ([0] * 15, (15, 0))
     kind = np.dtype([*RECORD.descr, ("loop", np.int64), ("commands", np.float32, (5,))])
@@ -132,18 +131,6 @@ def test_damage_is_said_and_never_read_as_other_telemetry(store: TelemetryStore)
             read_telemetry(store.path)
         chunk.write_bytes(content)
     assert len(read_telemetry(store.path).frame) == 15
-
-
-def test_telemetry_without_checksums_is_read(store: TelemetryStore) -> None:
-    """As version 0.1 wrote it: without codecs for that, and without chunks of zeros."""
-    import zarr
-
-    group: Any = zarr.open_group(str(store.path), mode="r+")
-    values = group["flags"][:]
-    del group["flags"]
-    group.create_array("flags", shape=values.shape, chunks=values.shape, dtype=values.dtype)[:] = 0 * values
-    assert not list((store.path / "flags").glob("c/*"))
-    assert not read_telemetry(store.path).flags.any()
 
 
 def test_aot_is_read_back_by_aotpy(store: TelemetryStore, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 from faintspot.kernels.host import WIDTHS, aligned_zeros, lanes_for
 

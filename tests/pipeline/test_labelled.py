@@ -5,18 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.simulated import frames_of
 
 from faintspot import InputError, Layout, MissingExtraError, Settings, SlopePipeline, Slopes
-from faintspot.simulate import sensor_frames
 
 LAYOUT = Layout.grid((2, 3), pixels=8, pixel_scale_arcsec=0.5)
 
 
 @pytest.fixture(scope="module")
 def slopes() -> Slopes:
-    frames, _ = sensor_frames(
-        LAYOUT.corners, LAYOUT.window, LAYOUT.frame_shape, 4, rng=np.random.default_rng(1)
-    )
+    frames, _ = frames_of(LAYOUT, 4, rng=np.random.default_rng(1))
     return SlopePipeline(LAYOUT, Settings(estimator="brightest", keep_brightest=8))(frames)
 
 

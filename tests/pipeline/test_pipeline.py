@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests import naive
-from tests.algorithms.image_cases import refused
 from tests.pipeline_cases import FIELDS, assert_equals_oracle, assert_same, largest_value, random_case
+from tests.refusals import refused
 
 import faintspot as fs
 

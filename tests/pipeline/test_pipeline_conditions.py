@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tests import naive
 from tests.pipeline_cases import FIELDS, assert_same
 from tests.shared_data import shared_file
+from tests.simulated import frames_of
 
 import faintspot as fs
 
@@ -175,9 +176,7 @@ class TestWindows:
     def test_size(self, window: tuple[int, int], n: int) -> None:
         layout = fs.Layout.grid((1, n), pixels=window)
         rng = np.random.default_rng(7)
-        frames, truth = fs.simulate.sensor_frames(
-            layout.corners, window, layout.frame_shape, 4, flux_e=5000.0, rng=rng
-        )
+        frames, truth = frames_of(layout, 4, flux_e=5000.0, rng=rng)
         settings = fs.Settings(noise_std=0.3, max_iterations=40)
         slopes = fs.SlopePipeline(layout, settings)(frames)
         assert slopes.valid.all()

@@ -10,6 +10,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 from tests.patience import LIMIT_S
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.realtime.engine import Engine
@@ -26,10 +27,8 @@ def make(settings: fs.Settings) -> fs.SlopePipeline:
 
 
 def simulated(n: int) -> NDArray[np.uint16]:
-    frames, _ = fs.simulate.sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
+    frames, _ = frames_of(
+        LAYOUT,
         n,
         flux_e=300.0,
         detector=fs.simulate.Detector(1.0, offset_adu=100.0, bits=16),

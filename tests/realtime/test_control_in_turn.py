@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.control.compiled_kalman import CompiledKalman

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.simulated import frames_of
 
 import faintspot as fs
 from faintspot.kernels.ordered import store
@@ -32,15 +33,7 @@ SETTINGS = {
 
 def frames(n: int, dtype: Any = np.uint16) -> NDArray[Any]:
     detector = fs.simulate.Detector(1.0, offset_adu=100.0, bits=16)
-    simulated, _ = fs.simulate.sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
-        n,
-        flux_e=200.0,
-        detector=detector,
-        rng=np.random.default_rng(4),
-    )
+    simulated, _ = frames_of(LAYOUT, n, flux_e=200.0, detector=detector, rng=np.random.default_rng(4))
     return np.asarray(simulated).astype(dtype)
 
 
@@ -91,14 +84,6 @@ def test_same_slopes_as_the_pipeline(name: str, threads: int) -> None:
         workers.close()
 
 
-def test_float_frames() -> None:
-    data, source = frames(1, np.float32), Source(np.float32)
-    source.write(0, data[0])
-    path = FramePath(pipeline("tv"), source.slots, source.progress)
-    assert path.measure(0)
-    assert_same(path.slopes, pipeline("tv")(data), 0)
-
-
 @pytest.mark.portable
 def test_a_frame_that_has_passed_counts_as_there() -> None:
     data, source = frames(2), Source()
@@ -146,13 +131,3 @@ def test_flux_must_be_known_beforehand() -> None:
     automatic = fs.Settings(noise_std="auto", keep_brightest="auto", spot_fwhm_px=2.0)
     with pytest.raises(fs.InputError, match=r"settings\.flux_e"):
         FramePath(fs.SlopePipeline(LAYOUT, automatic, NOISE), source.slots, source.progress)
-
-
-def test_a_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rather than silently measured on the CPU."""
-    source, work = Source(), pipeline("plain")
-    monkeypatch.setattr(work, "device", "cuda")
-    monkeypatch.setattr(work, "on_device", object())
-    with pytest.raises(fs.InputError, match=r"measures on the CPU; .*FrameStream") as raised:
-        FramePath(work, source.slots, source.progress)
-    assert "\n" not in str(raised.value)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.algorithms.image_cases import refused
 from tests.realtime.bench import SETTINGS, Bench, make, simulated
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.pipeline.settings import without_denoising

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 from tests.sensor.sensor_cases import spot_frame
 
 from faintspot.sensor.lenslets import LensletGrid, find_lenslets

@@ -7,20 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.simulated import frames_of
 
 from faintspot import Layout
 from faintspot.base.errors import InputError
 from faintspot.sensor.known_grid import find_illuminated
-from faintspot.simulate import Detector, sensor_frames
+from faintspot.simulate import Detector
 
 PUPIL = Layout.grid((10, 12), pixels=2, outer_radius=5.2, inner_radius=1.2)
 
 
 def frame(layout: Layout = PUPIL, flux_e: float = 200.0, n: int = 30, offset: float = 0.0) -> NDArray[Any]:
-    frames, _ = sensor_frames(
-        layout.corners,
-        layout.window,
-        layout.frame_shape,
+    frames, _ = frames_of(
+        layout,
         n,
         flux_e=flux_e,
         position_range_px=0.3,

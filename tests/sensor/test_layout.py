@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 
 import faintspot as fs
 

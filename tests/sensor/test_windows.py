@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.algorithms.image_cases import refused
+from tests.refusals import refused
 from tests.sensor.sensor_cases import spot_frame
 
 import faintspot as fs

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 from tests.shared_data import shared_file
 from tests.training.psf_cases import simulated, slope_error, true_psf
 
@@ -126,9 +127,8 @@ def static(rng: Any, spread_px: Any) -> Any:
 
 def test_spots_at_one_phase_teach_nothing() -> None:
     rng = np.random.default_rng(11)
-    with pytest.raises(InputError, match="one for each PSF") as error:
+    with refused("one for each PSF"):
         learn_psf_from_images(static(rng, 0.0), Calibration(read_noise_e=0.1), rng=rng)
-    assert "\n" not in str(error.value)
     with pytest.warns(UserWarning, match="sub-pixel position"):
         learn_psf_from_images(static(rng, 0.12), Calibration(read_noise_e=0.1), rng=rng)
 

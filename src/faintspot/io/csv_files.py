@@ -9,7 +9,7 @@ import numpy as np
 
 from faintspot.base.files import check_file_size
 from faintspot.io.file_format import FileFormat
-from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes, with_absent
+from faintspot.io.slopes_format import UNITS, VARIABLES, StoredSlopes, most_slopes_bytes
 from faintspot.io.slopes_writer import ExistingOutput
 
 _LINES = 1 << 12
@@ -53,13 +53,10 @@ class Csv(FileFormat):
         unit = next((unit for unit in UNITS if column_name("x", unit) in names), "px")
         table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
         width = int(table[:, names.index("subaperture")].max()) + 1
-        variables = with_absent(
-            {
-                name: table[:, names.index(column)].reshape(-1, width).astype(variable.dtype)
-                for name, variable in VARIABLES.items()
-                if (column := column_name(name, unit)) in names
-            }
-        )
+        variables = {
+            name: table[:, names.index(column_name(name, unit))].reshape(-1, width).astype(variable.dtype)
+            for name, variable in VARIABLES.items()
+        }
         attributes = {} if unit == "px" else {"unit": unit}
         return StoredSlopes(variables, {}, attributes, True, len(variables["x"]))
 

@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import parse_json
 from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip, pieces
-from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of, with_absent
+from faintspot.io.slopes_format import COORDINATE_UNITS, VARIABLES, StoredSlopes, unit_of
 
 fits = load_fits()
 _BLOCK_BYTES = 2880
@@ -49,7 +49,7 @@ def write_fits(stream: IO[bytes], slopes: StoredSlopes) -> None:
 
 
 def read_fits(path: Path) -> StoredSlopes:
-    """Read a FITS file of slopes; files of earlier versions have no checksums."""
+    """Read a FITS file of slopes with its checksums."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # astropy only warns of truncated files and wrong checksums
         try:
@@ -59,9 +59,7 @@ def read_fits(path: Path) -> StoredSlopes:
                     pass  # only at its end does gzip verify its checksum
         except Warning as warning:
             raise ValueError(str(warning)) from None
-    variables = with_absent(
-        {name: arrays.pop(name).astype(VARIABLES[name].dtype) for name in VARIABLES if name in arrays}
-    )
+    variables = {name: arrays.pop(name).astype(variable.dtype) for name, variable in VARIABLES.items()}
     attributes = parse_json(arrays.pop("attributes").tobytes())
     return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from faintspot.base.errors import InputError
 from faintspot.base.files import check_regular, parse_json, read_bytes, replace_file, sync_file, sync_folder
 from faintspot.base.sizes import MOST_TEXT_BYTES
-from faintspot.io.slopes_format import VARIABLES, RecordingHeader, StoredSlopes, with_absent
+from faintspot.io.slopes_format import VARIABLES, RecordingHeader, StoredSlopes
 from faintspot.io.slopes_writer import ExistingOutput
 
 _RUN = "run.json"
@@ -77,10 +77,7 @@ class FolderStorage:
         replace_file(self.place / _RUN, json.dumps(description))
 
     def open(self) -> None:
-        """Give the mark of an earlier version the name of its run."""
-        fingerprint, finished = _read_mark(self.place)
-        if not fingerprint:
-            self.mark(finished)
+        """Nothing stays open."""
 
     def marked(self) -> tuple[str, int]:
         """Return fingerprint and number of whole frames."""
@@ -134,13 +131,10 @@ def read_partial(folder: Path) -> StoredSlopes:
     variables: dict[str, NDArray[Any]] = {}
     for name, variable in VARIABLES.items():
         empty = np.empty(shape, variable.dtype)
-        if (folder / name).exists():
-            check_regular(folder / name)
-            variables[name] = (
-                np.memmap(folder / name, variable.dtype, "r", shape=shape) if finished else empty
-            )
+        check_regular(folder / name)
+        variables[name] = np.memmap(folder / name, variable.dtype, "r", shape=shape) if finished else empty
     return StoredSlopes(
-        variables=with_absent(variables),
+        variables=variables,
         coordinates={name: np.asarray(values) for name, values in description["coordinates"].items()},
         attributes=description["attributes"],
         complete=False,
@@ -158,7 +152,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
 
 
 def _read_mark(folder: Path) -> tuple[str, int]:
-    """Return fingerprint ("" where an earlier version has not written it) and number of whole frames."""
+    """Return fingerprint and number of whole frames."""
     try:
         finished, _, fingerprint = read_bytes(folder / _MARK, "a mark", 1 << 10).decode().partition("\n")
         return fingerprint, int(finished)

@@ -25,7 +25,7 @@ class Variable:
     long_name: str
     csv_name: str
     if_absent: float | None = None
-    """What takes its place where it is not given, as in files that were written before it existed."""
+    """What takes its place where it is not given."""
 
 
 VARIABLES: Mapping[str, Variable] = {
@@ -222,7 +222,7 @@ def checked_block(
     if not 0 < n <= run.n_frames - finished:
         raise InputError(f"slopes: expected 1 to {run.n_frames - finished} more frames, got {n}")
     arrays = {}
-    for name, values in with_absent(block).items():
+    for name, values in _with_absent(block).items():
         array = np.asarray(values)
         if array.shape != (n, run.n_subapertures):
             raise InputError(f"slopes: {name}: expected shape {(n, run.n_subapertures)}, got {array.shape}")
@@ -230,7 +230,7 @@ def checked_block(
     return arrays
 
 
-def with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
+def _with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
     """Return all variables in their order, those that are absent filled; KeyError when one is needed."""
     return {
         name: np.full(np.shape(found["x"]), variable.if_absent, variable.dtype)

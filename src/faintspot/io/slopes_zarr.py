@@ -28,7 +28,6 @@ from faintspot.io.slopes_format import (
     StoredSlopes,
     check_stated,
     unit_of,
-    with_absent,
 )
 from faintspot.io.slopes_writer import ExistingOutput
 from faintspot.io.zarr_store import (
@@ -126,7 +125,7 @@ class StoreStorage:
 
     def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return frames that are stored."""
-        return {name: _read(self.place, array, start, stop) for name, array in self._arrays.items()}
+        return {name: read_items(self.place, array, start, stop) for name, array in self._arrays.items()}
 
     def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Store whole chunks."""
@@ -176,20 +175,12 @@ def read_store(path: Path) -> StoredSlopes:
     stored = [name for name in (*VARIABLES, *coordinates) if name in group]
     check_stated(path, {name: group[name].shape for name in stored}, finished)
     return StoredSlopes(
-        variables=with_absent(
-            {name: _read(path, group[name], 0, finished) for name in VARIABLES if name in group}
-        ),
-        coordinates={name: _read(path, group[name], 0, group[name].shape[0]) for name in coordinates},
+        variables={name: read_items(path, group[name], 0, finished) for name in VARIABLES},
+        coordinates={name: read_items(path, group[name], 0, group[name].shape[0]) for name in coordinates},
         attributes=attributes,
         complete=complete,
         n_finished=finished,
     )
-
-
-def _read(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
-    """Return items of an array."""
-    # Versions without checksums wrote no chunk that is all fill value; NaN, that of floats, no slope ever is.
-    return read_items(path, array, start, stop, whole=array.dtype.kind == "f")
 
 
 def _create_arrays(path: Path, run: RecordingHeader) -> None:

@@ -251,7 +251,7 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
             count = finished[_dimensions(name, array.ndim)[0]]
             if count > array.shape[0]:
                 raise ValueError(f"{name}: expected {count}, found {array.shape[0]}")
-            arrays[name] = read_items(store, array, 0, count, whole=False)
+            arrays[name] = read_items(store, array, 0, count)
         changes = attributes.pop("changes")
     except InputError:
         raise

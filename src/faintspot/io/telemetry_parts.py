@@ -82,7 +82,7 @@ class StoredTelemetry:
         array = self._array(name)
         if stop > array.shape[0]:
             raise InputError(f"{self.path}: the store is damaged ({name}: {array.shape[0]} of {stop})")
-        return np.asarray(read_items(self.path, array, start, stop, whole=False))
+        return np.asarray(read_items(self.path, array, start, stop))
 
     def _array(self, name: str) -> Any:
         try:

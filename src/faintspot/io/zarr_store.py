@@ -117,24 +117,20 @@ def checked_codecs() -> tuple[Any, ...]:
     return zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec()
 
 
-def read_items(path: Path, array: Any, start: int, stop: int, *, whole: bool) -> NDArray[Any]:
+def read_items(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
     """Return items of an array, or say that some are lost: to Zarr, a lost chunk is its fill value.
-
-    `whole` says that a store without checksums has all chunks, too; one with checksums always does.
 
     Raises
     ------
     InputError
         When a chunk is damaged or lost.
     """
-    zarr = load_zarr()
-    if whole or any(isinstance(codec, zarr.codecs.Crc32cCodec) for codec in array.compressors):
-        for number, file in enumerate(chunk_files(path, array, start, stop), start // array.chunks[0]):
-            if not file.is_file():
-                raise InputError(
-                    f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
-                    "(counted from 0) and later is lost"
-                )
+    for number, file in enumerate(chunk_files(path, array, start, stop), start // array.chunks[0]):
+        if not file.is_file():
+            raise InputError(
+                f"{path}: the store is damaged: {array.basename} of frame {number * array.chunks[0]} "
+                "(counted from 0) and later is lost"
+            )
     check_array(f"{path}: {array.basename}", array)
     try:
         return np.asarray(array[start:stop])

@@ -1,0 +1,13 @@
+"""Simulated frames of a layout."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from faintspot.sensor.layout import Layout
+from faintspot.simulate import sensor_frames
+
+
+def frames_of(layout: Layout, n: int, **options: Any) -> tuple[Any, Any]:
+    """Return so many frames of a sensor and the positions of its spots, see `sensor_frames`."""
+    return sensor_frames(layout.corners, layout.window, layout.frame_shape, n, **options)
