@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
+from typing import Any
 from uuid import uuid4
 
 import pytest
+
+from faintspot.realtime.pixel_segment import FOLDER
 
 
 @pytest.fixture
@@ -28,3 +32,25 @@ def sky() -> Iterator[object]:
     made = Sky(f"fs_test_{uuid4().hex[:12]}")
     yield made
     made.close()
+
+
+@pytest.fixture
+def name() -> Iterator[str]:
+    """A name of its own; what shared memory holds under it is removed."""
+    chosen = f"fs_test_{uuid4().hex[:12]}"
+    yield chosen
+    for path in FOLDER.glob(f"{chosen}*"):
+        path.unlink()
+    with contextlib.suppress(ImportError):
+        import pyshmem
+
+        for part in ("in", "slopes", "commands", "truth", "frames"):
+            pyshmem.unlink_quiet(f"{chosen}_{part}")
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The configuration file of the simulated telescope, and its control; nobody writes there."""
+    from tests.realtime.closed_loop import configured
+
+    return configured(tmp_path_factory.mktemp("bench"))

@@ -5,19 +5,15 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import pytest
+from tests.patience import wait_for
 
-import faintspot
 from faintspot.base.errors import InputError
 from faintspot.realtime import bridge as bridge_module
 from faintspot.realtime.bridge import BridgeCounters, StreamBridge
@@ -29,7 +25,7 @@ pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
     pytest.mark.machine_time("clocks, threads and other processes"),
 ]
-SHAPE, PATIENCE_S = (6, 5), 60.0
+SHAPE = (6, 5)
 
 
 class Running:
@@ -61,21 +57,6 @@ class Running:
         self._thread.join()
 
 
-def wait_for(condition: Any, what: str = "") -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end, what
-        time.sleep(0.001)
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"fs_test_{uuid4().hex[:12]}"
-    yield chosen
-    (FOLDER / chosen).unlink(missing_ok=True)
-    pyshmem.unlink_quiet(f"{chosen}_in")
-
-
 @pytest.fixture(params=[False, True], ids=["parks", "spins"])
 def running(name: str, request: pytest.FixtureRequest) -> Iterator[Running]:
     made = Running(name, request.param)
@@ -94,7 +75,7 @@ def created(name: str, dtype: Any = np.uint16, shape: tuple[int, int] = SHAPE, *
 
 
 @pytest.mark.parametrize("notify", [False, True])
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "int32", "float32", "float64"])
+@pytest.mark.parametrize("dtype", ["uint16", "int32", "float64"])
 def test_frames_arrive(name: str, running: Running, dtype: str, notify: bool) -> None:
     running.said("is not there; waiting")
     stream = created(name, dtype, notify=notify)
@@ -240,9 +221,6 @@ def test_the_ring_belongs_to_somebody_else(name: str) -> None:
     with PixelRing.create(name, SHAPE, np.uint16), pytest.raises(InputError, match="writes into this"):
         StreamBridge(f"{name}_in", name).run()
     stream.unlink()
-
-
-def test_bad_number_of_frames(name: str) -> None:
     with pytest.raises(InputError, match="n_frames = 0"):
         StreamBridge(f"{name}_in", name).run(0)
 
@@ -256,27 +234,4 @@ def test_idle_leaves_the_processor_alone(name: str, running: Running) -> None:
     start, processor = time.monotonic(), time.process_time()
     time.sleep(1.0)
     assert time.process_time() - processor < 0.5 * (time.monotonic() - start)
-    stream.unlink()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_command_ends_in_order(name: str, number: signal.Signals) -> None:
-    stream = created(name)
-    code = "from faintspot.cli.realtime_sources import bridge; bridge()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, f"{name}_in", "--name", name],
-        env={**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    wait_for(lambda: (FOLDER / name).exists())
-    ring = PixelRing.attach(name)
-    wait_for(lambda: stream.write(frame(1)) or ring.progress()[0] >= 0)
-    process.send_signal(number)
-    out, errors = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, errors) == (0, "")
-    assert "frames, " in out.splitlines()[-1]
-    assert ring.closed
-    assert not (FOLDER / name).exists()
     stream.unlink()

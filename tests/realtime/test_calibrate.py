@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from faintspot.base.errors import InputError
 from faintspot.cli.realtime_calibrate import calibrate
 from faintspot.control.configuration import Control, load_control, save_control
 from faintspot.realtime.poking import StreamedMirror
@@ -20,16 +22,11 @@ pytest.importorskip("hcipy")
 pytest.importorskip("matplotlib")
 pyshmem = pytest.importorskip("pyshmem")
 
-from tests.realtime.closed_loop import COMMANDS, CONFIGURATION, Sky, configured, make_engine  # noqa: E402
+from tests.realtime.closed_loop import COMMANDS, CONFIGURATION, Sky, make_engine  # noqa: E402
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 STILL = CONFIGURATION.replace("control", frame_rate_hz=400.0)
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
-    return configured(tmp_path_factory.mktemp("bench"))
 
 
 @contextmanager
@@ -50,6 +47,12 @@ def running(files: tuple[Path, Control], *, control: bool = False) -> Iterator[S
         sky.close()
 
 
+def copied(path: Path, folder: Path) -> Path:
+    """Copy the configuration and its files, which other tests read too."""
+    shutil.copytree(path.parent, folder)
+    return folder / path.name
+
+
 def calibrated(path: Path, sky: Sky, *options: str) -> Result:
     arguments = ["--config", str(path), "--name", sky.name, *options]
     return CliRunner().invoke(calibrate, arguments, standalone_mode=False)
@@ -60,10 +63,7 @@ def test_the_matrix_is_the_true_one(files: tuple[Path, Control], tmp_path: Path)
 
     The matrix of the files is in true pixels: columns are in proportion to 3 %, more at the edge.
     """
-    path, true = tmp_path / "faintspot.toml", files[1]
-    path.write_text(files[0].read_text())
-    for name in ("interaction_matrix.npy", "reference_slopes.npy", "faintspot.psf.npz"):
-        (tmp_path / name).write_bytes((files[0].parent / name).read_bytes())
+    path, true = copied(files[0], tmp_path / "found"), files[1]
     with running(files) as sky:
         result = calibrated(path, sky, "--error", "0.02", "--amplitude", "100")
         assert result.exception is None, result.exception
@@ -77,7 +77,7 @@ def test_the_matrix_is_the_true_one(files: tuple[Path, Control], tmp_path: Path)
     assert np.corrcoef(found.interaction.ravel(), true.interaction.ravel())[0, 1] > 0.995
     assert 0.9 < (found.interaction * true.interaction).sum() / np.square(true.interaction).sum() < 1.1
     np.testing.assert_allclose(found.reference, true.reference, atol=0.02)
-    assert (tmp_path / "faintspot.control.png").is_file()
+    assert path.with_suffix(".control.png").is_file()
     assert f"{COMMANDS} commands, 72 slopes, 4 rounds of +-100" in result.output
     assert "times those of the former matrix" in result.output
 
@@ -101,14 +101,11 @@ def test_what_is_refused(files: tuple[Path, Control], tmp_path: Path) -> None:
         assert "the mirror does not answer: pokes of 50" in str(deaf.exception)
         assert "[control]" not in path.read_text()
         large = ("--amplitude", "60", "--actuators", "3")
-        save_control(files[0], largest_command=50.0)
-        assert "--amplitude 60: expected at most largest_command, 50" in str(
-            calibrated(files[0], sky, *large).exception
-        )
+        limited = copied(files[0], tmp_path / "limited")
+        save_control(limited, largest_command=50.0)
+        assert "largest_command, 50" in str(calibrated(limited, sky, *large).exception)
         assert not path.with_suffix(".control.npz").exists()
-    assert "no engine" in str(
-        calibrated(path, sky, "--actuators", "3").exception
-    ) or "there is no telemetry" in (str(calibrated(path, sky, "--actuators", "3").exception))
+    assert isinstance(calibrated(path, sky, "--actuators", "3").exception, InputError)
 
 
 def test_an_engine_that_ends_while_it_is_poked(files: tuple[Path, Control]) -> None:

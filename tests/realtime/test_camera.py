@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -17,8 +13,8 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.simulated import frames_of
 
-import faintspot
 from faintspot import Calibration, Layout
 from faintspot.base.errors import InputError
 from faintspot.base.generators import spawn
@@ -27,7 +23,7 @@ from faintspot.realtime import camera as camera_module
 from faintspot.realtime.camera import Camera, SpotMotion, readout_type
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
-from faintspot.simulate import Detector, sensor_frames
+from faintspot.simulate import Detector
 
 pytestmark = [
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
@@ -36,13 +32,6 @@ pytestmark = [
 
 LAYOUT = Layout.grid((3, 4), pixels=8)
 CONFIGURATION = "[layout.grid]\nshape = [3, 4]\npixels = 8\n"
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"faintspot-test-{secrets.token_hex(6)}"
-    yield chosen
-    (FOLDER / chosen).unlink(missing_ok=True)
 
 
 @pytest.fixture
@@ -61,10 +50,8 @@ def test_frames_are_those_of_the_simulation(ring: PixelRing) -> None:
     detector, motion = Detector(2.0, offset_adu=50.0), SpotMotion(0.5, 0.02)
     source = small(ring, flux_e=300.0, detector=detector, motion=motion, profile="gaussian", size=1.2)
     motion_rng, noise_rng = spawn(np.random.default_rng(3), 2)
-    frames, truth = sensor_frames(
-        LAYOUT.corners,
-        LAYOUT.window,
-        LAYOUT.frame_shape,
+    frames, truth = frames_of(
+        LAYOUT,
         5,
         flux_e=300.0,
         profile="gaussian",
@@ -294,32 +281,3 @@ def test_command_refuses(config: Path, name: str) -> None:
         result = CliRunner().invoke(camera, options)
         assert isinstance(result.exception, InputError)
         assert "writes into this pixel ring already" in str(result.exception)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_command_ends_in_order(config: Path, name: str, number: signal.Signals) -> None:
-    code = "from faintspot.cli.realtime_camera import camera; camera()"
-    options = ["--config", str(config), "--name", name, "--frame-rate-hz", "200", "--distinct", "5"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *options],
-        env={**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    reader = None
-    for _ in range(3000):
-        try:
-            reader = PixelRing.attach(name)
-            break
-        except InputError:
-            time.sleep(0.005)
-    assert reader is not None
-    assert reader.wait(5, 24, 30.0) or reader.progress()[0] > 5
-    process.send_signal(number)
-    out, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (0, "")
-    assert len(out.splitlines()) == 2
-    assert reader.closed
-    assert reader.progress()[1] == 24
-    assert not (FOLDER / name).exists()

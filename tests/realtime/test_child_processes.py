@@ -5,12 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from uuid import uuid4
 
 import pytest
+from tests.patience import LIMIT_S, wait_for
 
 from faintspot.base.errors import InputError
 from faintspot.realtime.child_processes import ChildProcesses
@@ -18,7 +17,6 @@ from faintspot.realtime.child_processes import ChildProcesses
 pytest.importorskip("pyshmem")
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
-PATIENCE_S = 60.0
 # A bridge waits for a stream that never comes.
 PARENT = """
 import sys, time
@@ -42,13 +40,6 @@ def lives(pid: int) -> bool:
     return state(pid) not in ("", "Z")  # nobody asks for what is left of it
 
 
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def test_they_end_where_this_one_is_killed(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PARENT, str(tmp_path), f"fs_test_{uuid4().hex[:12]}"]
     parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -56,8 +47,8 @@ def test_they_end_where_this_one_is_killed(tmp_path: Path) -> None:
     child = int(parent.stdout.readline())
     assert lives(child)
     parent.kill()
-    parent.communicate(timeout=PATIENCE_S)
-    until(lambda: not lives(child))
+    parent.communicate(timeout=LIMIT_S)
+    wait_for(lambda: not lives(child))
 
 
 def test_one_that_ends_says_why_and_all_others_end(tmp_path: Path) -> None:
@@ -69,7 +60,7 @@ def test_one_that_ends_says_why_and_all_others_end(tmp_path: Path) -> None:
             processes.wait_until(lambda: False, "rain", 0.05)
         processes.start("run", ["realtime", "run", "--config", str(tmp_path / "nothing.toml")])
         with pytest.raises(InputError, match=r"run: it has ended: .*nothing\.toml: no such file"):
-            processes.wait_until(lambda: False, "run", PATIENCE_S)
+            processes.wait_until(lambda: False, "run", LIMIT_S)
         bridge = processes._started["bridge"]
     assert bridge.returncode is not None
     assert not processes._started
@@ -82,7 +73,7 @@ def test_one_that_does_not_end_is_killed(tmp_path: Path, monkeypatch: pytest.Mon
         processes.start("bridge", ["realtime", "bridge", "fs_test_none", "--name", "fs_test_none"])
         process = processes._started["bridge"]
         process.send_signal(signal.SIGSTOP)  # so that it cannot be asked
-        until(lambda: state(process.pid) == "T")
+        wait_for(lambda: state(process.pid) == "T")
     assert process.returncode == -signal.SIGKILL
 
 

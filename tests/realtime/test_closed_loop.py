@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import subprocess
 import sys
 import time
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import faintspot
 from faintspot.ao_loop import Arm, simulate_loop
 from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.errors import InputError
@@ -27,16 +25,12 @@ from faintspot.realtime.private_socket import socket_path
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
 
-from tests.realtime.closed_loop import COMMANDS, CONFIGURATION, PATIENCE_S, Sky, configured, make_engine  # noqa: E402
+from tests.realtime.closed_loop import COMMANDS, CONFIGURATION, PATIENCE_S, Sky, make_engine  # noqa: E402
+from tests.realtime.commands import start  # noqa: E402
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 FRAMES = 60
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
-    return configured(tmp_path_factory.mktemp("bench"))
 
 
 def test_the_loop_is_the_simulated_one(sky: Sky, files: tuple[Path, Control]) -> None:
@@ -223,11 +217,10 @@ def test_a_stream_that_was_left_behind(
     np.testing.assert_array_equal(sky.records["commands"], expected)
 
 
-def start_engine(name: str, path: Path, *options: str) -> subprocess.Popen[bytes]:
+def start_engine(name: str, path: Path, *options: str) -> subprocess.Popen[str]:
     code = "from faintspot.cli.realtime_run import run; run()"
-    environment = {**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])}
-    command = [sys.executable, "-c", code, "--config", str(path), "--name", name, *options]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    null = subprocess.DEVNULL
+    return start(code, "--config", str(path), "--name", name, *options, stdout=null, stderr=null)
 
 
 class Commands:

@@ -477,12 +477,6 @@ def test_a_place_that_cannot_be_is_refused(path: Path, place: str) -> None:
 # The client
 
 
-def test_without_an_engine_the_error_says_how_to_start_one(path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        request(path, "status")
-    assert str(caught.value) == "no engine runs under the name lab; faintspot realtime run starts one"
-
-
 @pytest.mark.parametrize(
     ("reply", "named"),
     [

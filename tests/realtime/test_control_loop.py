@@ -126,7 +126,7 @@ def any_control(data: st.DataObject) -> None:
 
 
 def test_what_is_not_finite_never_reaches_the_mirror() -> None:
-    settings(max_examples=250, deadline=None)(given(st.data())(any_control))()
+    settings(max_examples=100, deadline=None)(given(st.data())(any_control))()
 
 
 def run(loop: ControlLoop, stroke: float, taken: list[Slopes]) -> str:

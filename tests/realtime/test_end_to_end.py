@@ -7,14 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import pytest
-from tests.patience import LIMIT_S
+from tests.patience import LIMIT_S, wait_for
 
 import faintspot as fs
 from faintspot.realtime.pixel_ring import PixelRing
@@ -39,11 +37,6 @@ dark = 100.0
 read_noise_e = 1.0
 """
 COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
-
-
-@pytest.fixture
-def name() -> str:
-    return f"fs_test_{uuid4().hex[:12]}"
 
 
 @pytest.fixture
@@ -84,13 +77,6 @@ def ask(name: str, *arguments: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def wait_for(what: object, condition: object) -> None:
-    end = time.monotonic() + LIMIT_S
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < end, what
-        time.sleep(0.01)
-
-
 def captured(name: str, count: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Frames and slopes of the same number, as another process sees them."""
     stream, ring = pyshmem.open(f"{name}_slopes"), PixelRing.attach(name)
@@ -105,15 +91,15 @@ def captured(name: str, count: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
                 found[number] = frame, np.array(publication.payload)
         return len(found) >= count
 
-    wait_for("slopes", enough)
+    wait_for(enough, "slopes")
     stream.close()
     return found
 
 
 @pytest.mark.portable
 def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path) -> None:
-    wait_for("the engine", lambda: socket_path(name).exists())
-    wait_for("frames", lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10)
+    wait_for(lambda: socket_path(name).exists(), "the engine")
+    wait_for(lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10, "frames")
     pipeline = fs.SlopePipeline.from_file(tmp_path / "faintspot.toml")
     for frame, slopes in captured(name, 30).values():
         assert np.array_equal(slopes, pipeline(frame).vector)
@@ -132,23 +118,3 @@ def test_three_processes(name: str, processes: list[subprocess.Popen[bytes]], tm
     assert engine.wait(LIMIT_S) == 0
     assert "frames measured" in (tmp_path / "run.log").read_text()
     assert not socket_path(name).exists()
-
-
-def test_a_killed_engine_is_replaced(
-    name: str, processes: list[subprocess.Popen[bytes]], tmp_path: Path
-) -> None:
-    """What it leaves in shared memory is recognised and cleaned up; the camera does not notice."""
-    wait_for("the engine", lambda: socket_path(name).exists())
-    wait_for("frames", lambda: json.loads(ask(name, "status", "--json"))["counters"]["processed"] > 10)
-    captured(name, 3)
-    processes[0].kill()
-    processes[0].wait()
-    with (tmp_path / "again.log").open("w") as log:
-        again = subprocess.Popen([*COMMAND, "run", "--name", name], cwd=tmp_path, stdout=log)
-    processes.append(again)
-    wait_for("the new engine", lambda: "waiting for frames" in (tmp_path / "again.log").read_text())
-    pipeline = fs.SlopePipeline.from_file(tmp_path / "faintspot.toml")
-    for frame, slopes in captured(name, 10).values():
-        assert np.array_equal(slopes, pipeline(frame).vector)
-    ask(name, "stop")
-    assert again.wait(LIMIT_S) == 0

@@ -105,12 +105,6 @@ def test_settings_change_between_two_frames(bench: Bench) -> None:
         assert np.array_equal(bench.slopes[number], make(settings)(frame).vector), number
 
 
-def test_an_invalid_change_is_refused_whole(bench: Bench) -> None:
-    with pytest.raises(fs.InputError, match="noise_std = -1"):
-        bench.engine.live.propose({"keep_brightest": 5, "noise_std": -1.0})
-    assert bench.engine.live.settings == SETTINGS
-
-
 @pytest.mark.portable
 def test_source_restarts(bench: Bench) -> None:
     data = simulated(2)
@@ -124,21 +118,6 @@ def test_source_restarts(bench: Bench) -> None:
     for start in (0, 100):
         assert np.array_equal(bench.slopes[start + 1], expected[1])
     assert bench.engine.counters.source_restarts == 2
-
-
-def test_numbers_are_skipped_and_begin_anew(bench: Bench) -> None:
-    data = simulated(3)
-    expected = make(SETTINGS)(data).vector
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 10, data[0])
-        bench.send(ring, 12, data[1])  # 11 never comes
-        bench.send(ring, 0, data[0])
-        bench.send(ring, 1, data[2])
-    assert np.array_equal(bench.slopes[12], expected[1])
-    assert np.array_equal(bench.slopes[1], expected[2])
-    counters = bench.engine.counters
-    assert (counters.processed, counters.skipped, counters.repeated, counters.dropped) == (4, 1, 1, 0)
 
 
 NOTHING_IS_COMPILED_LATER = """

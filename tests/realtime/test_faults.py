@@ -15,8 +15,6 @@ import pytest
 from tests.patience import LIMIT_S
 from tests.realtime.bench import SETTINGS, Bench, make, simulated
 
-import faintspot as fs
-from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 
 pyshmem = pytest.importorskip("pyshmem")
@@ -40,40 +38,29 @@ def test_a_short_frame(bench: Bench) -> None:
     assert np.array_equal(bench.slopes[2], make(SETTINGS)(data[2]).vector)
 
 
-def test_a_frame_number_that_never_changes(bench: Bench) -> None:
-    data = simulated(4)
+@pytest.mark.parametrize(
+    ("numbers", "skipped", "repeated"),
+    [
+        ([7, 7, 7, 7], 0, 3),
+        ([5, 1006], 1000, 0),
+        ([10, 12, 0, 1], 1, 1),
+        ([5, 2**62, 0, 1], 0, 1),
+        ([5, 2**63 - 1, 0, 1], 0, 1),
+    ],
+)
+def test_frame_numbers(bench: Bench, numbers: list[int], skipped: int, repeated: int) -> None:
+    """No frame that came is lost where numbers stay, are left out, begin anew or jump."""
+    data = simulated(len(numbers))
     with bench.ring() as ring:
         bench.attached()
-        for frame in data:
-            bench.send(ring, 7, frame)
+        for number, frame in zip(numbers, data, strict=True):
+            bench.send(ring, number, frame)
     counters = bench.engine.counters
-    assert (counters.processed, counters.repeated, counters.dropped) == (4, 3, 0)
-    expected = make(SETTINGS)(data)
-    assert np.array_equal(bench.records["x"], expected.x)
-
-
-def test_many_numbers_are_left_out(bench: Bench) -> None:
-    data = simulated(2)
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 5, data[0])
-        bench.send(ring, 1006, data[1])
-    counters = bench.engine.counters
-    assert (counters.processed, counters.skipped, counters.dropped, counters.torn) == (2, 1000, 0, 0)
-
-
-@pytest.mark.parametrize("number", [2**62, 2**63 - 1])
-def test_a_frame_number_that_jumps(bench: Bench, number: int) -> None:
-    """Nothing is lost when a camera numbers its frames anew, ahead or from 0."""
-    data = simulated(2)
-    with bench.ring() as ring:
-        bench.attached()
-        for each in (5, number, 0, 1):
-            bench.send(ring, each, data[each % 2])
-    counters = bench.engine.counters
-    assert (counters.processed, counters.skipped, counters.dropped) == (4, 0, 0)
-    assert (counters.source_restarts, counters.repeated) == (1, 1)
-    assert bench.records["frame"].tolist() == [5, number, 0, 1]
+    assert (counters.processed, counters.dropped, counters.torn) == (len(numbers), 0, 0)
+    assert (counters.skipped, counters.repeated) == (skipped, repeated)
+    assert counters.source_restarts == (max(numbers) >= 2**62)
+    assert bench.records["frame"].tolist() == numbers
+    assert np.array_equal(bench.records["x"], make(SETTINGS)(data).x)
 
 
 def test_overtaken_frames_are_dropped_never_mixed(bench: Bench) -> None:
@@ -150,11 +137,6 @@ def test_input_deleted_and_made_anew(bench: Bench) -> None:
     first.close()
     assert bench.engine.counters.source_restarts == 1
     assert np.array_equal(bench.slopes[0], make(SETTINGS)(data[1]).vector)
-
-
-def test_two_writers(bench: Bench) -> None:
-    with bench.ring(), pytest.raises(fs.InputError, match="writes into this pixel ring already"):
-        PixelRing.create(bench.name, (32, 32), np.uint16)
 
 
 def test_a_consumer_that_hangs(bench: Bench) -> None:

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import os
 import struct
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import pytest
-from tests.patience import LIMIT_S
+from tests.patience import LIMIT_S, wait_for
+from tests.realtime.commands import start
 from tests.realtime.image_files import DaoFile, IsioFile
 
-import faintspot
 from faintspot.base.errors import InputError
 from faintspot.realtime.bridge import StreamBridge
 from faintspot.realtime.image_layout import IncompatibleStreamError
@@ -41,22 +37,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # dao's names are paths of up to 79 characters
     return tmp_path
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"fs_test_{uuid4().hex[:12]}"
-    yield chosen
-    (FOLDER / chosen).unlink(missing_ok=True)
-    for part in ("slopes", "commands"):
-        pyshmem.unlink_quiet(f"{chosen}_{part}")
-
-
-def wait_for(condition: Any, what: str = "") -> None:
-    end = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < end, what
-        time.sleep(0.001)
 
 
 def isio(folder: Path, sizes: tuple[int, ...] = (5, 3), dtype: str = "u2", **changes: Any) -> IsioFile:
@@ -368,14 +348,7 @@ def test_command_both_ways(folder: Path, name: str) -> None:
     file = isio(folder)
     slopes = pyshmem.create(f"{name}_slopes", shape=(8,), dtype=np.float32)
     arguments = ["--from", "isio:cam", "--to", "isio:cam_slopes", "--name", name, "--frames", "3"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "faintspot", "realtime", "bridge", *arguments],
-        env={**os.environ, "PYTHONPATH": str(Path(faintspot.__file__).parents[1])},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start("from faintspot.cli.realtime_sources import bridge; bridge()", *arguments)
     try:
         wait_for(lambda: (FOLDER / name).exists() or process.poll() is not None)
         wait_for(lambda: (folder / "cam_slopes.im.shm").exists() or process.poll() is not None)

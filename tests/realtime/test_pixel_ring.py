@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import secrets
 import signal
 import stat
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
@@ -33,13 +31,6 @@ pytestmark = [
 
 SHAPE = (24, 32)
 ROW_NUMBERS = np.arange(SHAPE[0])[:, None]
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"faintspot-test-{secrets.token_hex(6)}"
-    yield chosen
-    (FOLDER / chosen).unlink(missing_ok=True)
 
 
 def content(frame: int) -> np.ndarray:
@@ -296,11 +287,8 @@ def killed_writer(name: str) -> subprocess.Popen[bytes]:
     return process
 
 
-@pytest.mark.parametrize("reaped", [False, True])
-def test_the_ring_of_a_killed_writer_is_replaced(name: str, reaped: bool) -> None:
+def test_the_ring_of_a_killed_writer_is_replaced(name: str) -> None:
     process = killed_writer(name)
-    if reaped:
-        process.wait()
     reader = PixelRing.attach(name)
     with PixelRing.create(name, (8, 8), np.uint16) as ring:
         assert is_stale(reader)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +18,6 @@ pytestmark = [
 ]
 
 SHAPE = (24, 32)
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"faintspot-test-{secrets.token_hex(6)}"
-    yield chosen
-    (FOLDER / chosen).unlink(missing_ok=True)
 
 
 def refused(name: str, *texts: str, create: bool = True) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import os
-import secrets
 import signal
 import threading
 import time
@@ -35,13 +34,6 @@ pytestmark = [
 ]
 
 PATIENCE_S = 60.0
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"faintspot-test-{secrets.token_hex(6)}"
-    yield chosen
-    (FOLDER / f"{chosen}_telemetry").unlink(missing_ok=True)
 
 
 @pytest.fixture

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import secrets
 import signal
 import stat
 import time
-from collections.abc import Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -28,13 +26,6 @@ pytestmark = [
     pytest.mark.portable,
     pytest.mark.skipif(not FOLDER.is_dir(), reason="needs POSIX shared memory as Linux has it"),
 ]
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"faintspot-test-{secrets.token_hex(6)}"
-    yield chosen
-    (FOLDER / f"{chosen}_telemetry").unlink(missing_ok=True)
 
 
 def write_on(name: str, ready: Event, enough: Event) -> None:

@@ -7,7 +7,6 @@ acts when does not depend on how busy the machine is.
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -16,12 +15,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.ao_loop.loop_cases import faint, plain
+from tests.realtime.commands import start
 
 import faintspot
 import faintspot as fs
@@ -31,14 +30,13 @@ from faintspot.ao_loop.engine_files import write_engine_files
 from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime_telescope import telescope_set, telescope_status
-from faintspot.control.reconstructor import make_reconstructor
 from faintspot.pipeline import configuration as configuration_file
 from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
 from faintspot.realtime.private_socket import TELESCOPE, socket_path
 from faintspot.realtime.telescope import TRUTH, SimulatedTelescope, commands_of
-from faintspot.realtime.telescope_orders import ORDERS, Conditions
+from faintspot.realtime.telescope_orders import Conditions
 
 pytest.importorskip("hcipy")
 pyshmem = pytest.importorskip("pyshmem")
@@ -48,15 +46,6 @@ pytestmark = [
 ]
 CONFIGURATION = faint().replace("control", frame_rate_hz=1000.0)  # runs of single frames take no longer
 COMMANDS, PATIENCE_S = 54, 120.0
-
-
-@pytest.fixture
-def name() -> Iterator[str]:
-    chosen = f"fs_test_{uuid4().hex[:12]}"
-    yield chosen
-    (FOLDER / chosen).unlink(missing_ok=True)
-    for stream in ("commands", "truth", "frames"):
-        pyshmem.unlink_quiet(f"{chosen}_{stream}")
 
 
 class Watched:
@@ -276,25 +265,29 @@ def test_magnitude_and_seeing_are_converted() -> None:
         ({"magnitude": -30}, "photons = "),
         ({"magnitude": "bright"}, "magnitude"),
         ({"r0_m": 0}, "r0_m"),
-        ({"r0_m": [0.1, 0.2, 0.3]}, "r0_m: expected one number, or two"),
+        ({"r0_m": [0.1, 0.2, 0.3]}, "r0_m"),
         ({"r0_m": None}, "r0_m"),
         ({"seeing_arcsec": 0}, "seeing_arcsec"),
         ({"wind_factor": -1}, "wind_factor = -1"),
-        ({"photons": 1, "magnitude": 1}, "photons and magnitude: expected one of them"),
-        ({"r0_m": 1, "seeing_arcsec": 1}, "r0_m and seeing_arcsec: expected one of them"),
+        ({"photons": 1, "magnitude": 1}, "photons and magnitude"),
+        ({"r0_m": 1, "seeing_arcsec": 1}, "r0_m and seeing_arcsec"),
         ({"phtons": 1}, "phtons: unknown order; did you mean photons"),
     ],
 )
-def test_bad_orders(watched: Watched, changes: dict[str, Any], text: str) -> None:
-    before = watched.telescope.status()["conditions"]
+def test_bad_orders(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError) as caught:
-        watched.telescope.order({"wind_factor": 3.0, **changes})
+        Conditions.of(CONFIGURATION).ordered(CONFIGURATION, {"wind_factor": 3.0, **changes})
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_bad_order_changes_nothing(watched: Watched) -> None:
+    before = watched.telescope.status()["conditions"]
+    with pytest.raises(InputError):
+        watched.telescope.order({"wind_factor": 3.0, "photons": -1})
     watched.frame()
     watched.frame()
     assert watched.telescope.status()["conditions"] == before
-    assert set(changes) - set(ORDERS) <= {"phtons"}
 
 
 def test_commands_over_the_socket(watched: Watched, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -366,17 +359,7 @@ def test_two_of_one_name_and_nothing_left_behind(watched: Watched, name: str) ->
 def started(name: str, *options: str) -> subprocess.Popen[str]:
     """Start the command; returns when it has published frames."""
     code = "from faintspot.cli.realtime_telescope import run; run()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "canary", "--name", name, "--frame-rate-hz", "100", *options],
-        env={
-            **os.environ,
-            "PYTHONPATH": str(Path(faintspot.__file__).parents[1]),
-            "OPENBLAS_NUM_THREADS": "1",
-        },
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = start(code, "canary", "--name", name, "--frame-rate-hz", "100", *options)
     end = time.monotonic() + PATIENCE_S
     while True:
         try:
@@ -414,31 +397,6 @@ def test_killed_and_restarted_then_ended_in_order(name: str, tmp_path: Path) -> 
 
 
 # ---- a loop
-
-
-def test_the_test_closes_the_loop(name: str, tmp_path: Path) -> None:
-    """An integrator from the files that were written: the Strehl ratio rises as in the simulation.
-
-    At 200 photons and 1 e- an integrator reaches 0.5 to 0.75 there (250 frames/s); the slopes are not divided
-    by their centroid gain here and the air stands nearly still at 1000 frames/s: above 0.4 is closed.
-    """
-    path = write_engine_files(CONFIGURATION, tmp_path)
-    known = configuration_file.load_all(path)
-    reference = np.load(tmp_path / "reference_slopes.npy")
-    matrix = make_reconstructor(np.load(tmp_path / "interaction_matrix.npy")).matrix
-    pipeline = fs.SlopePipeline(known.layout, known.settings, known.calibration, reference)
-    watched = Watched(name)
-    commands = pyshmem.create(f"{name}_commands", shape=(COMMANDS,), dtype=np.float32)
-    sent, strehl = np.zeros(COMMANDS), []
-    for number in range(60):
-        frame = watched.frame()
-        strehl.append(watched.truth["strehl"])
-        sent = 0.99 * sent - 0.4 * matrix @ pipeline(frame).vector
-        commands.write(sent, frame_id=number)
-    assert max(strehl[:3]) < 0.2
-    assert np.mean(strehl[30:]) > 0.4
-    commands.unlink()
-    watched.close()
 
 
 def test_files_keep_what_else_there_is(tmp_path: Path) -> None:
