@@ -13,7 +13,7 @@ class SubapertureFlag(IntFlag):
     TOO_MANY_BAD_PIXELS = 2
     """Too many bad pixels for the settings; the slope is 0 (the reference position).
 
-    Other flags are not set then.
+    Of the other flags, only SATURATED may be set then.
     """
     UNLIKE_NEIGHBOURS = 4
     """The slope differs from those of all neighbours, as if the spot were wrongly identified.

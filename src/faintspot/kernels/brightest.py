@@ -85,7 +85,7 @@ def _middle(lanes: Any, low: Any, high: Any) -> Any:
 
 @inlined
 def _pivot(lanes: Any, mean: Any, low: Any, high: Any, wanted: Any) -> Any:
-    """A number in a bracket, with about the wanted fraction of the bracket's pixels above it.
+    """Return a pivot in a bracket, with about the wanted fraction of the bracket's pixels above it.
 
     The mean parts them in halves. How far to go from it follows from the most variance that a distribution of
     this range and mean can have: saves a quarter of the passes.

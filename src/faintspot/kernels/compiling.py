@@ -64,7 +64,7 @@ def allocating(function: Callable[..., Any]) -> Any:
 
 
 def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
-    """Compile now, for arguments of these types alone; return what calls it, in 0.1 us and without any check.
+    """Compile now for the given argument types; return a function that calls it in 0.1 us without checks.
 
     It keeps the GIL: given up for a moment, it may come back to a real-time thread milliseconds later.
     """
@@ -74,12 +74,12 @@ def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
 
 
 def _kernel(function: Callable[..., Any], sources: tuple[Path, ...] = (), **options: Any) -> Any:
-    """Return a function's kernel; `sources` are files besides the kernels' own that its code depends on."""
+    """Return the kernel of a function; `sources` are files other than the kernels' own that its code depends on."""
     return function if config.DISABLE_JIT else _Kernel(function, sources, options)
 
 
 class _Kernel(CPUDispatcher):
-    """A function as kernels call it; called from Python, it is compiled once more, as a whole, and kept."""
+    """Function that kernels call; for calls from Python it is compiled again as a whole, and cached."""
 
     def __init__(
         self, function: Callable[..., Any], sources: tuple[Path, ...], options: dict[str, Any]
@@ -92,7 +92,7 @@ class _Kernel(CPUDispatcher):
 
     @cached_property
     def whole(self) -> Any:
-        """The same, to be called from Python: with machine code, on disk."""
+        """Compiled function for calls from Python, with its machine code cached on disk."""
         dispatcher: Any = njit(**self._options)(self.py_func)
         stamps = tuple(_stamp(path) for path in self._sources)
         dispatcher._cache = kernel_cache(self.py_func, _kernels_stamp() + stamps)

@@ -76,7 +76,7 @@ def _median(values: Any, largest: Any) -> Any:
 
 @compiled
 def _least_difference(f: Any, s: Any, x: Any, y: Any, flags: Any, neighbours: Any) -> Any:
-    """Distance of a slope from the neighbour's that it is most like; -1 with too few valid neighbours."""
+    """Return the distance of a slope from its most similar neighbour; -1 with too few valid neighbours."""
     square, count = np.float32(math.inf), 0
     for k in range(neighbours.shape[1]):
         other = neighbours[s, k]

@@ -175,7 +175,7 @@ def _flag_lane(
     s = min(first + lane, settings.shape[1] - 1)
     counts, centroid = own.counts, own.centroid
     bits = scratch.flags[lane]
-    if not bits & TOO_MANY_BAD_PIXELS:  # no other flag is set then
+    if not bits & TOO_MANY_BAD_PIXELS:  # else no further flags are added
         if counts[total_variation.INFEASIBLE * width + lane]:
             bits |= INFEASIBLE_STRENGTH
         if not counts[total_variation.CONVERGED * width + lane] and settings[TOLERANCE, s] > 0.0:

@@ -143,7 +143,7 @@ def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Sc
 
 @compiled
 def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
-    """Gather and calibrate the W sub-apertures of a group; numbers of bad, saturated pixels in `results`."""
+    """Gather and calibrate the W sub-apertures of a group; counts of bad and saturated pixels in `results`."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
     n, line = source.corners.shape[0], source.frames.shape[2]
@@ -157,7 +157,7 @@ def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
 
 @compiled
 def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) -> None:
-    """Gather and calibrate a group, fill bad pixels and flag what there is to flag."""
+    """Gather and calibrate a group, fill bad pixels and set the flags of bad and saturated pixels."""
     width, ny, nx = width_of(source.lanes), source.ny, source.nx
     gather_group(source, f, first, scratch)
     for lane in range(width):
@@ -172,7 +172,7 @@ def prepare_group(source: Any, f: Any, first: Any, settings: Any, scratch: Any) 
 
 @compiled
 def store_stage(width: Any, image: Any, stage: Any, first: Any) -> None:
-    """Copy a group's images to where `explain` collects them."""
+    """Copy the images of a group into the stages of `explain`."""
     for lane in range(min(width, stage.shape[0] - first)):
         scatter_image(width, image, lane, stage, first + lane)
 
@@ -225,7 +225,7 @@ def _store_group(width: Any, n: Any, group: Any, scratch: Any, slopes: Any) -> N
 
 
 def locate(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
-    """Stand for an estimator's own kernel, which `driver_of` puts in its place.
+    """Placeholder for an estimator's own kernel, which `driver_of` inserts.
 
     It reads `scratch.image` and writes `scratch.results`, `scratch.iterations` and bits of `scratch.flags`;
     where `stages` has rows, it may overwrite what the images are after its steps.
@@ -269,7 +269,7 @@ def measure_groups(
 
 @cache
 def driver_of(kernel: Any) -> Any:
-    """Return `measure_groups` with an estimator's own kernel in the place of `locate`, compiled.
+    """Return `measure_groups`, compiled with an estimator's own kernel in place of `locate`.
 
     A copy with globals and a name of its own: Numba's disk cache finds it again in a new process, which it
     does not for a closure or for a kernel that is passed as an argument.

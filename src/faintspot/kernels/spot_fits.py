@@ -441,7 +441,7 @@ def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
         error_x = lane_values[spot_rows.ERROR_X * width + lane]
         error_y = lane_values[spot_rows.ERROR_Y * width + lane]
         flux = lane_values[spot_rows.FLUX * width + lane]
-        if not bits & TOO_MANY_BAD_PIXELS:  # no other flag is set then
+        if not bits & TOO_MANY_BAD_PIXELS:  # else no further flags are added
             expected = settings[FLUX, s] if expects_flux else np.float32(-1.0)
             illuminated = _is_illuminated(width, lane, expected, lane_values)
             if not (error_x + error_y < math.inf and illuminated and abs(flux) < math.inf):
