@@ -74,7 +74,7 @@ def at_once(function: Callable[..., Any], *kinds: Any) -> Any:
 
 
 def _kernel(function: Callable[..., Any], sources: tuple[Path, ...] = (), **options: Any) -> Any:
-    """Return the kernel of a function; `sources` are files other than the kernels' own that its code depends on."""
+    """Return the kernel of a function; `sources` are other files that its code depends on."""
     return function if config.DISABLE_JIT else _Kernel(function, sources, options)
 
 

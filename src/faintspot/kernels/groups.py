@@ -143,7 +143,7 @@ def new_scratch(lanes: Lanes, ny: int, nx: int, own: tuple[Any, ...] = ()) -> Sc
 
 @compiled
 def gather_group(source: Any, f: Any, first: Any, scratch: Any) -> None:
-    """Gather and calibrate the W sub-apertures of a group; counts of bad and saturated pixels in `results`."""
+    """Gather and calibrate the W sub-apertures of a group; write counts of bad and saturated pixels."""
     lanes, ny, nx = source.lanes, source.ny, source.nx
     width = width_of(lanes)
     n, line = source.corners.shape[0], source.frames.shape[2]

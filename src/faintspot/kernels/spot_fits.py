@@ -239,7 +239,7 @@ def _round(group: Any, round_electrons: Any, image: Any) -> None:
 
 @compiled
 def _begin(group: Any, scratch: Any) -> None:
-    """Copy what the lanes' sub-apertures are set to; the position is the predicted one at first."""
+    """Copy the settings of the lanes' sub-apertures; the initial position is the predicted one."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
     lane_values = own.lane_values
     for lane in range(width):
@@ -272,7 +272,7 @@ def _begin(group: Any, scratch: Any) -> None:
 
 @compiled
 def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
-    """Begin at the smoothed image's peak."""
+    """Start from the peak of the smoothed image."""
     lanes, own = group.lanes, scratch.own
     gather_taps(width_of(lanes), group.first, taps, own.taps)
     reach = taps.shape[2] - 1
@@ -281,7 +281,7 @@ def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
 
 @compiled
 def _fit(group: Any, tables: Any, scratch: Any) -> None:
-    """Fit from where the lanes are; the floor on the weights is a fraction of the flux found so far."""
+    """Fit from the current positions; the floor of the weights is a fraction of the flux found so far."""
     width, first, settings, own = width_of(group.lanes), group.first, group.settings, scratch.own
     lane_values = own.lane_values
     for lane in range(width):
@@ -309,7 +309,7 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
 
 @compiled
 def _expect_flux(group: Any, lane_values: Any) -> None:
-    """Take the flux that is expected for the flux."""
+    """Use the expected flux as the flux."""
     width, first, settings = width_of(group.lanes), group.first, group.settings
     for lane in range(width):
         s = min(first + lane, settings.shape[1] - 1)
@@ -410,7 +410,7 @@ def _keep_broad_posteriors(width: Any, lane_values: Any) -> None:
 
 @compiled
 def _is_illuminated(width: Any, lane: Any, expected: Any, lane_values: Any) -> Any:
-    """Whether there is a spot: where its flux is expected, not surely much less; else a significant one."""
+    """Return whether there is a spot: its expected flux is not clearly missing, or it is significant."""
     seen = lane_values[spot_rows.SEEN * width + lane]
     error = lane_values[spot_rows.SEEN_ERROR * width + lane]
     if expected >= 0.0:
@@ -420,7 +420,7 @@ def _is_illuminated(width: Any, lane: Any, expected: Any, lane_values: Any) -> A
 
 @compiled
 def _is_moving(width: Any, lane: Any, error: Any, lane_values: Any) -> Any:
-    """Whether further steps would move a lane by several standard errors, were they a geometric series."""
+    """Return whether further steps, as a geometric series, would move a lane by several standard errors."""
     move = lane_values[spot_rows.MOVE * width + lane]
     before = lane_values[spot_rows.MOVE_BEFORE * width + lane]
     return move > error and move * move > _MOVING * error * (before - move)
@@ -428,7 +428,7 @@ def _is_moving(width: Any, lane: Any, error: Any, lane_values: Any) -> Any:
 
 @compiled
 def _finish(group: Any, steps: Any, expects_flux: Any, scratch: Any) -> None:
-    """Write the lanes' results, and the bits of their flags."""
+    """Write the results and the flags of the lanes."""
     width, settings, lane_values, found = (
         width_of(group.lanes),
         group.settings,
