@@ -1,4 +1,4 @@
-"""What experiments compare: an estimator with its settings, and what a loop does with its slopes."""
+"""Methods that experiments compare: an estimator with settings, knowledge and control."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRIOR = "prior_std_px"
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A way to measure slopes, what it knows, and what a loop does with them: what experiments compare.
+    """Method that experiments compare: estimator, settings, prior knowledge and control.
 
     Parameters
     ----------

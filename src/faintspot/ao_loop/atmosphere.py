@@ -37,7 +37,7 @@ class MovingLayers:
     velocity: NDArray[np.float64]
     """Points per second that each layer moves, (layers, 2): along rows, along columns."""
     start: NDArray[np.float64]
-    """Where the pupil's first point is in each screen at time 0."""
+    """Position of the pupil's first point in each screen at time 0."""
     points: int
     """Points across the pupil."""
     r0_range_m: tuple[float, float]
@@ -60,7 +60,7 @@ class MovingLayers:
         return total
 
     def blown(self, velocity: NDArray[np.float64], time_s: float) -> MovingLayers:
-        """Return the same air with another wind (as `velocity`), which has the same wavefront at one time."""
+        """Return the same turbulence with another wind (as `velocity`) and the same wavefront at one time."""
         start = self.start + (velocity - self.velocity) * time_s
         return replace(self, velocity=velocity, start=start % len(self.screens[0]))
 

@@ -17,7 +17,7 @@ class Exposing(Protocol):
     """A camera."""
 
     def expose(self, mean_e: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.generic]:
-        """Return a frame of so high flux in each pixel."""
+        """Return a frame with this flux in each pixel."""
 
 
 @dataclass(frozen=True, eq=False)

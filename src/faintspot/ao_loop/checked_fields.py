@@ -16,7 +16,7 @@ NUMBER_OR_LIST = "a number or a list of numbers"
 
 @dataclass(frozen=True)
 class _Permitted:
-    """What a field may hold."""
+    """Allowed values of a field."""
 
     low: float
     high: float

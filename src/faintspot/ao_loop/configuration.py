@@ -1,4 +1,4 @@
-"""What a closed-loop experiment simulates: telescope, sensor, mirror, air, camera and control (TOML)."""
+"""Configuration of a simulated closed loop: telescope, sensor, mirror, atmosphere, camera, control (TOML)."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class ControlParameters:
     largest_condition: float = number(30.0, 1.0, 1e6)
     """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
     telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
-    """Closed loop with an integrator that other kinds of control learn from, on air that is not scored."""
+    """Closed loop with an integrator, in turbulence that is not scored, from which other control learns."""
     winds: str = LEARNT
     """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
     assumed_wind_factor: float = number(1.0, 0.0, 100.0)
@@ -137,14 +137,14 @@ class ControlParameters:
 
 @dataclass(frozen=True)
 class Science:
-    """Where the Strehl ratio is measured, on axis."""
+    """Wavelength and field of the Strehl ratio, on axis."""
 
     wavelength_m: float = number(1.65e-6, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
 class RunLength:
-    """How long and how often."""
+    """Length and number of runs."""
 
     frames: int = number(1500, 1, 10_000_000, whole=True)
     settle_frames: int = number(100, 0, 10_000_000, whole=True)
@@ -254,7 +254,7 @@ class LoopConfiguration:
 
     @property
     def scene(self) -> Scene:
-        """What the estimators are told when their options are chosen."""
+        """Knowledge that estimators have when their options are chosen."""
         camera, elongation = self.camera, self.sensor.spot_elongation
         return Scene(
             flux_e=self.photons,

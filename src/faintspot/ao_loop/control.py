@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Simulate = Callable[..., LoopRecord]
 
 FIRST_TELEMETRY_REALISATION = 2000
-"""The realisation of the air that control learns from; never scored, nor tuned on."""
+"""Realisation of the turbulence that control learns from; never scored, nor tuned on."""
 
 _TELEMETRY_PRIOR_PX = 0.6  # while telemetry is taken, as nothing is known yet
 _SETTLE_FRAMES = 50
@@ -168,7 +168,7 @@ def _learnt(
 def _telemetry(
     configuration: LoopConfiguration, known: _Known, seed: int, simulate: Simulate
 ) -> OpenLoopTelemetry:
-    """Run the loop with an integrator on air that is never scored."""
+    """Run the loop with an integrator in turbulence that is never scored."""
     frames = configuration.control.telemetry_frames
     run = configuration.replace("run", frames=frames, settle_frames=0)
     record = simulate(run, [known.arm], seed=seed, realisation=FIRST_TELEMETRY_REALISATION)

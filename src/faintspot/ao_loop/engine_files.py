@@ -1,4 +1,4 @@
-"""What a real-time engine needs to know of a simulated telescope, as files."""
+"""Files with which a real-time engine controls a simulated telescope."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class Stored:
     """
 
     WHAT: ClassVar[str]
-    """What messages call it."""
+    """Name in messages."""
     FORMAT: ClassVar[int] = 1
 
     def save(self, path: str | Path) -> None:

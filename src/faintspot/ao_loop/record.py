@@ -1,4 +1,4 @@
-"""What a closed-loop run leaves: the telemetry, and the truth that a simulation knows."""
+"""Record of a closed-loop run: telemetry, and the truth that a simulation knows."""
 
 from __future__ import annotations
 

@@ -37,21 +37,21 @@ _MOST_ARMS = 127
 
 @dataclass(frozen=True)
 class DisabledErrors:
-    """What a run leaves out of what spoils the Strehl ratio, for error budgets; by default nothing."""
+    """Error sources that a run switches off, for error budgets; none by default."""
 
     noiseless: bool = False
     """Every pixel holds its mean flux."""
     true_slopes: bool = False
-    """Slopes are the wavefront's mean gradients, of every arm."""
+    """Whether slopes are the true mean gradients of the wavefront, for every method."""
     correctable: bool = False
-    """The air is only what the mirror can make."""
+    """Whether the turbulence is limited to what the mirror can correct."""
     faster: float = 1.0
-    """How many times as often frames are taken, as high flux in each, in stretches over the same time."""
+    """Factor on the frame rate, with the same flux in each frame and the same duration."""
     exact_gain: bool = False
-    """Slopes are divided by the centroid gain that they had in a first run, of one arm."""
+    """Whether slopes are divided by the centroid gain of a first run, for one method."""
 
     stretch_frames: ClassVar[int] = 100
-    """Of a faster loop, which sees as much of the air, but not all of it."""
+    """Frames in each stretch of a faster loop."""
     stretch_settle_frames: ClassVar[int] = 40
 
     def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
@@ -63,7 +63,7 @@ class DisabledErrors:
         return configuration.replace("camera", **camera).replace("control", frame_rate_hz=rate)
 
     def arm(self, arm: Arm) -> Arm:
-        """Return an arm as it is in such a run."""
+        """Return the method as used in such a run."""
         return replace(arm, true_slopes=arm.true_slopes or self.true_slopes)
 
     def time_s(self, frame: int, frame_rate_hz: float) -> float:

@@ -1,4 +1,4 @@
-"""What recorded telemetry of a loop, simulated or real, says about the air."""
+"""Estimate the turbulence from recorded telemetry of a simulated or real loop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FEWEST_FRAMES = 20
 
 @dataclass(frozen=True, eq=False)
 class TelemetryAnalysis:
-    """What recorded telemetry of a loop says about the air."""
+    """Turbulence estimated from recorded telemetry of a loop."""
 
     slopes_px: Floats
     """(frames, 2 n): slopes of the air alone."""

@@ -23,7 +23,7 @@ class PupilAmplitude:
     amplitude: NDArray[np.float32]
     """Part of each point's area that is in the pupil."""
     width_m: float
-    """Of all points together."""
+    """Side of the square that the points tile."""
 
     @property
     def points(self) -> int:

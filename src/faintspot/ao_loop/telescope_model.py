@@ -1,4 +1,4 @@
-"""What is observed, one frame at a time: from time and commands to the wavefront, its truth, and pixels."""
+"""Telescope, one frame at a time: from time and commands to wavefront, truth and pixels."""
 
 from __future__ import annotations
 
@@ -47,18 +47,18 @@ class LoopOptics:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What nobody at a telescope knows of a frame."""
+    """True values of a frame, which only a simulation knows."""
 
     field: NDArray[np.complex64]
     """Complex amplitude in the pupil at the science wavelength, (points, points)."""
     strehl: float
     rms_nm: float
-    """Of the wavefront after the mirror, over the pupil, without piston."""
+    """Rms of the wavefront after the mirror, over the pupil, without piston."""
     r0_m: float
 
 
 class TelescopeModel:
-    """A star seen through air, telescope, mirror and sensor by the sensor's camera.
+    """A star seen through atmosphere, telescope, mirror and sensor by the sensor's camera.
 
     Air and noise depend on seed, realisation and frame alone.
 
@@ -144,7 +144,7 @@ def prepare(configuration: LoopConfiguration) -> LoopOptics:
 
 
 def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
-    """Return the configuration without what air and wavefronts do not depend on, so that they can be kept."""
+    """Return the configuration without values that do not affect the wavefronts, so that these are kept."""
     control = ControlParameters(**{name: getattr(configuration.control, name) for name in _OF_AIR})
     camera = Camera(photons_per_subaperture=1.0)
     return replace(configuration, name="-", camera=camera, control=control, run=RunLength())
@@ -152,7 +152,7 @@ def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
 
 @lru_cache(maxsize=2)
 def atmosphere_of(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
-    """Return the air of a configuration `without_flux`; the last ones made are kept."""
+    """Return the atmosphere of a configuration `without_flux`; the last ones made are kept."""
     return make_atmosphere(configuration, seed, realisation)
 
 

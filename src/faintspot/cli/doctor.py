@@ -14,7 +14,7 @@ from faintspot.cli.examination import examine
 @click.command(short_help="Say what is installed, what this machine allows, and what to do.")
 @option("--json", "as_json", is_flag=True, help="As JSON: name, value and advice of each finding.")
 def command(as_json: bool) -> None:
-    """Say what is installed, what this machine allows, and what to do about what is missing.
+    """Check the installation and this machine, and say how to add what is missing.
 
     Versions, extras, processor and vector width, folder of compiled kernels, threads, GPU, shared memory and
     real-time permissions. Nothing of it is an error: most of faintspot needs no extra, GPU or permission. Put

@@ -1,4 +1,4 @@
-"""Asking a running engine for what may take long, and saying so."""
+"""Requests to a running engine that may take long."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
 from faintspot.realtime.private_socket import socket_path
 
 PATIENCE_S = 2.0
-"""Before the reason for waiting is said."""
+"""Delay before the reason for waiting is printed."""
 
 
 def asked_at_length(name: str, command: str, **fields: Any) -> dict[str, Any]:

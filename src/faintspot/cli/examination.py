@@ -1,4 +1,4 @@
-"""What faintspot finds on a machine, and what to do about what is missing: for reports of faults."""
+"""Examination of an installation and its machine, with advice, for bug reports."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Finding:
     name: str
     """What."""
     value: str
-    """What was found, in one line."""
+    """Finding, in one line."""
     advice: str | None = None
-    """What to do about it, in one line; None where nothing is missing."""
+    """Advice, in one line; None where nothing is missing."""
 
 
 def examine() -> list[Finding]:
@@ -91,7 +91,7 @@ def _extra(name: str) -> Finding:
 
 
 def _processor() -> Finding:
-    """What is compiled for."""
+    """Processor that kernels are compiled for."""
     from llvmlite import binding
 
     from faintspot.kernels.host import lanes_for
@@ -113,7 +113,7 @@ def _processor() -> Finding:
 
 
 def _cache() -> Finding:
-    """Where compiled kernels are kept."""
+    """Folder of compiled kernels."""
     from faintspot.kernels.cached import cache_folder
 
     folder, advice = cache_folder(), "set NUMBA_CACHE_DIR to a folder that can be written"

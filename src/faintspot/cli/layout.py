@@ -278,7 +278,7 @@ def _found(description: str, mean: NDArray[np.float64], options: dict[str, Any])
 
 
 def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, unit: str) -> list[str]:
-    """Say how noisy and bright the spots are, and what is done about it."""
+    """Describe noise and flux of the spots, and the settings."""
     estimator, reach = settings.estimator, settings.search_range_px
     within = "" if reach is None else f", slopes within {np.max(reach):g} px"
     lines = [
@@ -294,7 +294,7 @@ def _describe_settings(settings: Settings, layout: Layout, seen: FirstSettings, 
 
 
 def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
-    """Say in a few lines what was found, and what was left out."""
+    """Describe the lenslets that were found and those left out."""
     rows, columns = np.ptp(layout.cells, axis=0) + 1
     height, width = layout.window
     lines = [
@@ -320,7 +320,7 @@ def _describe(output: str, found: FoundLayout, layout: Layout) -> list[str]:
 
 
 def _doubtful_spots(found: FoundLayout) -> list[str]:
-    """Say which spots are outside all windows, far from their lattice, or doubtful."""
+    """Describe spots outside all windows, far from their lattice, or doubtful."""
     lines = []
     if (count := len(found.outside)) > 0:
         size = np.array(found.layout.frame_shape[::-1])
@@ -348,7 +348,7 @@ def _doubtful_spots(found: FoundLayout) -> list[str]:
 
 
 def _sides(found: FoundLayout) -> str:
-    """Say at which sides of the frame lenslets were left out, such as '7 left, 8 below'."""
+    """Count the lenslets left out at each side of the frame, such as '7 at small x'."""
     height, width = found.layout.frame_shape
     x, y = found.cut.T
     distances = np.stack([x, width - 1 - x, y, height - 1 - y])

@@ -40,7 +40,7 @@ def is_quad_cell(layout: Layout) -> bool:
 
 
 def describe(output: str, found: KnownGrid, layout: Layout, calibration: Calibration) -> list[str]:
-    """Say in a few lines which sub-apertures are illuminated."""
+    """Describe which sub-apertures are illuminated."""
     height, width = layout.window
     lines = [
         f"{output}: {len(layout)} sub-apertures illuminated of {len(found.layout) + len(found.unlit)}, "

@@ -1,4 +1,4 @@
-"""What the options of `faintspot layout` say: numbers, ranges of numbers, and maps of the camera."""
+"""Parse the options of `faintspot layout`: numbers, ranges of numbers, and maps of the camera."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def flat_field(text: str) -> NDArray[np.float64]:
 
 
 def plain(value: Any) -> str:
-    """Return a number with three digits, never as 6.7e+02; what is not one number as it is."""
+    """Format a number to three digits, never as 6.7e+02; return other values unchanged."""
     if not isinstance(value, float | int):
         return str(value)
     return np.format_float_positional(float(f"{value:.3g}"), trim="-")

@@ -52,9 +52,9 @@ _NICENESS = 5  # the engine comes first
 def command(recording: Path | None, name: str, bind: str, port: int, private: bool, folder: Path) -> None:
     """Serve a web page of the running engine NAME until Ctrl-C.
 
-    It shows frames, slopes, flux, validity, latencies and arms in turn, as they are. Whoever has the address
-    that is printed may change settings; without its end, from # on, a browser on this machine may watch. It
-    reads the engine's telemetry as a recorder does: the engine waits for nobody.
+    The page shows frames, slopes, flux, validity, latencies and alternating methods. The printed address
+    allows settings to be changed; without its part from # on, a browser on this machine may only watch. The
+    page reads telemetry as a recorder does, so the engine never waits for it.
 
     \b
     Examples:

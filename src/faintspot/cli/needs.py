@@ -1,4 +1,4 @@
-"""What commands need beyond faintspot's own dependencies, or Linux: asked before their work begins."""
+"""Requirements of commands: optional packages or Linux, checked before work begins."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def needs_linux(command: click.Command) -> click.Command:
 
 
 def _check_first(command: click.Command, check: Callable[[str], None]) -> None:
-    """Have a command check something, which is told what the command is called, before its work."""
+    """Run a check, given the command's path, before a command's work."""
     work = command.callback
     assert work is not None
 

@@ -123,7 +123,7 @@ def _known_commands(former: Any, name: str) -> int:
 
 
 def _in_words(found: Any) -> list[str]:
-    """Say what was found."""
+    """Describe the calibration."""
     import numpy as np
 
     slopes, commands = found.interaction.shape

@@ -130,7 +130,7 @@ def _table(name: str) -> Any:
 
 
 def since(frame: int | None) -> str:
-    """Say from which frame on a change is in effect."""
+    """Describe from which frame on a change is in effect."""
     return "taken at the next frame" if frame is None else f"in effect from frame {frame}"
 
 
@@ -144,7 +144,7 @@ def _preparing(change: dict[str, Any]) -> str:
 
 
 def loop_in_words(loop: dict[str, Any]) -> str:
-    """Say what state a loop is in."""
+    """Describe the state of a loop."""
     if loop["state"] == "none":
         return "no loop: the engine makes no commands"
     gain = "" if loop["gain"] is None else f", gain {loop['gain']:g}"
@@ -157,7 +157,7 @@ def loop_in_words(loop: dict[str, Any]) -> str:
 
 
 def summary(reply: dict[str, Any]) -> str:
-    """Say in a few lines how an engine is doing."""
+    """Summarise the counters and latencies of an engine."""
     counters, latency = reply["counters"], reply["latency"]
     lost = counters["dropped"] + counters["skipped"]
     lines = f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"

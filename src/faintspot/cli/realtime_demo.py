@@ -95,7 +95,7 @@ def _check_extras() -> None:
 
 
 def in_words(shown: Shown) -> list[str]:
-    """Say what has happened, besides the table."""
+    """Describe the run, besides the table."""
     status = shown.status
     if status is None:
         return ["ended before there was a loop"]

@@ -92,7 +92,7 @@ def _export(store: Path, out: Path, ao_mode: str) -> None:
 
 
 def _summary(report: RecordingReport) -> str:
-    """Say in a line or two what was recorded and what was lost."""
+    """Describe what was recorded and what was lost."""
     ended = {
         "frames": "all that were asked for",
         "seconds": "time is over",

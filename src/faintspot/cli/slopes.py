@@ -141,7 +141,7 @@ def _check_format(output: str) -> None:
 
 
 def describe(summary: Summary, output: str) -> list[str]:
-    """Say in a few lines what the run found and what to do next."""
+    """Summarise the run and suggest the next command."""
     if summary.resumed_at == summary.n_frames:
         return [
             f"{output}: complete already ({_count(summary.n_frames, 'frame')}); --overwrite makes it anew",
@@ -184,5 +184,5 @@ def _count(number: int, noun: str) -> str:
 
 
 def _next_step(output: str) -> list[str]:
-    """What to type next; a .csv does not hold what a report needs."""
+    """Return the next command; a .csv does not hold what a report needs."""
     return [] if Path(output).suffix.lower() == ".csv" else [f"Next: faintspot report {shlex.quote(output)}"]

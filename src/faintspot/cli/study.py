@@ -33,8 +33,8 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         option(
             "--scheduler",
             metavar="ADDRESS",
-            help="Running Dask scheduler to use instead: tls://HOST:PORT. Whoever reaches it can run code as "
-            "you: see docs/study.md.",
+            help="Running Dask scheduler to use instead: tls://HOST:PORT. Anyone who can reach it can run "
+            "code as you: see docs/study.md.",
         ),
     ):
         command = each(command)

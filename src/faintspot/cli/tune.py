@@ -253,7 +253,7 @@ def _question(
 
 
 def _where(text: str) -> str:
-    """Say how to give the value that an error begins with."""
+    """Return how to give the value that an error begins with."""
     name = text.replace("=", ":").partition(":")[0].strip()
     for table, keys in TABLES.items():
         if name in keys:

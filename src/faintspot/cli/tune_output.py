@@ -1,4 +1,4 @@
-"""What both kinds of `faintspot tune` print and write alike."""
+"""Output that `faintspot tune` and `faintspot loop tune` share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a controller is."""
+"""Interface of controllers."""
 
 from __future__ import annotations
 

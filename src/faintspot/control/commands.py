@@ -1,4 +1,4 @@
-"""What the mirror holds, and what is on its way to it."""
+"""Commands that the mirror holds, and those that are delayed."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class CommandDelayLine:
         self.rows = np.zeros((delay_frames + 1, commands))
         """All of them."""
         self.place = 0
-        """Of which row the next command goes to; the oldest of the others acts."""
+        """Row for the next command; the oldest of the others acts."""
         self._rows = list(self.rows)
 
     @property
     def acting(self) -> Floats:
-        """What the mirror holds during this frame."""
+        """Commands that the mirror holds during this frame."""
         return self._rows[(self.place + 1) % len(self._rows)]
 
     @property
@@ -45,7 +45,7 @@ class CommandDelayLine:
 
     @property
     def spare(self) -> Floats:
-        """Where the next command may be written, for `sent`."""
+        """Row in which the next command may be written, for `sent`."""
         return self._rows[self.place]
 
     def put(self, command: Floats) -> None:

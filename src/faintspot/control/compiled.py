@@ -19,7 +19,7 @@ _INVALID = int(INVALID)
 _compiled = partial(compiled_with, source=__file__)
 
 INVALID_PART, MEAN_SQUARE = range(2)
-"""What `true_slopes` says of a frame: part of the sub-apertures that are not valid; of the others, the mean
+"""Summary of a frame from `true_slopes`: fraction of invalid sub-apertures; of the valid ones, the mean
 square of a slope along one axis, px^2."""
 
 

@@ -27,7 +27,7 @@ from faintspot.control.kalman_kernels import (
 Floats = NDArray[np.float64]
 
 STEPS = 4
-"""Of conjugate gradients, for how much each slope corrects."""
+"""Conjugate-gradient iterations used to compute the Kalman gain."""
 _NO_PRIOR = np.zeros(0)
 
 
@@ -114,7 +114,7 @@ class CompiledKalman:
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
         self._is_behind = False
         self._held_at = -1
-        """Where the line was when what acts was turned into slopes."""
+        """Position of the delay line when the acting command was turned into slopes."""
 
     @property
     def chosen(self) -> int:

@@ -33,7 +33,7 @@ INTERACTION, REFERENCE = "interaction_matrix", "reference_slopes"
 MODEL = "model"
 FILES = (INTERACTION, REFERENCE, MODEL)
 NONE, CONTROLLER, STREAM = "none", "controller", "stream"
-"""Where predictions come from."""
+"""Sources of predictions."""
 PRIOR = "prior_std_px"
 _LARGEST_SLOPE_PX = 1e4
 _BEYOND_ALL = 1e30  # of commands without a limit: finite in float32, too
@@ -75,7 +75,7 @@ class ControlOptions(Options):
     centroid_gain: float = _setting(
         1.0,
         "What the estimator shows of a slope of 1 px of the interaction matrix; slopes are divided by it. 1 "
-        "for a matrix that was measured with the same estimator and as high flux.",
+        "for a matrix that was measured with the same estimator at the same flux.",
         low=0.01,
         high=100,
     )
@@ -117,7 +117,7 @@ class ControlOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """What an engine needs to make commands of slopes; checked when it is made.
+    """Controller, matrices and limits with which an engine computes commands; checked on creation.
 
     Parameters
     ----------
@@ -186,13 +186,13 @@ class Control:
 
     @property
     def plant(self) -> Plant:
-        """What controllers know of the loop."""
+        """Loop properties that controllers use."""
         options = self.options
         return Plant(self.interaction, self.reconstructor, options.delay_frames, options.leak)
 
     @property
     def prediction(self) -> str:
-        """Where predictions come from: NONE, CONTROLLER or STREAM."""
+        """Source of predictions: NONE, CONTROLLER or STREAM."""
         usual = CONTROLLER if self.options.controller == KALMAN else NONE
         return self.options.prediction or usual
 

@@ -1,4 +1,4 @@
-"""What open-loop slopes say about wind layers, turbulence, noise and vibrations."""
+"""Estimate wind layers, turbulence, noise and vibrations from open-loop slopes."""
 
 from __future__ import annotations
 

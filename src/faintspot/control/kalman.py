@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 _MOST_DOUBLINGS = 40
 _CONVERGED = 1e-9
 LARGEST_VARIANCE_PX2 = 1e6
-"""Of a slope that was not measured."""
+"""Variance of a slope that was not measured."""
 
 
 class SlopePredictor:

@@ -29,7 +29,7 @@ CHOSEN, FRAMES, _MEAN, _SQUARE = range(4)
 
 
 class Matrices(NamedTuple):
-    """What does not change, each transposed: what a product adds up lies side by side."""
+    """Constant matrices, transposed so that the terms of a sum are adjacent in memory."""
 
     interaction: Any
     """(commands, m)"""
@@ -61,7 +61,7 @@ class Lines(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What goes on from frame to frame, and what is made in between."""
+    """State that persists between frames, and work arrays."""
 
     state: Any
     """(layers, 2, m): as predicted for the coming frame."""

@@ -1,4 +1,4 @@
-"""What a controller has learnt, as numbers that can be kept in a file, and the controller made of them."""
+"""Models of controllers, which can be saved to a file, and the controllers made from them."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _RANGES = {
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """What a controller must know of its loop."""
+    """Loop properties that a controller needs."""
 
     interaction: Floats
     """(m, commands): slopes in px that a unit of each command adds."""
@@ -83,16 +83,16 @@ class Plant:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a kind of control has learnt of its air."""
+    """Model of the turbulence that a controller has learnt."""
 
     kind: str
     arrays: Mapping[str, Floats]
     """modal: gains (modes,). polc: now_px2 and ahead_px2 (m, m), gain. kalman: first, second and driving_px2
     (layers, m, m), variance_px2 (m,) of the slopes' noise."""
     plain_gain: float
-    """Of the integrator that is fallen back to."""
+    """Gain of the fallback integrator."""
     noise_factor: float
-    """What to multiply the variances of standard errors by."""
+    """Factor on the variances of standard errors."""
     left: tuple[float, float]
     """Phase variance that the learnt and the plain one leave in telemetry, noise included."""
     phase: Floats
@@ -205,7 +205,7 @@ class Learnt:
 
     @property
     def noise_factor(self) -> float:
-        """What to multiply the variances of standard errors by."""
+        """Factor on the variances of standard errors."""
         return self.model.noise_factor
 
     @property

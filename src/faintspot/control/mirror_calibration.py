@@ -16,8 +16,8 @@ from faintspot.base.flags import INVALID, SubapertureFlag
 Floats = NDArray[np.float64]
 
 FEWEST_ROUNDS = 4
-"""From whose scatter errors are told."""
-_ANSWERS = 1 / 3  # largest relative error of an actuator that is said to answer
+"""Rounds needed to estimate errors from their scatter."""
+_ANSWERS = 1 / 3  # largest relative error of an actuator that counts as responding
 _HOPELESS_ROUNDS = 8  # after which half of the actuators must have shown something
 _CHECKED = 8  # actuators that are poked by half as much, too
 _NOT_LINEAR = 0.1
@@ -41,7 +41,7 @@ class PokedMirror(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MirrorCalibration:
-    """What pokes have shown."""
+    """Result of a calibration by pokes."""
 
     interaction: Floats
     """(2 n, commands): px for a unit of each command; 0 where an actuator does not answer."""
@@ -55,7 +55,7 @@ class MirrorCalibration:
     relative_error: Floats
     """(commands,): error of each actuator's slopes, as a part of them."""
     linearity: float
-    """How far pokes of half the amplitude move the slopes, as a part of what would be in proportion."""
+    """Response to pokes of half the amplitude, relative to a linear response."""
 
     @property
     def answers(self) -> NDArray[np.bool_]:
@@ -72,8 +72,8 @@ def calibrate_mirror(
 ) -> MirrorCalibration:
     """Poke every actuator up and down, again and again, until the errors are small enough.
 
-    Errors are those of the mean of rounds, from their scatter, whatever it comes from: noise, or air that
-    moves. In every other round down comes first, so that what drifts is averaged out.
+    Errors are those of the mean of all rounds, from their scatter, which includes noise and turbulence. The
+    order of up and down alternates between rounds, so that drifts average out.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class _Pokes:
 
     @property
     def rounds(self) -> int:
-        """How many were made."""
+        """Number of rounds."""
         return len(self._differences)
 
     def round(self) -> None:

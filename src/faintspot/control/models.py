@@ -1,6 +1,6 @@
-"""How open-loop slopes go on from frame to frame: vector autoregressions of second order.
+"""Temporal models of open-loop slopes: vector autoregressions of second order.
 
-The slopes are the sum of those of layers, each of which goes on by itself. What blows with one wind is far
+The slopes are the sum of those of layers, which evolve independently. What blows with one wind is far
 easier to predict than the sum of several; where winds are not known, one layer stands for all.
 """
 

@@ -89,7 +89,7 @@ def check_commands(recording: Recording, control: Control, what: str) -> None:
 def recorded_slopes(
     recording: Recording, control: Control, rows: NDArray[np.int64], predicted: bool, what: str
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return what a closed loop has seen: slopes, errors, what the mirror added, what an integrator expected.
+    """Return slopes, their errors, the mirror's part, and the slopes that an integrator expected.
 
     Parameters
     ----------

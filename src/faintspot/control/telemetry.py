@@ -1,4 +1,4 @@
-"""What a loop has recorded for its control to learn from."""
+"""Telemetry of a loop, from which its controller learns."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Vibration:
     damping: float
     """Damping ratio."""
     rms_px: float
-    """Of the slopes, over all sub-apertures."""
+    """Rms of the slopes, over all sub-apertures."""
     frequency_error_hz: float
     rms_error_px: float
 
@@ -127,7 +127,7 @@ def with_vibrations(
 
 
 class _Lines:
-    """The spectrum of a mode, of which lines are sought."""
+    """The spectrum of a mode, in which lines are searched for."""
 
     def __init__(self, spectrum: Floats, window: Floats, segments: int, rate_hz: float, slopes: int) -> None:
         self._spectrum, self._segments, self._rate_hz, self._slopes = spectrum, segments, rate_hz, slopes

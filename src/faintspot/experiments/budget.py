@@ -48,7 +48,7 @@ TERMS = {
         Term("photon and read noise", "mean flux in every pixel", DisabledErrors(noiseless=True)),
         Term(
             "servo lag",
-            "ten times the frame rate, as high flux in every frame, in stretches over the same time",
+            "ten times the frame rate, with the same flux in every frame and the same duration",
             DisabledErrors(faster=_FASTER),
         ),
         Term(
