@@ -131,9 +131,9 @@ def test_detach() -> None:
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        ({"tag": "pyramid"}, {}, "expected a ShackHartmann of OOPAO's, got StandIn"),
+        ({"tag": "pyramid"}, {}, "expected OOPAO's ShackHartmann, got StandIn"),
         ({"is_geometric": True}, {}, "expected a diffractive sensor"),
-        ({"weighting_map": 0.5}, {}, 'take the estimator "window"'),
+        ({"weighting_map": 0.5}, {}, 'use the estimator "window"'),
         ({"two": True}, {"predict": [None]}, "expected one for each of 2 sources, got 1"),
         ({"dark": True}, {}, "expected flux in the sub-apertures"),
     ],
@@ -158,7 +158,7 @@ def test_images_of_another_size_and_units_of_nothing() -> None:
     with pytest.raises(InputError, match=r"OOPAO's images: expected shape \(9, 10, 10\), got \(9, 8, 8\)"):
         signal(wfs, np.ones((N, 8, 8)))
     with pytest.raises(
-        InputError, match=r"got \(8, 10, 10\); attach faintspot again when the sensor has changed"
+        InputError, match=r"got \(8, 10, 10\); attach faintspot again after changing the sensor"
     ):
         wfs.centroid(images()[1:], 0.0)
     wfs.slopes_units, wfs.initialize_wfs = float("nan"), lambda: None  # type: ignore[method-assign]

@@ -99,7 +99,7 @@ def test_predicted_slopes_come_by_a_stream() -> None:
 def test_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"slopes.faintspot: expected a faintspot.toml"):
         _Measuring({})
-    with pytest.raises(InputError, match="measured first"):
+    with pytest.raises(InputError, match="measure one first"):
         _ = measuring().tool
     message = r"10 px on the frame of 30 x 30, got 3 that leave it, first row 2, column 0; leave them out"
     with pytest.raises(InputError, match=message):
@@ -119,7 +119,7 @@ def test_refused_in_one_line() -> None:
         ),
         (
             {"ref_slopes": np.zeros((4, 2))},
-            r"ref_slopes: expected shape \(6, 3\) .* got \(4, 2\); make it anew",
+            r"ref_slopes: expected shape \(6, 3\) .* got \(4, 2\); remake it",
         ),
         (
             {"ref_slopes": np.full((6, 3), np.nan)},

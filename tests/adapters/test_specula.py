@@ -137,7 +137,7 @@ class TestRealTool:
             self.slopes(self.made(backwards), frame_of(images()))
         with pytest.raises(InputError, match="faintspot: expected a file or tables"):
             type(self.made(subapertures))(subapertures)
-        with pytest.raises(InputError, match="measured first"):
+        with pytest.raises(InputError, match="measure one first"):
             _ = self.made(subapertures).measured
 
     def test_another_system_than_was_calibrated(self, subapertures: Any, specula: Any) -> None:

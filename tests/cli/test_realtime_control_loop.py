@@ -52,7 +52,7 @@ def test_the_loop_by_the_command_line(bench: Bench) -> None:
         bench.attached()
         for number, frame in enumerate(simulated(3)):
             bench.send(ring, number, frame)
-    assert "expected an open loop to make the mirror flat" in said("flat", *name)
+    assert "expected it open to flatten the mirror" in said("flat", *name)
     assert said("open", *name) == "loop open: integrator, gain 0.25; asked to\n"
     assert said("flat", *name) == said("status", *name)
     everything = json.loads(said("status", *name, "--json"))
@@ -66,7 +66,7 @@ def test_an_engine_without_control() -> None:
     bench = Bench(f"fs_test_{uuid4().hex[:12]}")
     with ControlServer(socket_path(bench.name), commands_of(bench.engine)):
         assert said("status", "--name", bench.name) == "no loop: the engine makes no commands\n"
-        assert "its configuration has no [control]" in said("close", "--name", bench.name)
+        assert "add [control] to its configuration" in said("close", "--name", bench.name)
     assert "loop" not in summary(bench.engine.status())
     bench.close()
 

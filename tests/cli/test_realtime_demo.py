@@ -51,7 +51,10 @@ def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
     try:
         assert process.stdout is not None
         lines = [process.stdout.readline() for _ in range(5)]
-        assert lines[4].startswith("the loop is closed; in turn"), (lines, process.communicate(timeout=60))
+        assert lines[4].startswith("the loop is closed; methods compared"), (
+            lines,
+            process.communicate(timeout=60),
+        )
         with urllib.request.urlopen(lines[2], timeout=60) as page:
             assert b"<title>faintspot</title>" in page.read()
         end, begun = time.monotonic() + PATIENCE_S, frames_measured(name)
@@ -127,7 +130,7 @@ def test_refusals(folder: Path, run: Commands, name: str, monkeypatch: pytest.Mo
         assert refused.code == 2
         assert naming in refused.error
     with ControlServer(socket_path(name), {"status": lambda fields: {"counters": {}}}):
-        run.refused("realtime", "demo", "--name", name, naming=("expected one that no engine has",))
+        run.refused("realtime", "demo", "--name", name, naming=("expected an unused name",))
     monkeypatch.setattr("faintspot.cli.realtime_demo.present", lambda package: package == "zarr")
     wanted = (
         "needs pyshmem and tornado and hcipy: install it with pip install 'faintspot[realtime,live,loop]'"

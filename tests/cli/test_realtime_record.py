@@ -73,7 +73,9 @@ def test_record_aot(engine: Engine, tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path) -> None:
     name = engine.ring.name
     assert "ends in .zarr or .fits" in refused(record, str(tmp_path / "night"), "--name", name)
-    assert "is the engine running" in refused(record, str(tmp_path / "night.zarr"), "--name", f"{name}-other")
+    assert "start the engine first" in refused(
+        record, str(tmp_path / "night.zarr"), "--name", f"{name}-other"
+    )
     (tmp_path / "there.fits").touch()
     assert "exists already" in refused(record, str(tmp_path / "there.fits"), "--name", name)
     assert "ends in .fits" in refused(export, str(tmp_path / "a.zarr"), str(tmp_path / "b"))

@@ -59,7 +59,7 @@ BAD_FRAMES: list[tuple[str, Callable[[Path], Any], tuple[str, ...]]] = [
     ("4d.npy", saved(lambda: np.ones((2, 3, 32, 32))), ("(frames, height, width)", "(2, 3, 32, 32)")),
     ("1d.npy", saved(lambda: np.ones(32)), ("(frames, height, width)", "(32,)")),
     ("none.npy", saved(lambda: np.ones((0, 32, 32))), ("at least one frame", "(0, 32, 32)")),
-    ("cut.npz", lambda path: path.write_bytes(b"PK\x03\x04 and no more"), ("whole .npz file",)),
+    ("cut.npz", lambda path: path.write_bytes(b"PK\x03\x04 and no more"), ("valid .npz file",)),
 ]
 
 
@@ -144,7 +144,7 @@ def test_bad_output(folder: Path, run: Commands) -> None:
     run.refused("slopes", "a.npy", "-o", "a.npy/s.npz", naming=("a.npy", "does not exist"))
     run.refused("slopes", "a.npy", "-o", "", naming=("expected a name",))
     run.ok("slopes", "a.npy", "-o", "s.csv")
-    run.refused("slopes", "a.npy", "-o", "s.csv", naming=("s.csv", "exists already", "--overwrite"))
+    run.refused("slopes", "a.npy", "-o", "s.csv", naming=("s.csv", "already exists", "--overwrite"))
 
 
 @pytest.mark.parametrize("output", ["s.zarr", "s.npz", "s.fits"])

@@ -188,5 +188,5 @@ def test_command(run: Commands, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     result = run.ok("export", "darc", "--format", "npy")
     assert "pxlWeight" in result.out
     assert (tmp_path / "darc" / "pxlWeight.npy").exists()
-    run.refused("export", "darc", naming=("darc: exists already",))
+    run.refused("export", "darc", naming=("darc: already exists",))
     assert "WEIGHTS" in run.ok("export", "weights", "-o", "w.fits").out

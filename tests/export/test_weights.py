@@ -90,7 +90,7 @@ def test_given_weights_of_one_centre_of_gravity(tmp_path: Path) -> None:
     [
         (fs.Settings("brightest"), "w.fits", "'brightest': expected 'window'"),
         (fs.Settings("window", spot_fwhm_px=2.0, normalisation="none"), "w.fits", '"none"'),
-        (fs.Settings("window", spot_fwhm_px=2.0), "w.txt", "ends with .fits"),
+        (fs.Settings("window", spot_fwhm_px=2.0), "w.txt", "ending in .fits"),
         (fs.Settings("window", spot_fwhm_px=2.0), "nowhere/w.fits", "does not exist"),
     ],
 )

@@ -187,7 +187,7 @@ class TestHdf5:
             file.create_dataset("external", (2, 4, 4), "u1", external=[("/dev/zero", 0, h5py.h5f.UNLIMITED)])
             file["link"] = h5py.ExternalLink("other.h5", "frames")
         for name in ("virtual", "external"):
-            refused(partial(open_frames, [f"{tmp_path}/a.h5:{name}"]), "they are in others")
+            refused(partial(open_frames, [f"{tmp_path}/a.h5:{name}"]), "stored in other files")
         refused(lambda: open_frames([f"{tmp_path}/a.h5:link"]), "no array 'link'")
 
 

@@ -57,7 +57,7 @@ class TestDamageInAStream:
             path.write_bytes(path.read_bytes()[: 128 + 4 * 96 + 10])
             with pytest.raises(InputError) as error:
                 source.block(0, 11)
-        assert_message(error, "frame 4 ", "ends too early")
+        assert_message(error, "frame 4 ", "end too early")
 
     def test_zip_and_store(self, tmp_path: Path) -> None:
         path = save(tmp_path / "a.deflated.npz", cube())

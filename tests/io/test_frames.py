@@ -252,7 +252,7 @@ class TestRefused:
             "folder": "expected a Zarr store",
             "short.npy": "expected a NumPy array",
             "cut.npy": "truncated",
-            "cut.npy:frames": "without a name",
+            "cut.npy:frames": "one unnamed",
         }
         for name, part in cases.items():
             with refused(name.partition(":")[0], part):

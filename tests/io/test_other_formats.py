@@ -87,7 +87,7 @@ class TestPng:
         with pytest.raises(InputError, match="expected a grey image of 8 or 16 bits, got mode RGB"):
             open_frames([path])
         Image.fromarray(cube(1, 60, 80)[0].astype("u1")).save(path)
-        with pytest.raises(InputError, match="without a name"):
+        with pytest.raises(InputError, match="one unnamed"):
             open_frames([path], key="frames")
         path.write_bytes(path.read_bytes()[:200])
         with pytest.raises(InputError, match=r"a\.png: .*damaged"), open_frames([path]) as source:

@@ -35,7 +35,7 @@ class TestLock:
         with pytest.raises(InputError) as error:
             OutputLock(tmp_path / "a.npz")
         owner = f"process {os.getpid()} on {socket.gethostname()}"
-        assert f"a.npz: is being written by {owner}: wait" in str(error.value)
+        assert f"a.npz: is being written by {owner}; wait" in str(error.value)
         OutputLock(tmp_path / "b.npz").release()
         first.release()
         first.release()

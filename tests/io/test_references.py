@@ -48,7 +48,7 @@ def test_where_nothing_is_valid(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_reference(tmp_path / "a.npz"), expected, rtol=1e-12)
     slopes["valid"][:] = False
     write(tmp_path / "b.npz", slopes)
-    with pytest.raises(InputError, match=r"b\.npz: expected slopes to take as reference, found none"):
+    with pytest.raises(InputError, match=r"b\.npz: expected valid slopes to take as reference, found none"):
         read_reference(tmp_path / "b.npz")
 
 

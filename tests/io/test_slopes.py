@@ -164,11 +164,11 @@ class TestOutputThatExists:
             writer.append(0, part(result(), 0, 8))
         assert_refused(path, "another run", "--overwrite", attributes=other)
         assert_refused(path, "another run", n_frames=51)
-        assert_refused(path, "exists already", resume=False)
+        assert_refused(path, "already exists", resume=False)
         assert writer_for(path, resume=False, overwrite=True).finished() == 0
         write(path, result())
         assert_refused(path, "--overwrite", attributes=other)
-        assert_refused(path, "exists already", "--overwrite", resume=False)
+        assert_refused(path, "already exists", "--overwrite", resume=False)
         assert_stored(path, result())
         changed = {**result(), "x": result()["y"]}
         write(path, changed, overwrite=True)
@@ -178,7 +178,7 @@ class TestOutputThatExists:
     def test_same_run_that_is_complete(self, tmp_path: Path, name: str) -> None:
         write(tmp_path / name, result())
         if name.endswith(".csv"):
-            assert_refused(tmp_path / name, "exists already")
+            assert_refused(tmp_path / name, "already exists")
             return
         with writer_for(tmp_path / name) as writer:
             assert writer.finished() == 50
@@ -240,8 +240,8 @@ class TestOutputThatExists:
         (tmp_path / "a.npz").mkdir()
         (tmp_path / "b.npz").write_text("text")
         for name in ("a.zarr", "b.zarr"):
-            assert_refused(tmp_path / name, "no slopes", overwrite=True)
-        assert_refused(tmp_path / "a.npz", "exists already")
+            assert_refused(tmp_path / name, "expected slopes", overwrite=True)
+        assert_refused(tmp_path / "a.npz", "already exists")
         assert_refused(tmp_path / "b.npz", "expected slopes")
         for name in ("a.zarr", "b.npz", "c.fits"):
             with pytest.raises(InputError):

@@ -181,7 +181,7 @@ def test_aot_without_images_and_what_cannot_be_written(tmp_path: Path) -> None:
     write_aot(tmp_path / "night.fits", telemetry)
     system = aotpy.AOSystem.read_from_file(tmp_path / "night.fits")
     assert system.wavefront_sensors[0].detector.pixel_intensities is None
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="already exists"):
         write_aot(tmp_path / "night.fits", telemetry)
     with pytest.raises(InputError, match="cannot be written"):
         write_aot(tmp_path / "no" / "night.fits", telemetry)

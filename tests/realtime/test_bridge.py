@@ -178,10 +178,10 @@ def test_silence_is_told_once(name: str, running: Running, monkeypatch: pytest.M
     for number in range(2):
         stream.write(frame(number))
         wait_for(lambda number=number: running.counters.stalls == number + 1)
-    running.said("goes on")
+    running.said("resumed")
     time.sleep(0.5)
     assert running.counters.stalls == 2
-    running.said(f"pid {os.getpid()}, which made it, lives")
+    running.said(f"pid {os.getpid()}, which made it, is alive")
     stream.unlink()
 
 
@@ -207,7 +207,7 @@ def test_a_producer_that_dies_while_it_writes(name: str, running: Running) -> No
     wait_for(lambda: ring.last_row_time_ns(0))
     ready.wait()
     producer.join()
-    running.said("which made it, is gone")
+    running.said("which made it, has ended")
     assert ring.progress()[0] == 0
     successor = pyshmem.open(f"{name}_in")
     successor.write(frame(5))

@@ -280,4 +280,4 @@ def test_command_refuses(config: Path, name: str) -> None:
     with PixelRing.create(name, (4, 4), np.float32):
         result = CliRunner().invoke(camera, options)
         assert isinstance(result.exception, InputError)
-        assert "writes into this pixel ring already" in str(result.exception)
+        assert "already writes into this pixel ring" in str(result.exception)

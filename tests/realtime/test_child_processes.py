@@ -56,10 +56,10 @@ def test_one_that_ends_says_why_and_all_others_end(tmp_path: Path) -> None:
     with ChildProcesses(tmp_path) as processes:
         processes.start("bridge", ["realtime", "bridge", name, "--name", name])
         processes.check()
-        with pytest.raises(InputError, match=r"rain: waited for it for 0\.05 s in vain"):
+        with pytest.raises(InputError, match=r"rain: not ready after 0\.05 s"):
             processes.wait_until(lambda: False, "rain", 0.05)
         processes.start("run", ["realtime", "run", "--config", str(tmp_path / "nothing.toml")])
-        with pytest.raises(InputError, match=r"run: it has ended: .*nothing\.toml: no such file"):
+        with pytest.raises(InputError, match=r"run: the process has ended: .*nothing\.toml: no such file"):
             processes.wait_until(lambda: False, "run", LIMIT_S)
         bridge = processes._started["bridge"]
     assert bridge.returncode is not None

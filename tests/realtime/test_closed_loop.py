@@ -71,7 +71,7 @@ def test_open_close_flat_and_gain(sky: Sky, files: tuple[Path, Control]) -> None
     command({"action": "gain", "gain": 0.25})
     closed = command({"action": "close"})["loop"]
     assert (closed["state"], closed["gain"], closed["obstacle"]) == ("closed", 0.25, None)
-    with pytest.raises(InputError, match="expected an open loop"):
+    with pytest.raises(InputError, match="expected it open"):
         command({"action": "flat"})
     sky.frames(3)
     assert command({"action": "open"})["loop"]["opened_because"] == "asked to"

@@ -386,7 +386,7 @@ def test_a_folder_that_others_may_write_to_is_refused(path: Path) -> None:
 
 
 def test_a_living_server_is_not_replaced(server: ControlServer) -> None:
-    with pytest.raises(InputError, match="an engine runs under the name lab already"):
+    with pytest.raises(InputError, match="an engine is already running under the name lab"):
         ControlServer(server.path, {})
     assert is_well(server.path)
 
@@ -480,10 +480,10 @@ def test_a_place_that_cannot_be_is_refused(path: Path, place: str) -> None:
 @pytest.mark.parametrize(
     ("reply", "named"),
     [
-        (b"", "went away before it had answered"),
-        (b'{"ok": tr', "went away"),
-        (b"[]\n", "not understood"),
-        (b"\xff\n", "not understood"),
+        (b"", "ended before it answered"),
+        (b'{"ok": tr', "ended before"),
+        (b"[]\n", "not valid"),
+        (b"\xff\n", "not valid"),
         (None, "does not answer: waited 0.2 s"),
     ],
 )

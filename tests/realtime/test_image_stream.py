@@ -141,7 +141,7 @@ def test_a_file_that_is_cut_or_replaced(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "naming"),
     [
-        ({"version": b"1.00"}, "of version '1.00', expected '2.00'"),
+        ({"version": b"1.00"}, "has version '1.00', expected '2.00'"),
         ({"nelement": 16}, r"2 axes \[5, 3\] of 16 values"),
         ({"naxis": 4}, "4 axes"),
         ({"naxis": 0}, "0 axes"),
@@ -160,17 +160,17 @@ def test_what_is_no_stream_is_refused(folder: Path) -> None:
     with pytest.raises(FileNotFoundError):
         open_stream("isio:cam")
     (folder / "cam.im.shm").write_bytes(b"text")
-    with pytest.raises(IncompatibleStreamError, match="is no stream"):
+    with pytest.raises(IncompatibleStreamError, match="is not a stream"):
         open_stream("isio:cam")
     os.mkfifo(folder / "pipe.im.shm")
-    with pytest.raises(IncompatibleStreamError, match="is no stream"):
+    with pytest.raises(IncompatibleStreamError, match="is not a stream"):
         open_stream("isio:pipe")
     (folder / "sub.im.shm").mkdir()
     with pytest.raises(IncompatibleStreamError, match="directory"):
         open_stream("isio:sub")
     content = DaoFile(folder / "dao.im.shm", (4, 2), "f4").memory[:]
     (folder / "dao.im.shm").write_bytes(content + b"more")
-    with pytest.raises(IncompatibleStreamError, match="it is of another version"):
+    with pytest.raises(IncompatibleStreamError, match="it may have another version"):
         open_stream("dao:./dao.im.shm")
     for bad in ("isio:a/b", "isio:", "dao:x y", f"dao:/{'x' * 90}"):
         with pytest.raises(InputError, match="expected"):
@@ -251,10 +251,10 @@ def test_who_may_take_a_name(folder: Path) -> None:
     isio(folder, pid=2**22 - 1)
     ImageStreamWriter("isio", "cam", (6,)).close()
     (folder / "cam.im.shm").write_text("something else")
-    with pytest.raises(InputError, match="is no stream; remove it or choose another name"):
+    with pytest.raises(InputError, match="is not a stream; remove it or choose another name"):
         ImageStreamWriter("isio", "cam", (6,))
     os.mkfifo(folder / "pipe.im.shm")
-    with pytest.raises(InputError, match="is no stream"):
+    with pytest.raises(InputError, match="is not a stream"):
         ImageStreamWriter("isio", "pipe", (6,))
     with pytest.raises(InputError, match="cannot be made"):
         ImageStreamWriter("dao", "no/cam.im.shm", (6,))

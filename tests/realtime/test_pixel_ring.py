@@ -219,9 +219,9 @@ def test_wrong_use_by_the_writer(name: str) -> None:
             with pytest.raises(InputError, match=f"rows = {rows}: expected 8 to 24"):
                 ring.rows_ready(rows)
         reader = PixelRing.attach(name)
-        with pytest.raises(InputError, match="only its open creator"):
+        with pytest.raises(InputError, match="writable by its creator only"):
             reader.begin()
-    with pytest.raises(InputError, match="only its open creator"):
+    with pytest.raises(InputError, match="writable by its creator only"):
         ring.begin()
 
 
@@ -254,7 +254,7 @@ def test_only_the_same_user_can_open_it(name: str) -> None:
 def test_a_second_writer_is_refused(name: str) -> None:
     with PixelRing.create(name, SHAPE, np.float32) as ring:
         ring.publish(np.full(SHAPE, 3.0))
-        with pytest.raises(InputError, match=f"process {os.getpid()} writes") as caught:
+        with pytest.raises(InputError, match=f"process {os.getpid()} already writes") as caught:
             PixelRing.create(name, (8, 8), np.uint16)
         assert "\n" not in str(caught.value)
         np.testing.assert_array_equal(PixelRing.attach(name).slot(0), 3.0)
@@ -275,7 +275,7 @@ def killed_writer(name: str) -> subprocess.Popen[bytes]:
     ring = attached(name)
     assert ring.wait(0, SHAPE[0], LIMIT_S)
     assert not is_stale(ring)
-    with pytest.raises(InputError, match=f"process {process.pid} writes"):
+    with pytest.raises(InputError, match=f"process {process.pid} already writes"):
         PixelRing.create(name, SHAPE, np.float32)
     process.send_signal(signal.SIGKILL)
     for _ in range(2000):

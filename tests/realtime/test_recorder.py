@@ -167,13 +167,13 @@ def test_a_killed_recorder_leaves_a_whole_store(engine: Engine, name: str, tmp_p
 
 
 def test_what_cannot_be_recorded(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is the engine running"):
+    with pytest.raises(InputError, match="start the engine first"):
         Recorder(name, tmp_path / "night.zarr")
     assert not list(tmp_path.iterdir())
     with TelemetryRing.create(name, LAYOUT) as ring:
         write(ring, 0)
         (tmp_path / "there.zarr").mkdir()
-        with pytest.raises(InputError, match="exists already"):
+        with pytest.raises(InputError, match="already exists"):
             Recorder(name, tmp_path / "there.zarr")
         with pytest.raises(InputError, match="cannot be written"):
             Recorder(name, tmp_path / "no" / "folder.zarr")

@@ -187,7 +187,7 @@ def test_no_room_is_one_line(name: str, monkeypatch: pytest.MonkeyPatch) -> None
 
     before = set(FOLDER.iterdir())
     monkeypatch.setattr(os, "posix_fallocate", full)
-    assert "bytes, more than is left in /dev/shm" in refused(name)
+    assert "bytes exceed the free space in /dev/shm" in refused(name)
     assert set(FOLDER.iterdir()) == before
 
 

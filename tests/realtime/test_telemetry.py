@@ -94,7 +94,7 @@ def test_what_is_written_is_read(name: str) -> None:
     assert is_stale(reader)
     assert as_written(reader.records_since(0)[0])  # what is there can still be read
     reader.close()
-    with pytest.raises(InputError, match="is the engine running"):
+    with pytest.raises(InputError, match="start the engine first"):
         TelemetryReader.attach(name)
 
 
@@ -204,7 +204,7 @@ def test_the_ring_of_a_dead_engine_is_replaced(name: str) -> None:
 def test_what_is_not_telemetry_is_refused(name: str, tmp_path: Path) -> None:
     with (
         PixelRing.create(f"{name}_telemetry", (4, 4), np.uint8),
-        pytest.raises(InputError, match="is not telemetry"),
+        pytest.raises(InputError, match="expected telemetry"),
     ):
         TelemetryReader.attach(name)
     for wrong in ({"records": 1}, {"records": 1e9}, {"image_slots": 0}):

@@ -115,7 +115,7 @@ def test_files_lie_beside_the_page(tmp_path: Path) -> None:
     assert {path.parent for path in written[1:]} == {tmp_path / "a-figures"}
     assert all(path.exists() for path in written)
     (tmp_path / "b-figures").write_text("a file")
-    with pytest.raises(InputError, match="choose another place"):
+    with pytest.raises(InputError, match="choose another folder"):
         write_page(page(), tmp_path / "b.html")
 
 

@@ -41,5 +41,5 @@ def test_what_is_refused() -> None:
         slope_discrepancy(slopes, Layout.grid((2, 2), pixels=8))
     with pytest.raises(InputError, match="geometry"):
         slope_discrepancy(slopes, replace(LAYOUT, geometry="hexagonal"))
-    with pytest.raises(InputError, match="any slopes of these"):
+    with pytest.raises(InputError, match="cannot show a discrepancy"):
         slope_discrepancy(slopes_of(np.zeros((1, 2, 1))), Layout.grid((1, 1), pixels=8))

@@ -1,5 +1,5 @@
-"""Adapters: the slope pipeline as a part of other adaptive-optics tools, one module a tool.
+"""Adapters that use the slope pipeline in other adaptive-optics tools, one module per tool.
 
-Each takes a tool's image, the sub-apertures from the tool's own description of its sensor, and returns slopes
-in the tool's own unit and order; `faintspot.adapters.base` holds what they share.
+Each takes a tool's image and its description of the sub-apertures, and returns slopes in the tool's unit and
+order. `faintspot.adapters.base` holds the common parts.
 """

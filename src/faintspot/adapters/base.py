@@ -1,4 +1,4 @@
-"""What all adapters share: a tool's lenslets to a layout, a tool's image to slopes in its own unit."""
+"""Common parts of the adapters: layouts from a tool's lenslets, slopes in the tool's unit."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
 
 CALIBRATION_FLUX_E = 1000.0
-"""Flux (electrons) of a sub-aperture at which frames without noise are measured."""
+"""Flux of a sub-aperture [electrons] at which noise-free frames are measured."""
 FLUX_FRAMES = 1000.0
-"""Time constant of the mean flux, frames."""
-_FIRST_FRAMES = 20  # that the mean flux begins with: one faint frame says too little
+"""Time constant of the mean flux [frames]."""
+_FIRST_FRAMES = 20  # averaged before the mean flux is used: one faint frame is too noisy
 _FOLLOW_EVERY = 10  # frames
 _LEAST_FLUX_E = 1e-3
 _PARTS = "estimator", "settings", "calibration", "psf", "score"
-_EXACT_PX = 1e-6  # what a centre in pixels may be off by rounding
+_EXACT_PX = 1e-6  # rounding error of a centre
 
 
 def largest_window(centres: ArrayLike) -> int:
-    """Return the side of the largest square windows around lenslets that do not overlap, pixels.
+    """Return the side of the largest square windows around lenslets that do not overlap [px].
 
     Parameters
     ----------
@@ -47,13 +47,13 @@ def largest_window(centres: ArrayLike) -> int:
     Raises
     ------
     InputError
-        When there are fewer than two lenslets, or they are closer than the smallest window is wide.
+        When there are fewer than two lenslets, or their spacing is below the smallest window.
     """
     from scipy.spatial import cKDTree
 
     array = finite_array("lenslet centres", centres, minimum_dimensions=2)
     if len(array) < 2:
-        raise InputError("pixels: expected the window's side, as one lenslet does not tell it, got none")
+        raise InputError("pixels: expected the window's side for a single lenslet, got none")
     apart = float(np.min(cKDTree(array).query(array, k=2, p=np.inf)[0][:, 1]))
     side = int(np.floor(apart + _EXACT_PX))
     if side < SMALLEST_WINDOW:
@@ -64,14 +64,14 @@ def largest_window(centres: ArrayLike) -> int:
 def window_corners(centres: ArrayLike, side: int) -> NDArray[np.int64]:
     """Return row and column of the first pixel of the window of `side` pixels nearest each centre: (n, 2).
 
-    Windows are whole pixels, centres need not be: what is left over is in `Layout.offsets`.
+    Windows are whole pixels; the remaining offsets of the centres are in `Layout.offsets`.
     """
     array = np.round(finite_array("lenslet centres", centres, minimum_dimensions=2), 6)
     return np.floor(array[:, ::-1] - 0.5 * (side - 1) + 0.5).astype(np.int64)
 
 
 def on_detector(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -> NDArray[np.bool_]:
-    """Say of each lenslet whether its whole window is on the detector: (n,) bool."""
+    """Return whether each lenslet's whole window is on the detector: (n,) bool."""
     corners = window_corners(centres, side)
     return np.all((corners >= 0) & (corners + side <= np.array(frame_shape)), axis=1)  # type: ignore[no-any-return]
 
@@ -83,11 +83,11 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
     ----------
     centres : (n, 2) array
         x, y of each lenslet's centre in frame pixels (pixel i has its centre at i). Positions are measured
-        from there, also where that is not the middle of a window.
+        from there, even if it is not the centre of a window.
     frame_shape : (int, int)
         Height and width of a frame.
     side : int
-        Of each window, pixels.
+        Side of each window, pixels.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
 
 
 class Parts(NamedTuple):
-    """What a pipeline is made of, but for the layout, which the tool knows."""
+    """Parts of a pipeline except the layout, which the tool provides."""
 
     settings: Settings
     calibration: Calibration
@@ -108,18 +108,18 @@ class Parts(NamedTuple):
 
 
 def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
-    """Return what a tool's own file says of faintspot.
+    """Return the pipeline's parts from a tool's configuration.
 
     Parameters
     ----------
     source : path or mapping
         A faintspot.toml, or its tables `estimator`, `settings`, `calibration`, `psf` and `score` as mappings,
-        with files from the working directory.
+        with file names relative to the working directory.
 
     Raises
     ------
     InputError
-        For an unknown table or key, a bad value, a file that cannot be read.
+        When a table or key is unknown, a value is invalid, or a file cannot be read.
     """
     if isinstance(source, str | Path):
         path, document = Path(source), read_tables(source)
@@ -138,7 +138,7 @@ def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
 
 
 class AdapterOptions(TypedDict, total=False):
-    """What every adapter hands on to `ToolSlopes`."""
+    """Options that every adapter passes on to `ToolSlopes`."""
 
     psf: PSF | None
     score: Score | None
@@ -148,7 +148,7 @@ class AdapterOptions(TypedDict, total=False):
 
 
 class ToolSlopes:
-    """A slope pipeline inside another tool: its slopes in the tool's unit, its calibration, prior and light.
+    """A slope pipeline inside another tool: slopes in the tool's unit, calibration, prior and flux.
 
     Parameters
     ----------
@@ -157,21 +157,21 @@ class ToolSlopes:
     calibration : Calibration, optional
         Default: images are in electrons.
     unit_per_px : (2,) array
-        The tool's unit per pixel along x and y; negative where its axis runs against the frame's.
+        The tool's unit per pixel along x and y; negative if its axis is opposite to the frame's.
     psf, score : PSF, Score, optional
-        For the estimators that need them, see `faintspot.SlopePipeline`.
+        For estimators that need them; see `faintspot.SlopePipeline`.
     calibration_flux_e : float
-        Mean flux of a sub-aperture, electrons, at which frames without noise are measured.
+        Mean flux of a sub-aperture, electrons, at which noise-free frames are measured.
     flux_frames : float, optional
-        Time constant (frames) of the running mean of the flux that estimators which use it are given, where
-        the settings have no `flux_e`; begins after 20 frames. None: the flux is that of each frame.
+        Time constant (frames) of the running mean of the flux for estimators that use it, if the settings
+        have no `flux_e`; begins after 20 frames. None: the flux is that of each frame.
     threads : int, optional
         See `faintspot.SlopePipeline`.
 
     Raises
     ------
     InputError
-        As for the pipeline, and for numbers out of range.
+        As for the pipeline, and when a number is out of range.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class ToolSlopes:
         self._flux: MeanFlux | None = None
         self._frames = 0
         self.noise_free = False
-        """Whether frames are a calibration's, without noise, as in `calibrating`."""
+        """Whether frames are noise-free calibration frames, as in `calibrating`."""
         self._bright: SlopePipeline | None = None
         self._last: Slopes | None = None
 
@@ -214,12 +214,12 @@ class ToolSlopes:
         prior_px : (n, 2) or (2 n,) array, optional
             Predicted slopes, as for `faintspot.SlopePipeline`.
         noise_free : bool
-            Whether the frame is a calibration's, without noise: then it is measured as in `calibrating`.
+            Whether the frame is a noise-free calibration frame, to be measured as in `calibrating`.
 
         Raises
         ------
         InputError
-            As for the pipeline; for a calibration frame without flux, or without slopes.
+            As for the pipeline, and when a calibration frame has no flux or no slopes.
         """
         if noise_free or self.noise_free:
             self._last = self._calibrated(frame)
@@ -231,16 +231,16 @@ class ToolSlopes:
 
     @contextmanager
     def calibrating(self, flux_e: float | None = None) -> Iterator[None]:
-        """Measure frames without noise, as of interaction matrices and references, in the `with` block.
+        """Measure noise-free frames, e.g. for interaction matrices and references, in a `with` block.
 
-        Whatever their flux is, they are measured at `flux_e` electrons a sub-aperture (default: as given
-        when this was made), with no prior, and without what is meant for noise: at a faint star's own light
-        denoising would flatten the spots, and in very high flux models of noise no longer hold.
+        Frames are scaled to `flux_e` electrons per sub-aperture (default: `calibration_flux_e`) and measured
+        without a prior and without noise handling. At the flux of a faint star, denoising would flatten the
+        spots; at very high flux, noise models no longer hold.
 
         Raises
         ------
         InputError
-            For flux that is not positive.
+            When the flux is not positive.
         """
         before = self.noise_free, self._flux_e
         self.noise_free, self._flux_e = True, self._flux_e if flux_e is None else _checked_flux(flux_e)
@@ -251,30 +251,30 @@ class ToolSlopes:
 
     @property
     def last(self) -> Slopes:
-        """The last measurement, in pixels, with flags and flux.
+        """Last measurement, in pixels, with flags and flux.
 
         Raises
         ------
         InputError
-            When nothing was measured yet.
+            When nothing has been measured yet.
         """
         if self._last is None:
-            raise InputError("last slopes: expected an image to be measured first, got none")
+            raise InputError("last slopes: no image has been measured yet; measure one first")
         return self._last
 
     @property
     def standard_errors(self) -> NDArray[np.float64]:
-        """Standard errors of the last slopes in the tool's unit, (2, n); infinite where not known."""
+        """Standard errors of the last slopes in the tool's unit, (2, n); infinite where unknown."""
         in_px = np.stack([self.last.standard_error_x, self.last.standard_error_y], dtype=np.float64)
         return in_px * np.abs(self.unit_per_px)
 
     @property
     def flux(self) -> MeanFlux | None:
-        """The running mean of the flux, once there is one."""
+        """Running mean of the flux; None before it is available."""
         return self._flux
 
     def _follow(self, flux_e: NDArray[np.float32]) -> None:
-        """Take a frame's flux into the mean; the pipeline follows in steps, as making it anew takes time."""
+        """Add a frame's flux to the mean; rebuild the pipeline only now and then."""
         assert self._flux_frames is not None
         self._frames += 1
         if self._flux is not None:
@@ -288,7 +288,7 @@ class ToolSlopes:
             self.pipeline = self.pipeline.with_flux(self._flux)
 
     def _calibrated(self, frame: Any) -> Slopes:
-        """Measure a frame without noise at the flux of calibrations."""
+        """Measure a noise-free frame at the calibration flux."""
         pipeline, calibration = self.pipeline, self.pipeline.calibration
         layout = pipeline.layout
         array = finite_array("calibration frame", frame)
@@ -299,8 +299,8 @@ class ToolSlopes:
         flux = np.nansum(images, axis=(1, 2))
         if not flux.mean() > 0.0:
             raise InputError(
-                f"calibration frame: expected flux in the sub-apertures, got {flux.mean():.3g} e- in the "
-                "mean; is the source on, and the calibration's dark right?"
+                f"calibration frame: expected flux in the sub-apertures, got {flux.mean():.3g} e- on "
+                "average; check the source and the calibration's dark"
             )
         factor = self._flux_e / flux.mean()
         if self._bright is None:

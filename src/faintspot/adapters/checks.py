@@ -1,4 +1,4 @@
-"""What tools and their users give an adapter, checked: a tool's version, matrices, predicted slopes."""
+"""Checks of an adapter's input: version of the tool, matrices, predicted slopes."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from faintspot.base.errors import InputError
 
 
 class UntestedVersionWarning(UserWarning):
-    """A tool is older or newer than those that its adapter was tested with."""
+    """Warning for a tool outside the range of versions that its adapter was tested with."""
 
 
 @functools.cache
 def check_version(tool: str, distribution: str, oldest: str, newest: str) -> None:
-    """Warn, once, when a tool is none of the versions that its adapter was tested with.
+    """Warn once if a tool's version is outside the range that its adapter was tested with.
 
     Parameters
     ----------
     tool, distribution : str
-        What people call it, and what it is installed as.
+        Name of the tool, and of its installed distribution.
     oldest, newest : str
-        Versions that were tested.
+        Range of tested versions.
     """
     try:
         version = importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
-        return  # used from its sources: nothing says which version it is
+        return  # used from source: its version is not known
     if not _numbers(oldest) <= _numbers(version) <= _numbers(newest):
         tested = oldest if oldest == newest else f"{oldest} to {newest}"
         warnings.warn(
@@ -45,46 +45,46 @@ def check_version(tool: str, distribution: str, oldest: str, newest: str) -> Non
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Major, minor and patch."""
+    """Return major, minor and patch version."""
     found = [int(number) for number in re.findall(r"\d+", version)[:3]]
     return tuple(found + [0] * (3 - len(found)))
 
 
 def check_matrix(name: str, matrix: ArrayLike) -> NDArray[Any]:
-    """Return an interaction or control matrix that can be used.
+    """Return an interaction or control matrix after checking that it is usable.
 
     Raises
     ------
     InputError
-        When it has NaN or infinite numbers, or nothing but zeros, as after a calibration that went wrong.
+        When it has NaN or infinite numbers, or only zeros, e.g. after a failed calibration.
     """
     array = real_array(name, matrix, minimum_dimensions=2)
     bad = array.size - int(np.count_nonzero(np.isfinite(array)))
     if bad or not array.any():
         got = f"{bad} NaN or infinite of {array.size}" if bad else "zeros only"
         raise InputError(
-            f"{name}: expected finite numbers that are not all 0, got {got}; calibrate again with frames "
-            "without noise and light in every sub-aperture"
+            f"{name}: expected finite numbers that are not all 0, got {got}; calibrate again with noise-free "
+            "frames that illuminate every sub-aperture"
         )
     return array
 
 
 def predicted(predict: Any, last: NDArray[Any] | None, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Return the slopes that a tool's loop predicts for the next frame, in the tool's own unit and order.
+    """Return the slopes that a tool's loop predicts for the next frame, in the tool's unit and order.
 
     Parameters
     ----------
     predict : callable or object with `predict`, optional
-        Takes the last slopes. None, also what it returns: nothing is predicted.
+        Takes the last slopes. If it is None or returns None, there is no prediction.
     last : array, optional
-        None before the first frame: nothing is predicted then.
+        Last slopes; None before the first frame, when there is no prediction.
     shape : tuple of int
-        Of the slopes.
+        Shape of the slopes.
 
     Raises
     ------
     InputError
-        For something that cannot be called, or slopes of another shape.
+        When the object cannot be called, or the slopes have another shape.
     """
     if predict is None:
         return None

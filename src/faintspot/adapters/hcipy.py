@@ -26,17 +26,17 @@ TESTED = "0.7.1", "0.7.1"
 
 
 class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
-    """Slopes of a Shack-Hartmann sensor, in place of HCIPy's `ShackHartmannWavefrontSensorEstimator`.
+    """Slopes of a Shack-Hartmann sensor; replaces HCIPy's `ShackHartmannWavefrontSensorEstimator`.
 
     The first three arguments, the attributes of the same names and the slopes' shape, order, unit and grid
-    are those of HCIPy's estimator, so that code and interaction matrices written for it stay.
+    are those of HCIPy's estimator, so that existing code and interaction matrices remain valid.
 
     Parameters
     ----------
     mla_grid : hcipy.Grid
         Lenslet centres, m.
     mla_index : hcipy.Field
-        Number of the lenslet in front of each pixel, negative where there is none.
+        Number of the lenslet in front of each pixel, negative for none.
     estimation_subapertures : (mla_grid.size,) array of bool, optional
         Lenslets to measure. Default: all in `mla_index` whose window is wholly on the detector.
     settings : Settings
@@ -44,31 +44,31 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
     calibration : Calibration, optional
         Default: images are in electrons. Its maps have the shape of `image.shaped`.
     detector_grid : hcipy.Grid, optional
-        Pixel centres, m: regular and Cartesian. Default: the grid of `mla_index`; a detector with other
-        pixels than the optics' grid needs it.
+        Pixel centres, m: regular and Cartesian. Default: the grid of `mla_index`; needed if the detector's
+        pixels differ from the optics' grid.
     pixels : int, optional
-        Side of the windows. Default: the largest in which neighbours do not overlap. Windows are whole
-        pixels, lenslets need not be: slopes are from the lenslet's centre in any case.
+        Side of the windows. Default: the largest without overlap. Windows are whole pixels; slopes are
+        measured from the lenslet's centre in any case.
     predict : callable or object with `predict`, optional
-        Takes the last slopes, (2, n) m, and returns those that are expected next, for estimators that take a
-        prior; called before each frame but the first.
+        Takes the last slopes, (2, n) m, and returns the prediction for the next frame, for estimators that
+        use a prior; called before each frame except the first.
     **options
         psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Attributes
     ----------
     estimation_subapertures : (n,) array of int
-        Numbers of the lenslets that are measured.
+        Numbers of the measured lenslets.
     estimation_grid : hcipy.Grid
         Their centres: the grid of the slopes.
     measured : ToolSlopes
-        What measures: its `pipeline`, the `last` slopes (px), `flux`.
+        Measures the slopes: `pipeline`, `last` slopes (px), `flux`.
 
     Raises
     ------
     InputError
-        For a detector grid that is not regular, lenslets off the detector, a mask of the wrong size, or as
-        for `faintspot.SlopePipeline`.
+        When the detector grid is not regular, lenslets are off the detector, the mask has the wrong size, or
+        as for `faintspot.SlopePipeline`.
     """
 
     def __init__(
@@ -107,18 +107,18 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         Parameters
         ----------
         images : list of one hcipy.Field
-            The image of the detector, electrons (or ADU, with a calibration).
+            Image of the detector, electrons (or ADU, with a calibration).
 
         Returns
         -------
         hcipy.Field
-            (2, n), x then y: centre of the spot from the centre of its lenslet, m on the detector, in the
-            order and on the grid of HCIPy's estimator; 0 where `flags` says that it is invalid.
+            (2, n), x then y: spot position from the centre of its lenslet, m on the detector, in the order
+            and on the grid of HCIPy's estimator; 0 where `flags` marks it as invalid.
 
         Raises
         ------
         InputError
-            For an image that is not on the detector's grid.
+            When the image is not on the detector's grid.
         """
         frame = self._frame(images)
         if self.measured.noise_free:
@@ -129,31 +129,31 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         return self._slopes
 
     def calibrating(self, flux_e: float | None = None) -> Any:
-        """Measure images without noise in a `with` block, see `ToolSlopes.calibrating`."""
+        """Measure noise-free images in a `with` block; see `ToolSlopes.calibrating`."""
         return self.measured.calibrating(flux_e)
 
     @property
     def pipeline(self) -> SlopePipeline:
-        """Which measures; its layout has the windows."""
+        """Slope pipeline; its layout has the windows."""
         return self.measured.pipeline
 
     @property
     def slopes(self) -> Slopes:
-        """The last estimate in pixels, with flux, flags and iterations."""
+        """Last estimate in pixels, with flux, flags and iterations."""
         return self.measured.last
 
     @property
     def flags(self) -> NDArray[np.uint8]:
-        """Bits of `faintspot.SubapertureFlag` of the last estimate, (n,)."""
+        """Bits of `faintspot.SubapertureFlag` for the last estimate, (n,)."""
         return self.measured.last.flags
 
     @property
     def standard_errors(self) -> Any:
-        """Field (2, n): standard errors of the last estimate, m; infinite where they are not known."""
+        """Field (2, n): standard errors of the last estimate, m; infinite where unknown."""
         return hcipy.Field(self.measured.standard_errors, self.estimation_grid)
 
     def _frame(self, images: Any) -> NDArray[Any]:
-        """The image as rows and columns."""
+        """Return the image as rows and columns."""
         image = images[0] if isinstance(images, list | tuple) and len(images) == 1 else None
         height, width = self._frame_shape
         if image is None or np.size(image) != height * width:
@@ -166,24 +166,24 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
 
 
 def _points(grid: Any) -> NDArray[Any]:
-    """Coordinates of a grid's points, (n, 2)."""
+    """Return the coordinates of a grid's points, (n, 2)."""
     if not isinstance(grid, hcipy.Grid) or grid.ndim != 2:
         raise InputError(f"mla_grid: expected a two-dimensional hcipy.Grid, got {type(grid).__name__}")
     return np.asarray(grid.as_("cartesian").points)
 
 
 def _checked_grid(source: Any) -> Any:
-    """A regular Cartesian grid in two dimensions, given itself or as that of a field."""
+    """Return a regular two-dimensional Cartesian grid, given itself or as that of a field."""
     grid = source if isinstance(source, hcipy.Grid) else getattr(source, "grid", None)
     if grid is None:
         raise InputError("detector_grid: expected an hcipy.Grid, or mla_index on one, got none")
     if grid.ndim != 2 or not grid.is_("cartesian") or not grid.is_regular:
-        raise InputError("detector_grid: expected a regular two-dimensional Cartesian grid, got another one")
+        raise InputError("detector_grid: expected a regular two-dimensional Cartesian grid, got another grid")
     return grid
 
 
 def _same_pixels(grid: Any, other: Any) -> bool:
-    """Say whether two grids have the same points, but for rounding."""
+    """Return whether two grids have the same points within rounding."""
     if not grid.is_regular or not np.array_equal(grid.dims, other.dims):
         return False
     tolerance = 1e-3 * np.abs(other.delta)
@@ -196,7 +196,7 @@ def _checked_side(pixels: int) -> int:
 
 
 def _measured(mla_index: Any, mask: ArrayLike | None, whole: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Numbers of the lenslets to measure; `whole` says whose windows are on the detector."""
+    """Return the numbers of the lenslets to measure; `whole` marks windows on the detector."""
     if mask is None:
         numbers = np.unique(finite_array("mla_index", mla_index).astype(np.int64))
         if numbers[-1] >= len(whole):

@@ -1,4 +1,4 @@
-"""The slope pipeline in OOPAO (Heritier et al. 2023, AO4ELT7): in place of its sensor's centroiding."""
+"""The slope pipeline in OOPAO (Heritier et al. 2023, AO4ELT7), in place of its sensor's centroiding."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
 
 TESTED = "1.0.0", "1.0.0"
-_LEAST_UNIT = 1e-6  # of OOPAO's slopes, that of a tilt of one pixel being about 1
+_LEAST_UNIT = 1e-6  # smallest unit of OOPAO's slopes; a tilt of one pixel gives about 1
 
 
 def attach(
@@ -28,39 +28,40 @@ def attach(
     predict: Any = None,
     **options: Unpack[AdapterOptions],
 ) -> Attached:
-    """Let an OOPAO `ShackHartmann` measure its slopes with faintspot, and calibrate it anew.
+    """Make an OOPAO `ShackHartmann` measure its slopes with faintspot, and recalibrate it.
 
-    Reference slopes and `slopes_units` are made again (`initialize_wfs`); interaction matrices and
-    reconstructors made afterwards are in the same unit and order as OOPAO's own.
+    Reference slopes and `slopes_units` are remade (`initialize_wfs`). Interaction matrices and reconstructors
+    made afterwards have the unit and order of OOPAO's own.
 
     Parameters
     ----------
     wfs : OOPAO.ShackHartmann.ShackHartmann
-        Diffractive, without a weighting map of its own.
+        A diffractive sensor without a weighting map of its own.
     settings : Settings
     calibration : Calibration, optional
         Default: images are in electrons.
     predict : callable or object with `predict`, optional
-        Takes the last `wfs.signal`, (2 n,), and returns the one that is expected next, for estimators that
-        take a prior; called before each frame but the first. For an asterism a list, one for each source.
+        Takes the last `wfs.signal`, (2 n,), and returns the prediction for the next frame, for estimators
+        that use a prior; called before each frame except the first. For an asterism, a list with one for each
+        source.
     **options
         psf, score, calibration_flux_e, flux_frames, threads: see `faintspot.adapters.base.ToolSlopes`.
 
     Returns
     -------
     Attached
-        `calibrating`, `slopes`, `flags`; `detach()` puts OOPAO's own centroiding back.
+        `calibrating`, `slopes`, `flags`; `detach()` restores OOPAO's own centroiding.
 
     Raises
     ------
     InputError
-        For another or a geometric sensor, one with a weighting map, or as for `ToolSlopes`.
+        When the sensor is of another kind, geometric or has a weighting map, or as for `ToolSlopes`.
     """
     return Attached(wfs, settings, calibration, predict, options)
 
 
 class Attached:
-    """faintspot in a sensor of OOPAO's; see `attach`."""
+    """faintspot in an OOPAO sensor; see `attach`."""
 
     def __init__(
         self,
@@ -71,7 +72,7 @@ class Attached:
         options: AdapterOptions,
     ) -> None:
         if getattr(wfs, "tag", None) != "shackHartmann":
-            raise InputError(f"wfs: expected a ShackHartmann of OOPAO's, got {type(wfs).__name__}")
+            raise InputError(f"wfs: expected OOPAO's ShackHartmann, got {type(wfs).__name__}")
         check_version("OOPAO", "oopao", *TESTED)
         if wfs.is_geometric:
             raise InputError("wfs.is_geometric = True: expected a diffractive sensor, which has images")
@@ -79,7 +80,7 @@ class Attached:
         sources = list(wfs.sh_data.values())
         if any(np.any(np.asarray(source.weighting_map) != 1) for source in sources):
             raise InputError(
-                'wfs: expected no weighting map, got one; leave it out and take the estimator "window"'
+                'wfs: expected no weighting map, got one; leave it out and use the estimator "window"'
             )
         several = len(sources) > 1
         predicts = list(predict) if several and predict is not None else [predict] * len(sources)
@@ -95,7 +96,7 @@ class Attached:
         try:
             wfs.initialize_wfs()
             unit = float(wfs.slopes_units)
-            if not abs(unit) > _LEAST_UNIT:  # NaN is not, either
+            if not abs(unit) > _LEAST_UNIT:  # also refuses NaN
                 raise InputError(
                     f"wfs.slopes_units: expected about 1 from OOPAO's tilt, got {unit:g}; check "
                     "search_range_px, or give another calibration_flux_e"
@@ -105,15 +106,15 @@ class Attached:
             raise
 
     def detach(self) -> None:
-        """Put OOPAO's own centroiding back, calibrated."""
+        """Restore OOPAO's own centroiding and recalibrate it."""
         del self.wfs.wfs_integrate, self.wfs.centroid
         self.wfs.initialize_wfs()
 
     @contextmanager
     def calibrating(self, flux_e: float | None = None) -> Iterator[None]:
-        """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`.
+        """Measure as for calibration in a `with` block; see `ToolSlopes.calibrating`.
 
-        OOPAO's frames without photon and read-out noise are measured so anyway.
+        OOPAO's frames without photon and read-out noise are always measured this way.
         """
         with ExitStack() as stack:
             for each in self.measured:
@@ -122,21 +123,21 @@ class Attached:
 
     @property
     def measured(self) -> tuple[ToolSlopes, ...]:
-        """Of every source: what measures it, with `last` slopes (px), `standard_errors` and `flux`."""
+        """Measurement of each source, with `last` slopes (px), `standard_errors` and `flux`."""
         return tuple(source.slopes for source in self._sources)
 
     def _integrate(self, src: Any, sh_data: Any) -> Any:
-        """OOPAO's own step, which calls `centroid`, for the source that it is about."""
+        """Run OOPAO's own step, which calls `centroid`, and note its source."""
         self._current = next((s for s in self._sources if s.data is sh_data), self._sources[0])
         return self._own(src, sh_data)
 
     def _centroid(self, image: Any, threshold: float = 0.01) -> NDArray[np.float64]:
-        """Positions as OOPAO's: (n, 2) px from the first pixel, along rows, then along columns."""
+        """Return positions as OOPAO does: (n, 2) px from the first pixel, along rows, then along columns."""
         return self._current.positions(image)
 
 
 class _Source:
-    """One source's sub-apertures."""
+    """Sub-apertures of one source."""
 
     def __init__(
         self,
@@ -156,11 +157,11 @@ class _Source:
 
     @property
     def slopes(self) -> ToolSlopes:
-        """What measures."""
+        """Measurement of this source."""
         return self._spots.measured
 
     def positions(self, image: Any) -> NDArray[np.float64]:
-        """See `Attached._centroid`."""
+        """Return positions; see `Attached._centroid`."""
         images, camera = self._spots.checked(image), self.wfs.cam
         noise_free = not np.any(camera.photonNoise) and not np.any(camera.readoutNoise)
         reference, unit = self._reference() - self._first, float(self.wfs.slopes_units)
@@ -168,7 +169,7 @@ class _Source:
         return np.ascontiguousarray((found + self._first).T)
 
     def _reference(self) -> NDArray[np.float64]:
-        """OOPAO's reference positions, (2, n); the middle before it has any."""
+        """Return OOPAO's reference positions, (2, n); the centre before it has any."""
         reference = np.asarray(self.data.reference_signal_2D, np.float64)
         if reference.ndim < 2:
             return np.full((2, self._n), self._first)

@@ -6,7 +6,7 @@
       class_name: faintspot.adapters.pyrtc.FaintspotSlopes
       faintspot: faintspot.toml
 
-The classes are made when they are first asked for: pyRTC is imported then, not before.
+The classes are created on first access, which imports pyRTC.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _pyrtc() -> Any:
-    """Return the module pyrtc; another version than was tested is said once."""
+    """Return the module pyrtc; warn once about an untested version."""
     try:
         import pyrtc
     except ImportError:
@@ -50,18 +50,18 @@ def _pyrtc() -> Any:
 
 @functools.cache
 def slopes_process() -> Any:
-    """Return the class `FaintspotSlopes`, a `SlopesProcess` of pyRTC's.
+    """Return the class `FaintspotSlopes`, a `SlopesProcess` of pyRTC.
 
     Its configuration is that of a `SlopesProcess` of type "SHWFS", and
 
     faintspot : str or dict
         A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
     noise_free : bool
-        Whether frames are a calibration's without noise, as of a simulated sensor. Default false.
+        Whether frames are noise-free calibration frames, e.g. of a simulated sensor. Default: false.
     calibration_flux_e, flux_frames : float
         See `faintspot.adapters.base.ToolSlopes`; `flux_frames` 0: no running mean.
     input_streams: predicted : str
-        Stream of the slopes that are expected next, as long as `signal`; optional.
+        Stream of the predicted slopes, as long as `signal`; optional.
 
     Raises
     ------
@@ -72,18 +72,18 @@ def slopes_process() -> Any:
     process: Any = tool.SlopesProcess
 
     class FaintspotSlopes(process):  # type: ignore[misc]
-        """A slopes process of pyRTC's, with faintspot in place of its centroiders."""
+        """A pyRTC slopes process that uses faintspot instead of pyRTC's centroiders."""
 
         def __init__(self, conf: Any) -> None:
             self.measuring = _Measuring(conf)
             super().__init__(conf)
 
         def _compute_slopes_shwfs(self, image: Any) -> NDArray[np.float32]:
-            """Slopes as pyRTC's centroiders give them: (2 N, N) px, the x map above the y map."""
+            """Return slopes as pyRTC's centroiders do: (2 N, N) px, the x map above the y map."""
             return self.measuring.maps(self, image, tool.open_stream)
 
         def calibrating(self, flux_e: float | None = None) -> Any:
-            """Measure as for calibration in a `with` block, see `ToolSlopes.calibrating`."""
+            """Measure as for calibration in a `with` block; see `ToolSlopes.calibrating`."""
             return self.measuring.tool.calibrating(flux_e)
 
     FaintspotSlopes.__module__, FaintspotSlopes.__qualname__ = __name__, "FaintspotSlopes"
@@ -92,13 +92,14 @@ def slopes_process() -> Any:
 
 @functools.cache
 def camera() -> Any:
-    """Return the class `FaintspotCamera`, a `WavefrontSensor` of pyRTC's with the frames of a stream.
+    """Return the class `FaintspotCamera`, a pyRTC `WavefrontSensor` that reads frames from a stream.
 
     Its configuration is that of a `WavefrontSensor`, with the function `expose`, and
 
     frames : str
-        Stream of the frames: of pyshmem, such as NAME_frames of `faintspot realtime telescope`, isio:NAME or
-        dao:FILE. They become uint16, as pyRTC's raw frames are. It need not exist yet.
+        Stream of the frames: NAME (pyshmem), e.g. NAME_frames of `faintspot realtime telescope`, isio:NAME or
+        dao:FILE. Frames are converted to uint16, the type of pyRTC's raw frames. The stream need not exist
+        yet.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def camera() -> Any:
     sensor: Any = _pyrtc().WavefrontSensor
 
     class FaintspotCamera(sensor):  # type: ignore[misc]
-        """A sensor of pyRTC's whose frames come by a stream."""
+        """A pyRTC sensor whose frames come from a stream."""
 
         EXTRA_CONFIG_KEYS = ("frames",)
 
@@ -117,12 +118,12 @@ def camera() -> Any:
             super().__init__(conf)
 
         def expose(self) -> None:
-            """Publish the next frame, if there is one within a moment."""
+            """Publish the next frame if one comes within a moment."""
             if self.following.next_into(self.data):
                 super().expose()
 
         def close(self, *arguments: Any, **options: Any) -> None:
-            """Let go of the stream, too."""
+            """Close the sensor and the stream."""
             super().close(*arguments, **options)
             self.following.close()
 
@@ -131,7 +132,7 @@ def camera() -> Any:
 
 
 class _Frames:
-    """The frames of a stream, one after the other."""
+    """Frames of a stream, in order."""
 
     def __init__(self, conf: Any) -> None:
         name = conf.get("frames")
@@ -142,7 +143,7 @@ class _Frames:
         self._seen = 0
 
     def next_into(self, frame: NDArray[Any]) -> bool:
-        """Wait a moment for a frame that is new; return whether there was one."""
+        """Wait a moment for a new frame; return whether there was one."""
         follower = self._follower
         if follower.source is None:
             if follower.open() is None:
@@ -163,7 +164,7 @@ class _Frames:
         return publication is not None
 
     def close(self) -> None:
-        """Let go of the stream."""
+        """Close the stream."""
         self._follower.close()
 
     def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
@@ -172,7 +173,7 @@ class _Frames:
 
 
 class _Measuring:
-    """What a slopes process measures with; made when its geometry is known."""
+    """Measurement of a slopes process; created when its geometry is known."""
 
     def __init__(self, conf: Any) -> None:
         if "faintspot" not in conf:
@@ -189,19 +190,19 @@ class _Measuring:
 
     @property
     def tool(self) -> ToolSlopes:
-        """What measures.
+        """Measurement with the present geometry.
 
         Raises
         ------
         InputError
-            Before the geometry is known.
+            When the geometry is not known yet.
         """
         if self._tool is None:
-            raise InputError("slopes: expected a frame to be measured first, got none")
+            raise InputError("slopes: no frame has been measured yet; measure one first")
         return self._tool
 
     def maps(self, process: Any, image: Any, open_stream: Any) -> NDArray[np.float32]:
-        """Measure an image; only sub-apertures that pyRTC counts as valid are."""
+        """Measure an image; return maps with slopes of pyRTC's valid sub-apertures only."""
         n = int(process.num_regions)
         valid = _mapped("valid_sub_aps", process.valid_sub_aps, n).astype(bool)
         references = _mapped("ref_slopes", process.ref_slopes, n).astype(np.float64)
@@ -212,7 +213,7 @@ class _Measuring:
         reference = references.ravel()[at].reshape(2, -1)
         prior = self._predicted(valid, open_stream)
         prior = None if prior is None else (prior.ravel()[at].reshape(2, -1) + reference).ravel()
-        if not image.any():  # pyRTC's first frame, with which kernels are compiled, is no flux of a star's
+        if not image.any():  # pyRTC's first frame is blank and only compiles the kernels
             self._tool.pipeline(image)
             return np.zeros((2 * n, n), np.float32)
         found = self._tool.measure(image, prior_px=prior, noise_free=self.noise_free)
@@ -221,7 +222,7 @@ class _Measuring:
         return slopes
 
     def _made(self, process: Any, shape: tuple[int, ...], used: NDArray[np.int64]) -> ToolSlopes:
-        """Make the pipeline for pyRTC's sub-apertures."""
+        """Create the pipeline for pyRTC's sub-apertures."""
         if not used.size:
             raise InputError("slopes.valid_sub_aps: expected at least one valid sub-aperture, got none")
         side, spacing, n = int(process.region_size), float(process.sub_ap_spacing), int(process.num_regions)
@@ -251,14 +252,14 @@ class _Measuring:
         )
 
     def _predicted(self, valid: NDArray[np.bool_], open_stream: Any) -> NDArray[np.float64] | None:
-        """Return the predicted slopes, as maps, once there are any."""
+        """Return the predicted slopes as maps, or None if there are none yet."""
         if self.stream_name is None:
             return None
         if self._stream is None:
             try:
                 self._stream = open_stream(self.stream_name)
             except FileNotFoundError:
-                return None  # whoever predicts has not begun
+                return None  # nothing has been predicted yet
         if not self._stream.count:
             return None
         values = np.asarray(self._stream.read())
@@ -271,16 +272,16 @@ class _Measuring:
 
 
 def _mapped(name: str, values: Any, n: int) -> NDArray[Any]:
-    """Return a map of pyRTC's for n x n sub-apertures, x above y."""
+    """Return a checked pyRTC map for n x n sub-apertures, x above y."""
     array = np.asarray(values)
     if array.shape != (2 * n, n):
         raise InputError(
             f"slopes.{name}: expected shape {(2 * n, n)} for {n} x {n} sub-apertures, got {array.shape}; "
-            "make it anew for this sub_ap_spacing"
+            "remake it for this sub_ap_spacing"
         )
     if not np.isfinite(array).all():
         raise InputError(
             f"slopes.{name}: expected finite numbers, got {np.count_nonzero(~np.isfinite(array))} NaN or "
-            "infinite; take it anew, with light in every valid sub-aperture"
+            "infinite; remake it with every valid sub-aperture illuminated"
         )
     return array

@@ -1,4 +1,4 @@
-"""For tools that cut the windows themselves and ask where the spots are in them."""
+"""Spot positions for tools that cut out the windows themselves."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from faintspot.sensor.layout import Layout
 
 
 class Spots:
-    """Where spots are in a tool's windows, with the tool's references and predictions.
+    """Spot positions in a tool's windows, with the tool's references and predictions.
 
     Parameters
     ----------
     tool : str
-        What people call it, for errors.
+        Name of the tool, for errors.
     n, side : int
-        Windows, and their pixels along a side.
+        Number of windows, and their side in pixels.
     settings, calibration
         See `ToolSlopes`.
     predict : callable or object with `predict`, optional
         See `faintspot.adapters.checks.predicted`: slopes in the tool's order and unit.
     rows_first : bool
-        Whether the tool has what is along rows (y) before what is along columns (x).
+        Whether the tool puts coordinates along rows (y) before those along columns (x).
     **options
         See `ToolSlopes`.
     """
@@ -53,36 +53,36 @@ class Spots:
         self._slopes: NDArray[np.float64] | None = None
 
     def checked(self, images: Any) -> NDArray[Any]:
-        """Return a tool's images when they are of the windows that there were.
+        """Return a tool's images after checking their number and size.
 
         Raises
         ------
         InputError
-            For another number or size.
+            When there is another number of images, or another size.
         """
         array = np.asarray(images)
         if array.shape != self._shape:
             raise InputError(
                 f"{self._tool}'s images: expected shape {self._shape}, got {array.shape}; attach faintspot "
-                "again when the sensor has changed"
+                "again after changing the sensor"
             )
         return array
 
     def places(
         self, images: NDArray[Any], reference: NDArray[np.float64], unit: float = 1.0, *, noise_free: bool
     ) -> NDArray[np.float64]:
-        """Return where the spots are, in pixels from the windows' middle, in the tool's order: (2, n).
+        """Return the spot positions in pixels from the windows' centres, in the tool's order: (2, n).
 
         Parameters
         ----------
         images : (n, side, side) array
-            As `checked` returned them.
+            Images returned by `checked`.
         reference : (2, n) array
-            The tool's reference places, in the same coordinates. Invalid spots are there, too.
+            The tool's reference positions, in the same coordinates. Invalid spots get them, too.
         unit : float
-            Pixels in the tool's unit of slopes.
+            Pixels per unit of the tool's slopes.
         noise_free : bool
-            Whether the tool says that these images have no noise: a calibration's.
+            Whether the tool declares these images as noise-free calibration images.
 
         Raises
         ------

@@ -1,1 +1,1 @@
-"""Advice for a running loop: what its telemetry tells, what may be better, and whether it is."""
+"""Advice for a running loop: measurements from its telemetry, possible improvements, and their tests."""

@@ -1,4 +1,4 @@
-"""What telemetry of a closed loop tells of star, camera, turbulence and loop, and the journal of it."""
+"""Measurements of star, camera, turbulence and loop from telemetry of a closed loop, and their journal."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
 JOURNAL = ".advice.json"
-"""After the configuration's name."""
+"""Ending of the journal's name, after the configuration's."""
 _MOST_ENTRIES = 1000
 _BLOCK_FRAMES = 50
 _LOOK_S = 0.05
@@ -44,7 +44,7 @@ _MOST_IMAGES = 400
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A loop as its configuration describes it, and the engine that runs it."""
+    """A loop as described by its configuration, and the engine that runs it."""
 
     name: str
     control: Control
@@ -53,11 +53,11 @@ class Loop:
     written: Settings
     """Settings in the configuration."""
     known: dict[str, Any]
-    """PSF, score and reference slopes of `SlopePipeline`."""
+    """PSF, score and reference slopes for `SlopePipeline`."""
 
     @classmethod
     def load(cls, path: str | Path, name: str) -> Loop:
-        """Read a configuration.
+        """Load a configuration.
 
         Raises
         ------
@@ -66,27 +66,27 @@ class Loop:
         """
         control = load_control(path)
         if control is None:
-            raise InputError(f"{path}: expected a table [control], as of `faintspot realtime calibrate`")
+            raise InputError(f"{path}: expected a table [control]; `faintspot realtime calibrate` writes one")
         layout, settings, calibration, psf, score = configuration.load_all(path)
         control.check_fits(len(layout))
         known = {"psf": psf, "score": score, "reference": control.reference}
         return cls(name, control, layout, calibration, settings, known)
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
-        """Ask the engine."""
+        """Send a request to the engine."""
         return request(socket_path(self.name), command, timeout_s=LENGTHY_TIMEOUT_S, **fields)
 
     def running(self, seconds: float, stop: threading.Event) -> tuple[Telemetry, Settings]:
-        """Return telemetry of the running engine from now on, and its settings.
+        """Record telemetry of the running engine; return it with the engine's settings.
 
         Raises
         ------
         InputError
-            When there is no engine, arms take turns, the loop is not closed, or the engine ends.
+            When there is no engine, methods are interleaved, the loop is not closed, or the engine ends.
         """
         if len(self.ask("status")["arms"]) > 1:
             raise InputError(
-                f"{self.name}: expected no arms in turn; faintspot realtime interleave set ends it"
+                f"{self.name}: expected no interleaving; end it with faintspot realtime interleave set"
             )
         status = self.ask("loop", action="status")["loop"]
         if status["state"] != CLOSED:
@@ -98,7 +98,7 @@ class Loop:
         return telemetry, Settings(given.pop("estimator"), **given)
 
     def centroid_gain(self, settings: Settings, frames_e: NDArray[np.float32]) -> Estimate | None:
-        """Return by how much slopes grow with the spots' motion, after the control has divided them."""
+        """Return the ratio of slopes to the spots' motion, after the control's own correction."""
         plain = calibration_of_electrons(self.calibration)
         pipeline = SlopePipeline(self.layout, settings, plain, threads=1, **self.known)
         found = shifted_gain(pipeline, frames_e, prior_std_px(settings, self.layout))
@@ -116,7 +116,7 @@ class Advice:
     known: list[Measured]
 
     def entry(self, name: str) -> dict[str, Any]:
-        """Return it as plain values, for the journal."""
+        """Return the advice as plain values for the journal."""
         return {
             "unix_time_s": time.time(),
             "name": name,
@@ -130,26 +130,26 @@ class Advice:
 
 
 def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
-    """Measure flux, noise, spots, centroid gain, turbulence and residual wavefront from telemetry.
+    """Measure flux, noise, spots, centroid gain, turbulence and residual wavefront error from telemetry.
 
     Parameters
     ----------
     loop : Loop
     telemetry : faintspot.io.Telemetry
-        Of a closed loop, with one state of the settings.
+        Telemetry of a closed loop with constant settings.
     settings : Settings
-        With which it was measured.
+        Settings in use.
 
     Raises
     ------
     InputError
-        For telemetry without frames of a closed loop, or of several arms.
+        When the telemetry has no frames of a closed loop, or several interleaved methods.
     """
     arms = np.unique(telemetry.arm)
     if not len(arms):
-        raise InputError(f"{loop.name}: expected frames of a closed loop, none came")
+        raise InputError(f"{loop.name}: expected frames of a closed loop, got none")
     if len(arms) != 1:
-        raise InputError(f"telemetry: expected one state of the settings, found {len(arms)} in turn")
+        raise InputError(f"telemetry: expected a single method, found {len(arms)} interleaved")
     layout, number = loop.layout, int(arms[0]) + 1
     seen = seen_in_telemetry(telemetry, loop.control, [prior_std_px(settings, layout)] * number)
     frames = electrons_of(telemetry.raw, loop.calibration)
@@ -157,7 +157,7 @@ def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
     known = of_images(frames, layout, loop.calibration)
     gain_known = Measured("centroid gain", "", remark="too few images")
     if shifted is not None:
-        remark = "over the one that the control divides by"
+        remark = "relative to the gain that the control corrects"
         gain_known = Measured("centroid gain", "", shifted.value, shifted.standard_error, remark)
     gains = [shifted.value if shifted is not None and shifted.value > 0 else 1.0] * number
     modes, unit = wavefront_modes(layout)
@@ -172,7 +172,7 @@ def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Set
     ----------
     telemetry : faintspot.io.Telemetry
     gain : float
-        Loop gain to begin with.
+        Initial loop gain.
     """
     document = parse_text(telemetry.attributes["settings"], "settings of the recording")
     settings, first = Settings.from_tables("settings of the recording", document), -1
@@ -187,12 +187,12 @@ def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Set
 
 
 def write_journal(path: str | Path, entry: dict[str, Any]) -> Path:
-    """Add an entry to the journal beside a configuration; return the journal's place.
+    """Add an entry to the journal beside a configuration; return the journal's path.
 
     Raises
     ------
     InputError
-        When it cannot be written, or something else is there.
+        When it cannot be written, or the path is something else.
     """
     place = derived(path, JOURNAL)
     entries: Any = []
@@ -202,14 +202,14 @@ def write_journal(path: str | Path, entry: dict[str, Any]) -> Path:
         except (OSError, ValueError):
             entries = None
         if not isinstance(entries, list):
-            raise InputError(f"{place}: expected a journal of advice; move it away")
+            raise InputError(f"{place}: expected a journal of advice, found another file; move it away")
     text = json.dumps([*entries, entry][-_MOST_ENTRIES:], indent=1)
     write_atomically(place, text)
     return place
 
 
 def _watched(name: str, seconds: float, stop: threading.Event) -> Telemetry:
-    """Return what an engine measures from now on, for so long or until `stop` is set."""
+    """Return telemetry of an engine from now on, for `seconds` or until `stop` is set."""
     reader = TelemetryReader.attach(name)
     try:
         cursors = [reader.newest, reader.newest_image]
@@ -236,16 +236,16 @@ def _watched(name: str, seconds: float, stop: threading.Event) -> Telemetry:
 
 
 def _residual(left: Floats, unit: str) -> Measured:
-    """Return the rms of the residual wavefront."""
+    """Return the rms of the residual wavefront error."""
     values = left[np.isfinite(left)]
-    name = "residual wavefront, what the modes see of it"
+    name = "residual wavefront error in the fitted modes"
     if not len(values):
         return Measured(name, unit, remark="too few frames")
     mean: Estimate = mean_by_blocks(values, _BLOCK_FRAMES)
     if not mean.value > 0:
         return Measured(name, unit, remark="less than its error")
     rms = math.sqrt(mean.value)
-    return Measured(name, f"{unit} rms", rms, mean.standard_error / (2 * rms), "the noise taken off")
+    return Measured(name, f"{unit} rms", rms, mean.standard_error / (2 * rms), "with the noise subtracted")
 
 
 def _plain(value: float) -> float | None:

@@ -1,4 +1,4 @@
-"""Centroid gain and light from recorded images, without moving anything but the windows."""
+"""Centroid gain from recorded images, by moving only the windows."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _FEWEST_IMAGES = 5
 
 
 def electrons_of(frames_adu: NDArray[np.floating], calibration: Calibration) -> NDArray[np.float32]:
-    """Return frames in electrons, without the dark."""
+    """Return frames in electrons after subtraction of the dark."""
     dark, electrons_per_adu = calibration.maps(frames_adu.shape[-2:])
     return np.asarray((frames_adu - dark) * electrons_per_adu, np.float32)
 
 
 def calibration_of_electrons(calibration: Calibration) -> Calibration:
-    """Return what is left of a calibration for frames of `electrons_of`."""
+    """Return the calibration that remains for frames from `electrons_of`."""
     plain = replace(calibration, dark=0.0, flat=None, gain_e_per_adu=1.0, em_gain=1.0, saturation_adu=None)
     noise = calibration.read_noise_photoelectrons
     return replace(plain, bad_pixels=None, read_noise_e=noise)
@@ -34,23 +34,23 @@ def calibration_of_electrons(calibration: Calibration) -> Calibration:
 def shifted_gain(
     pipeline: SlopePipeline, frames_e: NDArray[np.float32], prior_px: Floats | None = None
 ) -> Estimate | None:
-    """Return by how much slopes grow when all spots are moved by one pixel: frames against their windows.
+    """Return the slopes' change per pixel of spot motion, by shifting frames against their windows.
 
-    The spots are those that the loop left, with all their speckles and noise, so it is the gain where it is
-    needed; an estimator that does not see spots that are far off has a small one.
+    The spots are those of the closed loop with their speckles and noise, so this is the gain that matters
+    there. An estimator that is insensitive to distant spots has a small gain.
 
     Parameters
     ----------
     pipeline : SlopePipeline
-        For frames in electrons.
+        Pipeline for frames in electrons.
     frames_e : (images, h, w) array
     prior_px : (2 n,) array, optional
-        Width of the estimator's prior, which does not count. Default: it has none.
+        Width of the estimator's prior, whose effect is removed. Default: no prior.
 
     Returns
     -------
     Estimate
-        Its error is from the scatter between images; None of fewer than five.
+        Its error is the scatter between images; None for fewer than five.
     """
     if len(frames_e) < _FEWEST_IMAGES:
         return None

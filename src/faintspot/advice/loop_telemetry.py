@@ -1,4 +1,4 @@
-"""What a closed loop has seen, from telemetry."""
+"""Slopes of a closed loop from telemetry."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from faintspot.io.telemetry import Telemetry
 Floats = NDArray[np.float64]
 
 _CLOSED = 2
-_EVEN_TRUST = 0.2  # above it weights are equal: the best spots alone would tell of the best moments
+_EVEN_TRUST = 0.2  # trust above which weights are equal, to avoid selecting the best moments
 FEWEST_FRAMES = 200
 
 
 @dataclass(frozen=True, eq=False)
 class LoopTelemetry:
-    """Consecutive frames of a closed loop, with m slopes; arms may have taken turns."""
+    """Consecutive frames of a closed loop, with m slopes; configurations may be interleaved."""
 
     arm: NDArray[np.int64]
-    """(frames,)"""
+    """Number of the configuration, (frames,)."""
     turn: NDArray[np.int64]
-    """(frames,): the same number for frames of one arm without a gap between them."""
+    """Number of the turn, (frames,): equal for consecutive frames of one configuration without a gap."""
     slopes_px: Floats
-    """(frames, m): what the frame alone says of a slope, without the estimator's prior; not divided by the
-    centroid gain. Anything finite where not measured."""
+    """Slopes of the frame alone, (frames, m), without the estimator's prior, not divided by centroid gains;
+    any finite number if not measured."""
     variance_px2: Floats
-    """(frames, m): of its noise, as the estimator states it; infinite: not measured."""
+    """Noise variance of the slopes from the estimator, (frames, m); infinite if not measured."""
     trust: Floats
-    """(frames, m): weight of a slope; see `faintspot.control.telemetry.Telemetry`."""
+    """Weight of each slope, (frames, m); see `faintspot.control.telemetry.Telemetry`."""
     held_px: Floats
-    """(frames, m): what the mirror added to the slopes."""
+    """Contribution of the mirror to the slopes, (frames, m)."""
     rate_hz: float
 
     def __len__(self) -> int:
@@ -46,12 +46,12 @@ class LoopTelemetry:
 
     @property
     def since(self) -> NDArray[np.int64]:
-        """(frames,): frames since the turn began."""
+        """Frames since the turn began, (frames,)."""
         starts = np.flatnonzero(np.concatenate([[True], np.diff(self.turn) != 0]))
         return np.arange(len(self)) - np.repeat(starts, np.diff(np.append(starts, len(self))))
 
     def chosen(self, rows: NDArray[np.bool_]) -> LoopTelemetry:
-        """Return some of the frames; what was apart or comes apart is not one turn."""
+        """Return selected frames; frames separated by others belong to different turns."""
         gaps = np.flatnonzero(rows[1:] & ~rows[:-1]) + 1
         turn = self.turn + np.searchsorted(gaps, np.arange(len(self)), "right") * (self.turn.max() + 1)
         return LoopTelemetry(
@@ -65,12 +65,12 @@ class LoopTelemetry:
         )
 
     def weighted(self, gains: Sequence[float] | None = None) -> tuple[Floats, Floats]:
-        """Return residual and open-loop slopes, (frames, m) px, each with its weight, of mean 1 in an arm.
+        """Return residual and open-loop slopes, (frames, m) px, each with a weight (mean 1 per method).
 
         Parameters
         ----------
         gains : sequence of float, optional
-            Centroid gain of every arm. Default: 1.
+            Centroid gain of each configuration. Default: 1.
         """
         residual, open_loop = np.empty_like(self.slopes_px), np.empty_like(self.slopes_px)
         for arm in np.unique(self.arm):
@@ -87,28 +87,28 @@ class LoopTelemetry:
 def seen_in_telemetry(
     telemetry: Telemetry, control: Control, priors_px: Sequence[Floats | None] = (None,)
 ) -> LoopTelemetry:
-    """Return what an engine's closed loop has seen.
+    """Return the slopes of an engine's closed loop.
 
     Parameters
     ----------
     telemetry : faintspot.io.Telemetry
     control : Control
-        Of the engine: matrix, delay and centroid gain.
+        Control of the engine: matrix, delay and centroid gain.
     priors_px : sequence of (m,) arrays
-        How wide the prior of every arm's estimator was, by the arm's number; None: it had none.
+        Width of the prior of each configuration's estimator, by its number; None: no prior.
 
     Raises
     ------
     InputError
-        When there are too few frames of a closed loop, commands of another number, no standard errors, or an
-        estimator with a prior around what is not known any more.
+        When there are too few frames of a closed loop, another number of commands, no standard errors, or an
+        estimator whose prior had a mean that is no longer known.
     """
     check_commands(telemetry, control, "telemetry")
     predicted = control.prediction != NONE and any(prior is not None for prior in priors_px)
     if predicted and (control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM):
         raise InputError(
-            "telemetry: expected an integrator, as what another controller or program has told the estimator "
-            "to expect is not in it"
+            "telemetry: expected an integrator, because the predictions that other controllers or programs "
+            "gave to the estimator are not recorded"
         )
     rows = _usable(telemetry, control.options.delay_frames)
     if len(rows) < FEWEST_FRAMES:
@@ -123,7 +123,7 @@ def seen_in_telemetry(
 
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
-    """Return the frames of a closed loop whose mirror is known."""
+    """Return the frames of a closed loop with known mirror commands."""
     frame, closed = np.asarray(telemetry.frame), np.asarray(telemetry.loop) == _CLOSED
     if len(frame) <= delay:
         return np.empty(0, np.int64)
@@ -138,7 +138,7 @@ def without_priors(
     arm: NDArray[np.int64],
     priors_px: Sequence[Floats | None],
 ) -> tuple[Floats, Floats, Floats]:
-    """Return slopes without the prior of each arm's estimator, their variances, and trust."""
+    """Return slopes without the prior of each configuration's estimator, their variances, and trust."""
     found = np.empty_like(slopes), np.empty_like(slopes), np.empty_like(slopes)
     for number in np.unique(arm):
         rows = arm == number

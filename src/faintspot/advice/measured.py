@@ -1,4 +1,4 @@
-"""What telemetry tells of star, camera, spots and air; and what it cannot tell, and why."""
+"""Quantities of star, camera, spots and turbulence measured from telemetry."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from faintspot.turbulence.slope_covariance import SlopeTurbulence
 Floats = NDArray[np.float64]
 
 OUTER_SCALE_M = 25.0
-"""That r0 and wind are told with."""
-_STRETCHES = 5  # whose scatter says an error
+"""Outer scale assumed for r0 and wind [m]."""
+_STRETCHES = 5  # parts of the telemetry whose scatter gives an error
 _FEWEST_IMAGES = 10
 _FEWEST_OF_STRETCH = 40  # frames
-_WIND_LAG = 8  # frames, in which the air changes by enough to see
+_WIND_LAG = 8  # frames; long enough for a visible change of the turbulence
 _WINDS_M_PER_S = np.geomspace(1.0, 60.0, 9)
-_BINS = 256  # of a spectrum
-_NEIGHBOURS = 10  # bins on each side that say how strong the turbulence is there
-_FALSE_ALARM = 0.01  # of a spectrum without vibrations
-_FIRST_BIN = 10  # below, the turbulence's own spectrum is too steep
+_BINS = 256  # in a spectrum
+_NEIGHBOURS = 10  # bins on each side that estimate the turbulence
+_FALSE_ALARM = 0.01  # false-alarm probability of a spectrum without vibrations
+_FIRST_BIN = 10  # below it the turbulence spectrum is too steep
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A quantity that telemetry tells."""
+    """A quantity measured from telemetry."""
 
     name: str
     unit: str
     value: float = math.nan
-    """NaN: not known."""
+    """Measured value; NaN: not known."""
     error: float = math.nan
-    """Standard error; NaN where it cannot be told."""
+    """Standard error; NaN if it is not known."""
     remark: str = ""
-    """Why it is not known, or what it rests on."""
+    """Reason why it is not known, or assumptions of the value."""
 
     def in_words(self) -> str:
-        """Return it as a line."""
+        """Format the quantity as a line of text."""
         remark = f" ({self.remark})" if self.remark else ""
         if not math.isfinite(self.value):
             return f"{self.name}: not known{remark}"
@@ -65,7 +65,7 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
     frames_e : (images, h, w) array
     layout : Layout
     calibration : Calibration
-        Of the camera; where its dark is rough, the background is taken from the windows' edges.
+        Calibration of the camera; if its dark is uncertain, the background is taken from the windows' edges.
     """
     flux = "flux", "e- per sub-aperture and frame"
     noise, width = ("read noise", "e-"), ("width of the spots", "px, with the pixel and the mean speckles")
@@ -97,14 +97,14 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
 def of_atmosphere(
     seen: LoopTelemetry, layout: Layout, gains: Sequence[float] | None = None
 ) -> list[Measured]:
-    """Return r0, the wind and vibrations, from the slopes without what the mirror added."""
+    """Return r0, the wind and vibrations, from slopes without the mirror's contribution."""
     _, atmosphere = seen.weighted(gains)
     r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
     side = layout.subaperture_m
     if side is None and layout.diameter_m is not None:
         side = layout.diameter_m / (int(np.ptp(layout.cells, axis=0).max()) + 1)
     if side is None or layout.pixel_scale_arcsec is None:
-        why = "the layout does not say subaperture_m and pixel_scale_arcsec"
+        why = "the layout lacks subaperture_m or pixel_scale_arcsec"
         found = [Measured(*r0, remark=why), Measured(*wind, remark=why)]
     else:
         found = [
@@ -119,7 +119,7 @@ def _stretches(seen: LoopTelemetry) -> list[NDArray[np.int64]]:
 
 
 def _of_stretches(kind: Measured, whole: float, parts: list[float], remark: str) -> Measured:
-    """Return a value with the error that its scatter between stretches tells."""
+    """Return a value with an error from the scatter between parts of the telemetry."""
     known = [part for part in parts if math.isfinite(part)]
     error = float(np.std(known, ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
     if not math.isfinite(whole):
@@ -149,7 +149,7 @@ def _r0(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout,
 
 
 def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout, side: float) -> Measured:
-    """Return the speed of one layer, from anywhere, that changes the slopes as fast as they do."""
+    """Return the wind speed of a layer that changes the slopes as fast as observed, from any direction."""
     positions = layout.cells[:, ::-1].astype(np.float64) * side
     far = _WIND_LAG
     if seen.rate_hz <= 0 or len(seen) < 10 * far:
@@ -196,7 +196,7 @@ def _without_tilt(covariance: Floats) -> float:
 
 
 def _vibrations(seen: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
-    """Return lines in the spectra of tip and tilt that the turbulence beside them does not explain."""
+    """Return lines in the spectra of tip and tilt that exceed the turbulence at neighbouring frequencies."""
     from scipy.signal import welch
     from scipy.stats import chi2
 
@@ -228,6 +228,6 @@ def _vibrations(seen: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
 
 
 def _median_beside(power: Floats, place: int) -> float:
-    """Return the median of the bins beside one, without those next to it."""
+    """Return the median of the bins beside a bin, except its direct neighbours."""
     low, high = power[max(place - _NEIGHBOURS, 0) : max(place - 2, 0)], power[place + 3 : place + _NEIGHBOURS]
     return float(np.median(np.concatenate([low, high])))

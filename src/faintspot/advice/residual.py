@@ -1,10 +1,10 @@
-"""How large the wavefront is that a loop leaves, without the noise of the slopes that tell it.
+"""Residual wavefront error of a loop, without the slopes' noise.
 
-Measured slopes are residual slopes and noise. The noise is what the open-loop slopes of a frame, those
-without what the mirror added, differ by from their neighbours' beyond a parabola: it is that of one frame
-alone, while air and commands are known to the frames around it. So an arm of settings is neither punished
-for noise that the mirror does not make, nor rewarded for smoothing that hides what is left; noise that has
-gone through the loop to the mirror counts, as it should.
+Measured slopes are residual slopes plus noise. The noise is estimated from a frame's open-loop slopes, i.e.
+without the mirror's contribution: the deviation from a parabola through neighbouring frames. Noise belongs
+to one frame alone, while turbulence and commands follow from its neighbours. So a configuration
+is neither penalised for noise that the mirror does not produce, nor favoured by smoothing that hides the
+residual. Noise that reaches the mirror through the loop counts, as it should.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ Floats = NDArray[np.float64]
 
 _FEWEST_TURNS = 4
 SETTLE_FRAMES = 20
-"""Of a turn, in which the loop forgets the arm before."""
+"""Frames at the start of a turn that are affected by the previous configuration."""
 
 
 def wavefront_modes(layout: Layout) -> tuple[Floats, str]:
-    """Return what makes Zernike coefficients of slopes, (k, 2 n), and their unit; see `fit_wavefront`.
+    """Return the matrix from slopes to Zernike coefficients, (k, 2 n), and their unit; see `fit_wavefront`.
 
     Raises
     ------
     InputError
-        Where the layout's sub-apertures cannot tell modes apart.
+        When the layout's sub-apertures cannot separate the modes.
     """
     n = len(layout)
     names = Slopes.__dataclass_fields__
@@ -48,8 +48,8 @@ def wavefront_modes(layout: Layout) -> tuple[Floats, str]:
 def residual_wavefront(seen: LoopTelemetry, modes: Floats, gains: Sequence[float] | None = None) -> Floats:
     """Return the mean square of each frame's residual wavefront without the noise, (frames,).
 
-    In the square of the modes' unit; of single frames it may be negative. NaN near the ends of turns, and
-    while the loop forgets the turn before.
+    In the square of the modes' unit; it may be negative for single frames. NaN near the ends of turns, and at
+    their start, while the previous configuration still has an effect.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def residual_wavefront(seen: LoopTelemetry, modes: Floats, gains: Sequence[float
     modes : (k, m) array
         See `wavefront_modes`.
     gains : sequence of float, optional
-        Centroid gain of every arm; see `faintspot.advice.centroid_gain`.
+        Centroid gain of each configuration; see `faintspot.advice.centroid_gain`.
     """
     residual, atmosphere = (each @ modes.T for each in seen.weighted(gains))
     around = np.full_like(atmosphere, np.nan)
@@ -74,11 +74,11 @@ def residual_wavefront(seen: LoopTelemetry, modes: Floats, gains: Sequence[float
 def compared_residual(
     seen: LoopTelemetry, left: Floats, gain_errors: Sequence[float] = (0.0, 0.0)
 ) -> Estimate:
-    """Return by how much arm 1 leaves more than arm 0, in turn with it.
+    """Return by how much the residual of configuration 1 exceeds that of 0, interleaved with it.
 
-    Each turn of arm 1 is compared with the straight line between the turns of arm 0 before and after it.
-    The interval is Student's t, as if these differences were independent: they nearly are, as the air's slow
-    changes cancel.
+    Each turn of configuration 1 is compared with the straight line between the turns of configuration 0
+    before and after it. The interval is Student's t for independent differences. They are nearly independent,
+    because slow changes of the turbulence cancel.
 
     Parameters
     ----------
@@ -86,13 +86,13 @@ def compared_residual(
     left : (frames,) array
         See `residual_wavefront`.
     gain_errors : two floats
-        Relative errors of the centroid gains that `left` rests on.
+        Relative errors of the centroid gains used for `left`.
     """
     turns, first, of_frame = np.unique(seen.turn, return_index=True, return_inverse=True)
     kept = np.isfinite(left)
     count = np.bincount(of_frame, weights=kept, minlength=len(turns))
     sums = np.bincount(of_frame, weights=np.where(kept, left, 0.0), minlength=len(turns))
-    full = (count > 0) & (count >= 0.5 * np.median(count))  # most may have nothing, where frames are lost
+    full = (count > 0) & (count >= 0.5 * np.median(count))  # most turns may be empty if frames are lost
     means, arm = sums[full] / count[full], seen.arm[first][full]
     if len(means) < _FEWEST_TURNS or len(set(arm.tolist())) < 2:
         return Estimate(math.nan)

@@ -1,4 +1,4 @@
-"""A simulated loop as advice sees a running one: its slopes, and images of some of its frames."""
+"""Slopes and images of a simulated loop, in the form that advice uses for a running one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from faintspot.ao_loop.telescope_model import TelescopeModel
 
 
 def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> LoopTelemetry:
-    """Return what a simulated loop has seen after settling; its slopes divided as the loop does it."""
+    """Return the slopes of a simulated loop after settling, divided by the centroid gain as in the loop."""
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
     later, arm = record.delay_frames - 1, record.arm.astype(np.int64)
     expected = np.zeros_like(held)
@@ -35,7 +35,7 @@ def seen_in_record(record: LoopRecord, arms: Sequence[Arm]) -> LoopTelemetry:
 
 
 def frames_of_record(record: LoopRecord, numbers: Sequence[int]) -> NDArray[np.float32]:
-    """Return some frames of a run, (images, h, w) electrons, made anew from what the mirror held."""
+    """Return frames of a run, (images, h, w) electrons, simulated again from the mirror's commands."""
     configuration = LoopConfiguration.from_text(record.configuration)
     telescope_model = TelescopeModel(configuration, record.seed, record.realisation)
     frames = []

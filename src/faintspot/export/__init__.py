@@ -1,4 +1,4 @@
-"""Settings as the files that other controllers read: one module a kind of controller."""
+"""Export of settings to files of other controllers: one module per kind of controller."""
 
 from faintspot.export.darc import export_darc
 from faintspot.export.weights import export_weights

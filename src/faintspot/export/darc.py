@@ -1,7 +1,7 @@
-"""Parameters of DARC, the Durham adaptive optics real-time controller, for what faintspot is set to do.
+"""Parameters of DARC, the Durham adaptive optics real-time controller, for a faintspot configuration.
 
-Names, shapes, units and order are those of DARC's manual (its section on configuration); nothing else of
-DARC, which has a licence of its own, is used here.
+Names, shapes, units and order follow DARC's manual (section on configuration); no code of DARC, which has
+its own licence, is used.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 
 class Parameter(NamedTuple):
-    """One parameter by its name in DARC: a value, or an array for a file of its own."""
+    """One DARC parameter: a value, or an array that gets its own file."""
 
     name: str
     value: Any
@@ -44,7 +44,7 @@ class Parameter(NamedTuple):
 
     @property
     def is_array(self) -> bool:
-        """Whether it is kept in a file."""
+        """Whether it is written to a file of its own."""
         return isinstance(self.value, np.ndarray)
 
 
@@ -56,33 +56,33 @@ def export_darc(
     control: bool = True,
     form: str = "fits",
 ) -> list[Parameter]:
-    """Write what DARC's users set by hand, for the sensor and estimator of a configuration.
+    """Write DARC's parameters for the sensor and estimator of a configuration.
 
     Parameters
     ----------
     configuration_file : path
         faintspot.toml, with estimator "brightest", "thresholded", "centroid" or "window".
     folder : path
-        A folder that does not exist yet, or is empty: arrays as NAME.fits or NAME.npy, and parameters.txt, a
+        Folder, which must be empty or not exist: arrays as NAME.fits or NAME.npy, and parameters.txt with a
         line for each parameter.
     reference : array or path, optional
-        Reference slopes, px, as for `SlopePipeline`. Default: those of [control], if there are any.
+        Reference slopes, px, as for `SlopePipeline`. Default: those of [control], if any.
     control : bool
-        Whether to write the control matrix of [control], where there is one.
+        Whether to write the control matrix of [control], if there is one.
     form : {"fits", "npy"}
 
     Returns
     -------
     list of Parameter
-        What was written.
+        The parameters written.
 
     Raises
     ------
     InputError
-        For an estimator or a controller that these parameters cannot express, a folder that is not empty,
-        and for what cannot be read or written.
+        When these parameters cannot express the estimator or controller, the folder is not empty, or a file
+        cannot be read or written.
     MissingExtraError
-        For FITS files without astropy.
+        For FITS files, when astropy is not installed.
     """
     one_of("format", form, FORMATS)
     if form == "fits":
@@ -97,14 +97,14 @@ def export_darc(
 
 
 def interleaved(slopes: ArrayLike) -> Floats:
-    """Return (..., 2 n) slopes, all x, then all y, in DARC's order: x, y of the first sub-aperture, ..."""
+    """Return slopes (..., 2 n), all x, then all y, in DARC's order: x, y of the first sub-aperture, ..."""
     array = np.asarray(slopes, np.float64)
     pairs = array.reshape(*array.shape[:-1], 2, array.shape[-1] // 2)
     return np.ascontiguousarray(pairs.swapaxes(-1, -2)).reshape(array.shape)
 
 
 def _of_sensor(pipeline: SlopePipeline) -> Iterator[Parameter]:
-    """Where sub-apertures are, and how pixels become electrons."""
+    """Yield the geometry of the sub-apertures and the calibration of pixels to electrons."""
     layout = pipeline.layout
     (height, width), n = layout.frame_shape, len(layout)
     first, last = layout.corners, layout.corners + np.array(layout.window)
@@ -114,18 +114,18 @@ def _of_sensor(pipeline: SlopePipeline) -> Iterator[Parameter]:
     yield Parameter("ncam", 1, "cameras")
     yield Parameter("npxlx", _int([width]), "columns of a frame")
     yield Parameter("npxly", _int([height]), "rows of a frame")
-    yield Parameter("nsub", _int([n]), "sub-apertures; only lit ones are written")
+    yield Parameter("nsub", _int([n]), "sub-apertures; only illuminated ones are written")
     yield Parameter("subapFlag", _int(np.ones(n)), "which sub-apertures are used")
     yield Parameter("subapLocType", 0, "sub-apertures are rectangles")
     yield Parameter("subapLocation", _int(places), "first row, row after the last, step; columns alike")
     yield Parameter("pxlCnt", _int(last[:, 0] * width), "pixels to wait for: up to the end of the last row")
-    yield Parameter("windowMode", "basic", "windows stay where they are")
+    yield Parameter("windowMode", "basic", "windows do not move")
     yield Parameter("darkNoise", _map(np.where(bad, 0.0, dark)), "dark, ADU, row by row")
     yield Parameter("flatField", _map(np.where(bad, 0.0, scale)), "electrons per ADU; 0 in bad pixels")
 
 
 def _of_estimator(pipeline: SlopePipeline) -> Iterator[Parameter]:
-    """What is done with a sub-aperture's pixels, and where slopes are counted from."""
+    """Yield the processing of a sub-aperture's pixels, and the reference positions."""
     n = len(pipeline.layout)
     estimator = pipeline.settings.estimator
     brightest, threshold, weights = np.zeros(n, np.int64), np.zeros(n), None
@@ -143,26 +143,26 @@ def _of_estimator(pipeline: SlopePipeline) -> Iterator[Parameter]:
     algorithm = _SUBTRACTED if isinstance(estimator, Thresholded) else _NO_THRESHOLD
     reference = interleaved(_centre(pipeline).reference.T.reshape(-1))
     yield Parameter("centroidMode", "CoG", "centre of gravity")
-    yield Parameter("useBrightest", _int(brightest), "pixels that are kept; negative: the next one taken off")
-    yield Parameter("thresholdAlgo", algorithm, "0: none, 2: taken off, what is negative becomes 0")
+    yield Parameter("useBrightest", _int(brightest), "pixels kept; negative: the next one is subtracted")
+    yield Parameter("thresholdAlgo", algorithm, "0: none, 2: subtracted, negative values become 0")
     yield Parameter("thresholdValue", threshold.astype(np.float32), "electrons")
     if weights is not None:
         yield Parameter("pxlWeight", weights, "weight of every pixel, row by row; 0 outside windows")
-        yield Parameter("slope_gain", _slope_gain(pipeline), "px for 1 px of DARC's slopes; rmx has it")
-    yield Parameter("refCentroids", reference.astype(np.float32), "px from the middles of windows; x, y, ...")
+        yield Parameter("slope_gain", _slope_gain(pipeline), "px per px of DARC's slopes; included in rmx")
+    yield Parameter("refCentroids", reference.astype(np.float32), "px from the centres of windows; x, y, ...")
 
 
 def _brightest(pipeline: SlopePipeline) -> NDArray[np.int64]:
-    """Numbers of brightest pixels of every sub-aperture, with the sign that says what is taken off."""
+    """Return the number of brightest pixels per sub-aperture; the sign selects the subtraction."""
     estimator, n, pixels = pipeline.settings.estimator, len(pipeline.layout), pipeline.layout.pixels
     if pipeline.plan.needs_flux:
         raise InputError(
-            'estimator.keep_brightest = "auto": expected the flux of the spots, settings.flux_e, of which '
-            "their number follows"
+            'estimator.keep_brightest = "auto": expected settings.flux_e, the flux of the spots, which '
+            "determines their number"
         )
     rank = pipeline.plan.settings[0][gravity.RANK].astype(np.int64)
     rules = estimator.values("rule", n, pixels)
-    # Where the pixel of that rank is taken off, it is not kept.
+    # If the pixel of that rank is subtracted, it is not kept.
     kept: NDArray[np.int64] = np.where(rules == "threshold", rank, 1 - rank)
     if not kept.all():
         raise InputError("estimator.keep_brightest = 1: expected at least 2 with rule 'subtract_kth'")
@@ -170,7 +170,7 @@ def _brightest(pipeline: SlopePipeline) -> NDArray[np.int64]:
 
 
 def _centre(pipeline: SlopePipeline) -> WeightedCentre:
-    """Weights, gain and reference of every sub-aperture; all weights 1 but for estimator "window"."""
+    """Return weights, gain and reference of each sub-aperture; weights are 1 unless it is "window"."""
     if isinstance(pipeline.settings.estimator, Window):
         return centre_of(pipeline, fixed_weights(pipeline))
     n = len(pipeline.layout)
@@ -179,12 +179,12 @@ def _centre(pipeline: SlopePipeline) -> WeightedCentre:
 
 
 def _slope_gain(pipeline: SlopePipeline) -> NDArray[np.float32]:
-    """Our slopes for DARC's, (2 n,) in its order: a weighted centre of gravity moves less than the spot."""
+    """Return the factor from DARC's slopes to px, (2 n,) in its order: weighting reduces a spot's motion."""
     return interleaved(_centre(pipeline).gain.T.reshape(-1)).astype(np.float32)
 
 
 def _of_control(pipeline: SlopePipeline, control: Control | None) -> Iterator[Parameter]:
-    """The integrator, for slopes in DARC's order and of DARC's size."""
+    """Yield the integrator, for slopes in DARC's order and scale."""
     if control is None:
         return
     options, commands = control.options, control.commands
@@ -193,15 +193,15 @@ def _of_control(pipeline: SlopePipeline, control: Control | None) -> Iterator[Pa
     moved = interleaved(control.interaction.T) / gain
     each = np.ones(commands, np.float32)
     yield Parameter("nacts", commands, "commands")
-    yield Parameter("rmx", matrix.astype(np.float32), "what slopes add to commands, for gain 1")
+    yield Parameter("rmx", matrix.astype(np.float32), "commands added per slope, for gain 1")
     yield Parameter("gain", options.gain * each, "loop gain")
-    yield Parameter("reconstructMode", "truth", "added to the last commands, times decayFactor")
-    yield Parameter("decayFactor", (1.0 - options.leak) * each, "1 less the leak")
-    yield Parameter("interaction", moved.astype(np.float32), "slopes of a unit of each command; for scripts")
+    yield Parameter("reconstructMode", "truth", "added to decayFactor times the last commands")
+    yield Parameter("decayFactor", (1.0 - options.leak) * each, "1 minus the leak")
+    yield Parameter("interaction", moved.astype(np.float32), "slopes per unit of each command; for scripts")
 
 
 def _frame_of(pipeline: SlopePipeline, windows: Floats) -> NDArray[np.float32]:
-    """A map of the whole frame, row by row, of maps of every window."""
+    """Return a map of the whole frame, row by row, from maps of each window."""
     layout = pipeline.layout
     frame = np.zeros(layout.frame_shape)
     rows = layout.corners[:, 0, None, None] + np.arange(layout.window[0])[:, None]
@@ -211,7 +211,7 @@ def _frame_of(pipeline: SlopePipeline, windows: Floats) -> NDArray[np.float32]:
 
 
 def _map(frame: ArrayLike) -> NDArray[np.float32]:
-    """A map of a frame as one row of numbers after the other."""
+    """Return a map of a frame as one row of numbers after another."""
     return np.asarray(frame, np.float32).reshape(-1)
 
 
@@ -222,7 +222,7 @@ def _int(values: ArrayLike) -> NDArray[np.int32]:
 def _write(folder: Path, parameters: list[Parameter], form: str) -> None:
     """Write the arrays, then the list of all parameters."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: exists already: choose another name")
+        raise InputError(f"{folder}: already exists; choose another name")
     with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     lines = []
@@ -237,7 +237,7 @@ def _write(folder: Path, parameters: list[Parameter], form: str) -> None:
 
 
 def _content(parameter: Parameter, form: str) -> bytes:
-    """One array as a file."""
+    """Return an array as the content of a file."""
     stream = io.BytesIO()
     if form == "npy":
         np.save(stream, parameter.value)

@@ -1,4 +1,4 @@
-"""What is exported of a configuration: its pipeline, with reference slopes, and its control."""
+"""Parts of a configuration that are exported: its pipeline with reference slopes, and its control."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 def pipeline_of(
     path: str | Path, reference: ArrayLike | str | Path | None, control: Control | None = None
 ) -> SlopePipeline:
-    """Return the pipeline of a configuration file, with the reference slopes that are given or in [control].
+    """Return the pipeline of a configuration file, with the given reference slopes or those of [control].
 
     Raises
     ------
@@ -40,35 +40,35 @@ def pipeline_of(
 
 
 def control_of(path: str | Path) -> Control | None:
-    """Return the control of a configuration file, when that is an integrator; None where there is none.
+    """Return the control of a configuration file if it is an integrator; None without control.
 
     Raises
     ------
     InputError
-        For another controller, and as `faintspot.control.configuration.load_control`.
+        When it is another controller, and as for `faintspot.control.configuration.load_control`.
     """
     control = load_control(path)
     if control is not None and control.model is not None:
         raise InputError(
-            f"{path}: control.controller = {control.options.controller!r}: expected 'integrator', which a "
-            "control matrix is; set that, or leave the control out"
+            f"{path}: control.controller = {control.options.controller!r}: expected 'integrator', which "
+            "is a control matrix; set that, or leave the control out"
         )
     return control
 
 
 def fixed_weights(pipeline: SlopePipeline) -> FixedWeights:
-    """Return the weights of estimator "window", one kind for each sub-aperture.
+    """Return the weights of estimator "window", one set for each sub-aperture.
 
     Raises
     ------
     InputError
-        For another estimator, which has none, and for sums that are not divided by the flux.
+        When the estimator is another one, or its sums are not divided by the flux.
     """
     estimator = pipeline.settings.estimator
     if not isinstance(estimator, Window):
         raise InputError(
-            f"estimator {estimator.name!r}: expected 'window', which has fixed weights; another's depend on "
-            "the frame"
+            f"estimator {estimator.name!r}: expected 'window', which has fixed weights; those of others "
+            "depend on the frame"
         )
     if estimator.normalisation == NONE:
         raise InputError('estimator.normalisation = "none": expected "mean" or "frame"')
@@ -78,9 +78,9 @@ def fixed_weights(pipeline: SlopePipeline) -> FixedWeights:
 
 
 def offsets_of(pipeline: SlopePipeline) -> Floats:
-    """Return what references take off the slopes of the weights, (n, 2) px.
+    """Return the offsets that references subtract from the weights' slopes, (n, 2) px.
 
-    Weights that were given are around the sub-apertures' centres, Gaussian windows around the references.
+    Weights from a file are centred on the sub-apertures, Gaussian windows on the references.
     """
     sensor = pipeline.plan.sensor
     given = isinstance(sensor.score, FixedWeights)
@@ -88,12 +88,12 @@ def offsets_of(pipeline: SlopePipeline) -> Floats:
 
 
 def centre_of(pipeline: SlopePipeline, weights: FixedWeights) -> WeightedCentre:
-    """Return the weighted centre of gravity of every sub-aperture, its reference as the pipeline's.
+    """Return the weighted centre of gravity of each sub-aperture, with the pipeline's reference.
 
     Raises
     ------
     InputError
-        When the weights are none.
+        When the weights are not those of a centre of gravity.
     """
     centre = weights.weighted_centre()
     return centre._replace(reference=centre.reference + offsets_of(pipeline) / centre.gain)

@@ -1,4 +1,4 @@
-"""Weights of estimator "window" as FITS, for controllers that take a weighted centre of gravity."""
+"""Weights of estimator "window" as FITS, for controllers that use a weighted centre of gravity."""
 
 from __future__ import annotations
 
@@ -23,42 +23,42 @@ def export_weights(
 ) -> tuple[str, ...]:
     """Write the weights of estimator "window" to a FITS file.
 
-    Images, float32, (n, ny, nx) for n sub-apertures in the layout's order unless said otherwise:
+    Images are float32, (n, ny, nx) for n sub-apertures in the layout's order, unless stated otherwise:
 
     - CORNERS (n, 2), int32: row and column of each window's first pixel, counted from 0;
-    - WEIGHTS: of a centre of gravity c of weighted pixels, the largest 1; GAIN and REFERENCE (n, 2), x and y:
-      the slope is gain (c - reference), c and reference counted from the window's middle, px;
-    - LINEAR_X, LINEAR_Y, MEAN_SPOT: the same as sums, for flux that is known: the slope is the sum of
-      LINEAR_X times (pixels over flux - MEAN_SPOT) less OFFSET, px;
-    - FLUX: the sum of FLUX times the pixels is the flux;
-    - OFFSET (n, 2): what references add to the sums' slopes.
+    - WEIGHTS: pixel weights of a centre of gravity c, with maximum 1; GAIN and REFERENCE (n, 2), x and y: the
+      slope is gain (c - reference), with c and reference in px from the window's centre;
+    - LINEAR_X, LINEAR_Y, MEAN_SPOT: the same as sums, for known flux: the slope is the sum of LINEAR_X times
+      (pixels / flux - MEAN_SPOT), minus OFFSET, px;
+    - FLUX: the flux is the sum of FLUX times the pixels;
+    - OFFSET (n, 2): contribution of the references to the slopes from sums.
 
-    WEIGHTS, GAIN and REFERENCE are absent for weights that are none of one centre of gravity.
+    WEIGHTS, GAIN and REFERENCE are absent for weights that are not those of a centre of gravity.
 
     Parameters
     ----------
     configuration_file : path
         faintspot.toml, with estimator "window".
     output : path
-        A name that ends with .fits.
+        A name ending in .fits.
     reference : array or path, optional
         Reference slopes, px, as for `SlopePipeline`.
 
     Returns
     -------
     tuple of str
-        Names of the images that were written.
+        Names of the images written.
 
     Raises
     ------
     InputError
-        For another estimator, another ending, or what cannot be read or written.
+        When the estimator or the ending is another one, or a file cannot be read or written.
     MissingExtraError
-        Without astropy.
+        When astropy is not installed.
     """
     path = Path(output)
     if path.suffix.lower() != ".fits":
-        raise InputError(f"{path}: expected a name that ends with .fits")
+        raise InputError(f"{path}: expected a name ending in .fits")
     fits = load_fits()
     pipeline = pipeline_of(configuration_file, reference)
     weights = fixed_weights(pipeline)
@@ -68,7 +68,7 @@ def export_weights(
         centre = centre_of(pipeline, weights)
         images |= {"WEIGHTS": centre.weights, "GAIN": centre.gain, "REFERENCE": centre.reference}
     except InputError:
-        pass  # they are no centre of gravity, and still sums
+        pass  # no centre of gravity: sums only
     images |= {"LINEAR_X": weights.x, "LINEAR_Y": weights.y, "MEAN_SPOT": weights.mean_spot}
     images |= {"FLUX": weights.flux, "OFFSET": offsets_of(pipeline)}
     primary = fits.PrimaryHDU()

@@ -1,4 +1,4 @@
-"""Frames in, slopes and telemetry out: FITS, TIFF, NumPy, Zarr, CSV, AOT."""
+"""Input of frames, output of slopes and telemetry: FITS, TIFF, NumPy, Zarr, CSV, AOT."""
 
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from faintspot.io.telemetry import Telemetry as Telemetry
     from faintspot.io.telemetry import read_telemetry as read_telemetry
 
-# Imported at first use: they need zarr.
+# Imported on first use because they need zarr.
 _HOMES = {
     "AotSensor": "faintspot.io.aot_reading",
     "read_aot": "faintspot.io.aot_reading",

@@ -1,8 +1,8 @@
-"""Telemetry as a file of the Adaptive Optics Telemetry standard (AOT, FITS), by way of aotpy.
+"""Writing telemetry as a file of the Adaptive Optics Telemetry standard (AOT, FITS), with aotpy.
 
-Dimensions and units are those of the documentation of aotpy 3 (https://pypi.org/project/aotpy/). AOT has
-places for slopes, fluxes, frames and times. It has none for standard errors, flags, iterations, the arms of
-interleaved settings and denoised images: they stay in the Zarr store.
+Dimensions and units follow the documentation of aotpy 3 (https://pypi.org/project/aotpy/). AOT has fields for
+slopes, fluxes, frames and times. It has none for standard errors, flags, iterations, the interleaved
+configurations and denoised images: these stay in the Zarr store.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from faintspot.base.files import write_atomically
 from faintspot.base.toml_files import parse_text
 from faintspot.io.telemetry import Telemetry
 
-# The standard wants both, and a sensor alone has neither.
+# The standard demands both, which a sensor alone does not have.
 _EXPECTED = r".AOT_(WAVEFRONT_CORRECTORS|LOOPS). .* contains no data"
 AO_MODES = ("SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO")
 
@@ -30,28 +30,27 @@ AO_MODES = ("SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO")
 def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") -> None:
     """Write telemetry to an AOT file.
 
-    Of the system, AOT demands a telescope, a source and a mode; the first two are there as names without
-    data. Slopes are `measurements` (t, 2, n), px, x and y; they were published with the reference subtracted,
-    which is `ref_measurements`, px from the middle of each window. Fluxes are sums over the sub-aperture,
-    electrons after background subtraction, where the standard speaks of averages in ADU. Estimator and
-    settings at the start are in the keyword CONFIG, changes in CHG1, CHG2 and so on, the layout and the
-    reference slopes with all their digits in LAYOUT and SUBTRACT of the references, JSON texts. There are no
-    wavefront correctors and loops, about which aotpy warns when it reads the file. All of it is in memory at
-    once.
+    AOT demands a telescope, a source and a mode; the first two are written as names without data. Slopes are
+    `measurements` (t, 2, n), px, x and y. They were published with the reference subtracted, which is stored
+    as `ref_measurements`, px from the centre of each window. Fluxes are sums over the sub-aperture in
+    electrons after background subtraction; the standard has averages in ADU. The keyword CONFIG holds the
+    initial estimator and settings; CHG1, CHG2 and so on hold changes. LAYOUT and SUBTRACT of the references
+    hold the layout and the exact reference slopes as JSON texts. There are no wavefront correctors and loops,
+    so that aotpy warns when it reads the file. All data are in memory at once.
 
     Parameters
     ----------
     path : path
         A FITS file that does not exist yet.
     telemetry : Telemetry
-        With at least one frame.
+        Telemetry with at least one frame.
     ao_mode : {"SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"}
-        What the sensor is part of.
+        AO mode of the system.
 
     Raises
     ------
     InputError
-        When there is no frame, the file exists, or cannot be written.
+        When there is no frame, or the file exists or cannot be written.
     MissingExtraError
         When aotpy is not installed.
 
@@ -69,7 +68,7 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
     if not len(telemetry.frame):
         raise InputError("telemetry: expected at least one frame, got none")
     if target.exists():
-        raise InputError(f"{target}: exists already: choose another name")
+        raise InputError(f"{target}: already exists; choose another name")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", _EXPECTED)
         file = AOTFITSWriter(_system(telemetry, ao_mode)).get_hdulist()
@@ -77,7 +76,7 @@ def write_aot(path: str | Path, telemetry: Telemetry, *, ao_mode: str = "SCAO") 
 
 
 def _system(telemetry: Telemetry, ao_mode: str) -> Any:
-    """The whole as aotpy has it."""
+    """Return the system as aotpy represents it."""
     import aotpy
 
     unix = telemetry.unix_time_s
@@ -98,7 +97,7 @@ def _system(telemetry: Telemetry, ao_mode: str) -> Any:
 
 
 def _metadata(telemetry: Telemetry) -> list[Any]:
-    """What AOT has no place of its own for, as keywords."""
+    """Return keywords for data that have no field in AOT."""
     from aotpy import Metadatum
 
     dropped = int(telemetry.attributes["dropped_records"])
@@ -111,7 +110,7 @@ def _metadata(telemetry: Telemetry) -> list[Any]:
 
 
 def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
-    """The Shack-Hartmann sensor with its measurements."""
+    """Return the Shack-Hartmann sensor with its measurements."""
     import aotpy
 
     attributes = telemetry.attributes
@@ -140,7 +139,7 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
         measurements=aotpy.Image("SLOPES", slopes, "pix", when, [subtracted]),
         ref_measurements=aotpy.Image("REFERENCE", reference.astype(np.float32), "pix", metadata=exact),
         subaperture_intensities=aotpy.Image("FLUX", telemetry.flux, "electron", when, [summed]),
-        # AOT knows square sub-apertures only.
+        # AOT supports square sub-apertures only.
         subaperture_size=float(window[0]) if window[0] == window[1] else None,
         mask_offsets=[aotpy.Coordinates(float(corners[:, 1].min()), float(corners[:, 0].min()))],
         centroiding_algorithm=estimator,
@@ -153,7 +152,7 @@ def _sensor(telemetry: Telemetry, source: Any, estimator: str | None) -> Any:
 
 
 def _mask(cells: NDArray[np.int64]) -> NDArray[np.int32] | None:
-    """Square grid with the number of each sub-aperture, -1 elsewhere; None where two share a cell."""
+    """Return a square grid with the number of each sub-aperture, -1 elsewhere; None if two share a cell."""
     places = cells - cells.min(axis=0)
     mask = np.full((int(places.max()) + 1,) * 2, -1, np.int32)
     mask[places[:, 0], places[:, 1]] = np.arange(len(places))
@@ -161,7 +160,7 @@ def _mask(cells: NDArray[np.int64]) -> NDArray[np.int32] | None:
 
 
 def _detector(telemetry: Telemetry) -> Any:
-    """The detector, with the frames that were recorded."""
+    """Return the detector with the recorded frames."""
     import aotpy
 
     detector = aotpy.Detector(uid="DETECTOR")
@@ -169,7 +168,7 @@ def _detector(telemetry: Telemetry) -> Any:
         numbers, places = np.unique(telemetry.frame, return_index=True)
         found = np.minimum(np.searchsorted(numbers, telemetry.image_frame), len(numbers) - 1)
         known = bool(np.all(numbers[found] == telemetry.image_frame))
-        times = telemetry.unix_time_s[places[found]].tolist() if known else []  # all of them, or none
+        times = telemetry.unix_time_s[places[found]].tolist() if known else []  # for all or none
         when = aotpy.Time("IMAGES", timestamps=times, frame_numbers=telemetry.image_frame.tolist())
         detector.pixel_intensities = aotpy.Image("PIXELS", telemetry.raw, "adu", when)
     return detector

@@ -1,7 +1,7 @@
-"""Sensors from files of the Adaptive Optics Telemetry standard (AOT, FITS), by way of aotpy.
+"""Reading sensors from files of the Adaptive Optics Telemetry standard (AOT, FITS), with aotpy.
 
-What the standard leaves open is taken as faintspot writes it: rows of an image are its vertical axis,
-positions are counted from 0, slopes are px from the middle of a sub-aperture's window.
+Where the standard is not specific, faintspot's conventions apply: rows of an image are its vertical axis,
+positions are counted from 0, slopes are in px from the centre of a sub-aperture's window.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PIXELS = ("pix", "pixel", "px")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AotSensor:
-    """A Shack-Hartmann sensor of an AOT file, with what the file has of it; None is what it has not.
+    """A Shack-Hartmann sensor of an AOT file, with the data that the file holds; missing data are None.
 
     Examples
     --------
@@ -39,51 +39,51 @@ class AotSensor:
 
     path: Path
     name: str
-    """Its UID."""
+    """Unique identifier (UID)."""
     n: int
     """Number of sub-apertures."""
     layout: Layout | None
     tables: Mapping[str, Any]
-    """[estimator] and [settings] of a faintspot.toml, in files that faintspot has written."""
+    """Tables [estimator] and [settings] of a faintspot.toml, in files written by faintspot."""
     parts: Mapping[str, str] | None
     """Calibration, PSF and score in such files, for `faintspot.pipeline.configuration.unpacked`."""
     reference: NDArray[np.float64] | None
-    """(2 n,): slopes that are or were to be subtracted, px from the layout's centres, all x, then all y."""
+    """Slopes that are to be or were subtracted, (2 n,): px from the layout's centres, all x, then all y."""
     pixels: str | None
-    """The image of the frames: `open_frames` reads "file:pixels"."""
+    """Name of the image with the frames: `open_frames` reads "file:pixels"."""
     image_frame: NDArray[np.float64]
-    """Numbers of those frames; empty where the file does not say."""
+    """Numbers of those frames; empty if the file has none."""
     slopes: NDArray[Any] | None
-    """(t, 2, n): x and y as they are stored, in `unit`."""
+    """Slopes as stored, (t, 2, n): x and y, in `unit`."""
     unit: str
     frame: NDArray[np.float64]
-    """Numbers of the frames of the slopes; empty where the file does not say."""
+    """Frame numbers of the slopes; empty if the file has none."""
     unix_time_s: NDArray[np.float64]
-    """Their times; empty where the file does not say."""
+    """Times of the slopes; empty if the file has none."""
     flux: NDArray[Any] | None
-    """(t, n), as it is stored."""
+    """Flux as stored, (t, n)."""
     interaction: NDArray[np.float64] | None
-    """(2 n, commands): slopes, all x, then all y, for a unit of each command; of the first loop with one."""
+    """Interaction matrix of the first loop with one, (2 n, commands): all x, then all y, per unit command."""
 
     def __repr__(self) -> str:
-        """Say what there is."""
+        """Return the name, the number of sub-apertures and the available data."""
         what = [name for name in ("layout", "pixels", "slopes", "reference", "interaction") if self.has(name)]
         return f"AotSensor({self.name!r}, {self.n} sub-apertures, {', '.join(what) or 'no data'})"
 
     def has(self, name: str) -> bool:
-        """Whether the file has it."""
+        """Return whether the file holds a quantity."""
         return getattr(self, name) is not None
 
 
 def is_aot(path: str | Path) -> bool:
-    """Tell whether a file is a FITS file of the AOT standard."""
+    """Return whether a file is a FITS file of the AOT standard."""
     try:
         return AOT_VERSION in next(units_of(Path(path))).header
     except (
         InputError,
         MissingExtraError,
         OSError,
-    ):  # another file, or a damaged one, about which its reader says more
+    ):  # another or a damaged file; its reader gives the reason
         return False
 
 
@@ -110,13 +110,13 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
     ----------
     path : path
     sensor : str, optional
-        UID of the sensor, or the name of the image with its frames. Default: the only one, or the only one
+        UID of the sensor, or name of the image with its frames. Default: the only sensor, or the only one
         with pixels.
 
     Raises
     ------
     InputError
-        When it is not a valid AOT file, has no such sensor, or says things of it that do not fit together.
+        When the file is not valid AOT, has no such sensor, or its data are inconsistent.
     MissingExtraError
         When aotpy is not installed.
 
@@ -139,11 +139,11 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
     total = sum(unit.data_bytes for unit in whole_units(path))
     check_bytes(path, total, memory_bytes() // 2, "telemetry")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what faintspot does not ask for
+        warnings.simplefilter("ignore")  # about data that faintspot does not read
         try:
-            # Images elsewhere would be asked for in a dialogue, or fetched.
+            # By default aotpy would ask for external images in a dialogue, or fetch them.
             system = AOTFITSReader(path, externals="ignore").get_system()
-        except Exception as error:  # aotpy raises whatever a damaged file leads to
+        except Exception as error:  # aotpy raises many kinds of errors on damaged files
             raise InputError(f"{path}: the AOT file is not valid ({one_line(error)})") from None
     sensors = [each for each in system.wavefront_sensors if isinstance(each, aotpy.ShackHartmann)]
     found = _chosen(path, sensors, sensor)
@@ -157,11 +157,11 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
     except InputError as error:
         raise InputError(f"{path}: sensor {found.uid!r}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-        raise InputError(f"{path}: sensor {found.uid!r}: not as AOT has it ({one_line(error)})") from None
+        raise InputError(f"{path}: sensor {found.uid!r}: not valid AOT ({one_line(error)})") from None
 
 
 def _chosen(path: Path, sensors: list[Any], name: str | None) -> Any:
-    """The sensor that is meant."""
+    """Return the selected sensor."""
     listed = ", ".join(str(each.uid) for each in sensors) or "none"
     if name is not None:
         sensors = [each for each in sensors if name in (each.uid, _pixels_of(each))]
@@ -175,7 +175,7 @@ def _chosen(path: Path, sensors: list[Any], name: str | None) -> Any:
 
 
 def _pixels_of(sensor: Any) -> str | None:
-    """Name of the image with a sensor's frames."""
+    """Return the name of the image with a sensor's frames."""
     image = None if sensor.detector is None else sensor.detector.pixel_intensities
     return None if image is None or image.data is None else str(image.name)
 
@@ -219,7 +219,7 @@ def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
 
 
 def _layout(found: Any, n: int, size: tuple[int, int] | None) -> Layout | None:
-    """Sub-apertures as the standard has them: a grid of squares of pixels; None where it lacks a part."""
+    """Return the layout, in AOT a grid of squares of pixels; None if data for it are missing."""
     mask = _data_of(found, "subaperture_mask")
     if mask is None or not found.mask_offsets or found.subaperture_size is None:
         return None
@@ -228,7 +228,7 @@ def _layout(found: Any, n: int, size: tuple[int, int] | None) -> Layout | None:
     places = np.argwhere(mask >= 0)
     numbers = mask[mask >= 0]
     if not np.array_equal(np.sort(numbers), np.arange(n)):
-        raise InputError(f"subaperture_mask: expected the numbers 0 to {n - 1}, each once, got others")
+        raise InputError(f"subaperture_mask: expected the numbers 0 to {n - 1}, each once, got other numbers")
     cells = places[np.argsort(numbers)]
     side, offset = float(found.subaperture_size), found.mask_offsets[0]
     first = np.array([float(offset.y), float(offset.x)])
@@ -241,7 +241,7 @@ def _layout(found: Any, n: int, size: tuple[int, int] | None) -> Layout | None:
 
 
 def _reference(found: Any, n: int) -> NDArray[np.float64] | None:
-    """Reference slopes, where they are in pixels."""
+    """Return the reference slopes if they are in pixels."""
     values = _data_of(found, "ref_measurements")
     if values is None or str(found.ref_measurements.unit).lower() not in _PIXELS:
         return None
@@ -251,7 +251,7 @@ def _reference(found: Any, n: int) -> NDArray[np.float64] | None:
 
 
 def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
-    """The interaction matrix, (2 n, commands)."""
+    """Return the interaction matrix, (2 n, commands)."""
     if not loops:
         return None
     values = np.asarray(loops[0].interaction_matrix.data)
@@ -262,7 +262,7 @@ def _interaction(loops: list[Any], n: int) -> NDArray[np.float64] | None:
 
 
 def _data_of(owner: Any, name: str) -> Any:
-    """An image's data in native byte order, or None."""
+    """Return an image's data in native byte order, or None."""
     image = None if owner is None else getattr(owner, name)
     if image is None or image.data is None:
         return None
@@ -271,7 +271,7 @@ def _data_of(owner: Any, name: str) -> Any:
 
 
 def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Frame numbers and times of an image; empty where it has none."""
+    """Return frame numbers and times of an image; empty if it has none."""
     time = None if image is None else image.time
     values = ([], []) if time is None else (time.frame_numbers, time.timestamps)
     numbers, stamps = (np.asarray([] if each is None else each, np.float64) for each in values)
@@ -279,7 +279,7 @@ def _time_of(image: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _own(image: Any) -> dict[str, Any]:
-    """What faintspot has written beside the references."""
+    """Return the data that faintspot has written with the references."""
     if image is None:
         return {}
     values = {item.key: item.value for item in image.metadata}
@@ -287,7 +287,7 @@ def _own(image: Any) -> dict[str, Any]:
 
 
 def _tables(system: Any) -> dict[str, Any]:
-    """Estimator and settings of a file that faintspot has written."""
+    """Return estimator and settings of a file written by faintspot."""
     if not any(item.key == "ORIGIN" and item.value == "faintspot" for item in system.metadata):
         return {}
     tables = parse_json(system.config)

@@ -1,4 +1,4 @@
-"""Slopes in .csv files: a line for each frame and sub-aperture, without coordinates and attributes."""
+"""Slopes in .csv files: one line per frame and sub-aperture, without coordinates and attributes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _INDEX = ("frame", "subaperture")
 
 
 class Csv(FileFormat):
-    """A table with the quantities of `VARIABLES` as columns, which anything reads."""
+    """A table with the quantities of `VARIABLES` as columns."""
 
     name = "CSV"
     endings = (".csv",)
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        """Write floats with the fewest digits that give them back."""
+        """Write floats with the fewest digits that reproduce them."""
         names = [
             *_INDEX,
             *(column_name(name, str(slopes.attributes.get("unit", "px"))) for name in VARIABLES),
@@ -42,12 +42,12 @@ class Csv(FileFormat):
             stream.write("".join(",".join(line) + "\n" for line in lines).encode())
 
     def finished(self, path: Path) -> ExistingOutput | None:
-        """Say that it is there: a table does not tell of which run."""
+        """Return an output without a fingerprint: a table does not identify its run."""
         return ExistingOutput(None, (0, 0), complete=True) if path.exists() else None
 
     def read(self, path: Path) -> StoredSlopes:
         """Read the whole table."""
-        check_file_size(path, "slopes", most_slopes_bytes() // 4)  # a number may take two characters
+        check_file_size(path, "slopes", most_slopes_bytes() // 4)  # a number takes at least two characters
         with path.open(encoding="utf-8") as stream:
             names = stream.readline().strip().split(",")
         unit = next((unit for unit in UNITS if column_name("x", unit) in names), "px")

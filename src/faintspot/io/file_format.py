@@ -1,4 +1,4 @@
-"""What a file format is to faintspot: it holds frames to be read, slopes that are written, or both."""
+"""Interface of a file format, which holds frames to read, slopes to write, or both."""
 
 from __future__ import annotations
 
@@ -13,55 +13,55 @@ from faintspot.io.slopes_writer import ExistingOutput, Storage
 
 
 class FileFormat:
-    """A file format: a subclass in a file of its own, with what it can do, named in `faintspot.io.formats`.
+    """A file format, implemented by a subclass in its own file and listed in `faintspot.io.formats`.
 
-    All formats are known to every program, so a package that one needs is imported where it is used.
+    All programs load all formats, so a format imports its optional packages where it uses them.
     """
 
     name: str
-    """For messages."""
+    """Name for messages."""
     signatures: tuple[bytes, ...] = ()
-    """What a file of frames begins with, up to 8 bytes; none where frames are not read."""
+    """First bytes of a file of frames, up to 8; empty if frames are not supported."""
     endings: tuple[str, ...] = ()
-    """Names of files of slopes end with them; none where slopes are not written."""
+    """Endings of files of slopes; empty if slopes are not supported."""
 
     def has_frames(self, path: Path, start: bytes) -> bool:
-        """Tell whether a path is of this format; `start` are the first bytes of a file, of a folder none."""
+        """Return whether a path is of this format; `start` holds a file's first bytes (b"" for a folder)."""
         return start.startswith(self.signatures)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return an array of a file: the one named `key`, or by itself that of the frames."""
+        """Return an array of a file: the one named `key`, by default that of the frames."""
         raise NotImplementedError
 
     def require(self) -> None:
-        """Raise MissingExtraError when a package for slopes is absent: before the work, not after."""
+        """Raise MissingExtraError when a package for slopes is missing; called before the work."""
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        """Write slopes to a file; the arrays may be mapped from the disk and larger than memory."""
+        """Write slopes to a file; the arrays may be memory-mapped and larger than memory."""
         raise NotImplementedError
 
     def read(self, path: Path) -> StoredSlopes:
-        """Read slopes; any usual exception when there are none, InputError when it knows the reason."""
+        """Read slopes; raise InputError for a known fault, another exception if there are no slopes."""
         raise NotImplementedError
 
     def has_slopes(self, path: Path) -> bool:
-        """Tell slopes from other arrays in a file whose name ends like one of slopes."""
+        """Return whether a file with an ending for slopes holds slopes."""
         return True
 
     def finished(self, path: Path) -> ExistingOutput | None:
-        """Return what a finished output says of itself, or None when there is none."""
+        """Return the description of a finished output, or None when there is none."""
         if not path.exists():
             return None
         if not path.is_file():
-            raise InputError(f"{path}: exists already and is no file: choose another name")
+            raise InputError(f"{path}: already exists and is not a file; choose another name")
         stored = self.read(path)
         frames, subapertures = stored.variables["x"].shape
         return ExistingOutput(stored.attributes.get("fingerprint"), (frames, subapertures), complete=True)
 
     def leftovers(self, path: Path) -> bool:
-        """Tell whether an unfinished output lies beside `path`."""
+        """Return whether an unfinished output lies beside `path`."""
         return is_partial(partial_folder(path))
 
     def storage(self, path: Path, run: RecordingHeader) -> Storage:
-        """Return where an unfinished output is kept."""
+        """Return the storage of an unfinished output."""
         return FolderStorage(path, run, self.write)

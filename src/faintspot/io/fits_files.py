@@ -1,7 +1,7 @@
 """FITS files: frames, plain, gzip-compressed (.gz) or tile-compressed (.fz); slopes, plain or .gz.
 
-The headers are read by astropy; the numbers of uncompressed images are read here, block by block, which
-works the same on a plain file and on a gzip stream. Values follow the FITS standard 4.0, section 4.4.2:
+astropy reads the headers. The numbers of uncompressed images are read here, block by block, from plain files
+and gzip streams alike. Values follow the FITS standard 4.0, section 4.4.2:
 physical = BZERO + BSCALE * stored, and BLANK marks integers without a value, which become NaN.
 """
 
@@ -30,7 +30,7 @@ _STORED = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 
 class Fits(FileFormat):
-    """Frames in an image; slopes with every quantity in an image extension of its name, with checksums."""
+    """Frames in an image; slopes with each quantity in an image extension of its name, with checksums."""
 
     name = "FITS"
     signatures: tuple[bytes, ...] = (b"SIMPLE", GZIP_SIGNATURE)
@@ -39,7 +39,7 @@ class Fits(FileFormat):
     def find(self, path: Path, key: str | None) -> StoredArray:
         """Return an image of a file: the first, or the one whose EXTNAME or number is `key`.
 
-        Of a file of the AOT standard it is the frames of the sensor `key`, or of the only one.
+        For a file of the AOT standard, return the frames of the sensor `key`, by default of the only one.
         """
         if AOT_VERSION in next(units_of(path)).header:
             names = {name for unit in units_of(path) for name in (unit.name.upper(), str(unit.index))}
@@ -48,17 +48,17 @@ class Fits(FileFormat):
         return _find_fits(path, key)
 
     def require(self) -> None:
-        """Raise MissingExtraError when astropy is absent."""
+        """Raise MissingExtraError when astropy is not installed."""
         load_fits()
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        """Write an image extension for every variable and coordinate, and one for the attributes."""
+        """Write an image extension for each variable and coordinate, and one for the attributes."""
         from faintspot.io.slopes_fits import write_fits
 
         write_fits(stream, slopes)
 
     def read(self, path: Path) -> StoredSlopes:
-        """Read a file of slopes, and verify its checksums."""
+        """Read a file of slopes and verify its checksums."""
         from faintspot.io.slopes_fits import read_fits
 
         units = {unit.name.lower(): unit for unit in whole_units(path)}
@@ -67,14 +67,14 @@ class Fits(FileFormat):
         return read_fits(path)
 
     def has_slopes(self, path: Path) -> bool:
-        """Tell by the names of the extensions."""
+        """Return whether the extensions have the names of slopes."""
         return {name.upper() for name in (*REQUIRED, "attributes")} <= {unit.name for unit in units_of(path)}
 
 
 class FitsGz(Fits):
     """Slopes in a gzip-compressed file."""
 
-    signatures = ()  # its frames are those of `Fits`
+    signatures = ()  # frames are read by `Fits`
     endings = (".fits.gz",)
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
@@ -89,7 +89,7 @@ def _find_fits(path: Path, key: str | None) -> StoredArray:
     Raises
     ------
     InputError
-        When the file is no FITS file, is truncated or has no such image.
+        When the file is not FITS, is truncated or has no such image.
     MissingExtraError
         When astropy is not installed.
     """
@@ -99,7 +99,7 @@ def _find_fits(path: Path, key: str | None) -> StoredArray:
     needed, present = unit.data_start + unit.data_bytes, path.stat().st_size
     if not compressed_file and present < needed:
         raise InputError(
-            f"{name}: truncated: its header promises data up to byte {needed}, the file has {present} bytes"
+            f"{name}: truncated: its header states data up to byte {needed}, the file has {present} bytes"
         )
     if unit.compressed:
         return _TileCompressedImage(name, path, unit.index, unit.shape)
@@ -119,7 +119,7 @@ def _find_fits(path: Path, key: str | None) -> StoredArray:
 
 @dataclass(frozen=True)
 class _Scaling:
-    """Stored numbers to physical values."""
+    """Conversion of stored numbers to physical values."""
 
     scale: float
     zero: float
@@ -130,7 +130,7 @@ class _Scaling:
         try:
             blank = int(header["BLANK"]) if "BLANK" in header and header["BITPIX"] > 0 else None
             return cls(float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0)), blank)
-        except Exception as error:  # cards are parsed when they are asked for, and may be broken
+        except Exception as error:  # cards are parsed on access and may be broken
             raise InputError(f"{name}: BSCALE, BZERO and BLANK must be numbers ({one_line(error)})") from None
 
     def __call__(self, stored: NDArray[Any]) -> NDArray[Any]:
@@ -138,7 +138,7 @@ class _Scaling:
             return stored
         bits = 8 * stored.itemsize
         if self.blank is None and self.scale == 1.0 and stored.dtype.kind != "f":
-            # The standard's way to store the other signedness: an offset of half the range flips one bit.
+            # An offset of half the range flips one bit: FITS stores the other signedness so.
             other = np.dtype(f"{'i' if bits == 8 else 'u'}{stored.itemsize}")
             if self.zero == (-128.0 if bits == 8 else 2.0 ** (bits - 1)):
                 unsigned = stored.view(f"u{stored.itemsize}")
@@ -174,7 +174,7 @@ class _TileCompressedImage:
                 if self._file is None:
                     self._file = load_fits().open(self._path)
                 values = np.asarray(self._file[self._index].section[start:stop])
-        except Exception as error:  # the decompressors raise whatever they like
+        except Exception as error:  # decompressors raise many kinds of errors
             self.close()
             raise InputError(
                 f"{self.name}: frames {start} to {stop - 1} (counted from 0) cannot be decompressed: "

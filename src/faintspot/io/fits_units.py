@@ -17,14 +17,14 @@ from faintspot.io.optional_packages import load_fits
 from faintspot.io.raw import open_plain_or_gzip
 
 AOT_VERSION = "AOT-VERS"
-"""Keyword of the primary header of a file of the Adaptive Optics Telemetry standard."""
+"""Keyword in the primary header of a file of the Adaptive Optics Telemetry standard."""
 _BLOCK_BYTES = 2880
 _MOST_HEADER_BYTES, _MOST_PADDING_BYTES = 1 << 24, 1 << 20
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One header-and-data unit (HDU); `shape` is the image's in NumPy's order, () when it is no image."""
+    """One header-and-data unit (HDU); `shape` is the image's in NumPy's order, () without an image."""
 
     index: int
     name: str
@@ -36,7 +36,7 @@ class Unit:
 
     @classmethod
     def of(cls, index: int, header: Any, data_start: int) -> Unit:
-        """Understand a header; a wrong one raises whatever astropy makes of it."""
+        """Parse a header; a wrong one raises the exceptions of astropy."""
         axes = _axes(header, "NAXIS")
         groups = int(header.get("GCOUNT", 1)) * (int(header.get("PCOUNT", 0)) + math.prod(axes))
         data_bytes = abs(int(header["BITPIX"])) // 8 * groups if axes else 0
@@ -57,12 +57,12 @@ def _axes(header: Any, keyword: str) -> tuple[int, ...]:
 
 
 def whole_units(path: Path) -> list[Unit]:
-    """Return all units of a file, behind which nothing else may follow, of which astropy would read all.
+    """Return all units of a file; nothing may follow the last one, because astropy would read it.
 
     Raises
     ------
     InputError
-        When something does.
+        When more data follow.
     """
     units = list(units_of(path))
     with open_plain_or_gzip(path) as stream:
@@ -79,7 +79,7 @@ def units_of(path: Path) -> Iterator[Unit]:
         while (header := _read_header(path, stream, index)) is not None:
             try:
                 unit = Unit.of(index, header, stream.tell())
-            except Exception as error:  # cards are parsed when they are asked for, and may be broken
+            except Exception as error:  # cards are parsed on access and may be broken
                 raise InputError(f"{path}: header {index} is not valid FITS ({one_line(error)})") from None
             yield unit
             padded = -(-unit.data_bytes // _BLOCK_BYTES) * _BLOCK_BYTES
@@ -91,7 +91,7 @@ def units_of(path: Path) -> Iterator[Unit]:
 
 
 def _header_blocks(stream: IO[bytes], index: int) -> bytes:
-    """Return the blocks of a header up to that with END; ValueError where there is none."""
+    """Return the blocks of a header up to END; raise ValueError if there is no END."""
     start = b"SIMPLE" if index == 0 else b"XTENSION"
     text = bytearray()
     while len(text) < _MOST_HEADER_BYTES and (block := stream.read(_BLOCK_BYTES)):
@@ -110,7 +110,7 @@ def _read_header(path: Path, stream: IO[bytes], index: int) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return fits.Header.fromfile(io.BytesIO(_header_blocks(stream, index)))
-    except Exception as error:  # a broken header makes astropy raise many things
+    except Exception as error:  # astropy raises many kinds of errors on broken headers
         if index > 0:
             return None
         raise InputError(f"{path}: expected a FITS file ({one_line(error)})") from None

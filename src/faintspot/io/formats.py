@@ -1,4 +1,4 @@
-"""The file formats; a new one is added here."""
+"""List of the file formats; add new formats here."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _SIGNATURE_BYTES = 8
 
 
 def frame_format(path: Path) -> FileFormat:
-    """Return the format of a file of frames, by its content.
+    """Return the format of a file of frames, recognised by content.
 
     Raises
     ------
     InputError
-        When it is of none.
+        When it has no known format.
     OSError
         When it cannot be read.
     """
@@ -62,12 +62,12 @@ def slope_format(path: Path) -> FileFormat:
     Raises
     ------
     InputError
-        When it is of none.
+        When the ending is unknown.
     """
     for item in FORMATS:
         if path.name.lower().endswith(item.endings):
             return item
-    raise InputError(f"{path}: expected a name that ends with {_listed(slope_endings())}")
+    raise InputError(f"{path}: expected a name ending in {_listed(slope_endings())}")
 
 
 def slope_endings() -> list[str]:

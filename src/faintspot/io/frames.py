@@ -1,4 +1,4 @@
-"""Frames in: one long sequence from files of any format, read in blocks of bounded memory."""
+"""Input of frames: one sequence from files of any format, read in blocks of bounded memory."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from faintspot.io.formats import frame_format
 from faintspot.io.locations import StoredArray, one_line, split_location
 from faintspot.io.raw import MOST_WHOLE_BYTES
 
-_MOST_PIXELS = 1 << 26  # of a frame: 8192 x 8192
+_MOST_PIXELS = 1 << 26  # in a frame: 8192 x 8192
 
 
 class FrameSource(Closing):
     """Frames of one or several files as one sequence, for one thread at a time.
 
-    Reading in order is cheap for every format; in compressed files going back starts from the front.
+    Reading in order is fast for every format; going back in a compressed file starts again from its
+    beginning.
 
     Attributes
     ----------
     shape : tuple of int
         Height and width of a frame in pixels.
     n_frames : int
-        Number of frames in all files together.
+        Total number of frames in all files.
     dtype : numpy.dtype
         Data type of every block.
     description : str
@@ -64,12 +65,13 @@ class FrameSource(Closing):
     def block(self, start: int, stop: int) -> NDArray[Any]:
         """Return frames `start` to `stop` (exclusive), shape (stop - start, height, width).
 
-        The array is the caller's own, in native byte order.
+        The array belongs to the caller and is in native byte order.
 
         Raises
         ------
         InputError
-            When the range is not within the sequence, or a file is damaged there; it names the frame.
+            When the range is not within the sequence, or the file is damaged there; the message names the
+            frame.
         """
         if not 0 <= start < stop <= self.n_frames:
             raise InputError(f"frames {start} to {stop} of {self.description}: expected 0 to {self.n_frames}")
@@ -89,11 +91,11 @@ class FrameSource(Closing):
             yield first, self.block(first, min(first + size, stop))
 
     def close(self) -> None:
-        """Close the file that is open, if any."""
+        """Close the open file, if any."""
         self._open.close()
 
     def _read(self, array: StoredArray, start: int, stop: int) -> NDArray[Any]:
-        """Read from one file, keeping no more than one open: there may be thousands."""
+        """Read from one file, keeping at most one open: there may be thousands."""
         if array is not self._open:
             self._open.close()
             self._open = array
@@ -111,16 +113,16 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
     Parameters
     ----------
     paths : sequence of str or Path
-        Files; "file.npz:key", "file.fits:EXTNAME", "file.tif:NUMBER" (of a series of pages) or
-        "store.zarr:path" choose one of several arrays. Without, it is the first image of a FITS file, all
-        pages of a TIFF file, or the array named "frames", or the only 2-D or 3-D one.
+        Files; "file.npz:key", "file.fits:EXTNAME", "file.tif:NUMBER" (a series of pages) or "store.zarr:path"
+        select one of several arrays. Default: the first image of a FITS file, all pages of a TIFF file, else
+        the array named "frames", or the only 2-D or 3-D array.
     key : str, optional
-        The array to choose in every file whose name does not say.
+        Array to read from every file whose name does not select one.
 
     Raises
     ------
     InputError
-        When a file is missing, damaged, of another format, or does not hold real frames of the others' size.
+        When a file is missing, damaged, of another format, or does not hold real frames of the same size.
     MissingExtraError
         When the package that reads the format is not installed.
 
@@ -145,24 +147,24 @@ def open_frames(paths: Sequence[str | Path], *, key: str | None = None) -> Frame
         if arrays and array.shape[-2:] != arrays[0].shape[-2:]:
             raise InputError(
                 f"{array.name}: its frames are {_size(array)} px (height x width), "
-                f"those of {arrays[0].name} are {_size(arrays[0])}: expected the same"
+                f"those of {arrays[0].name} are {_size(arrays[0])}; expected frames of one size"
             )
         arrays.append(array)
     return FrameSource(arrays)
 
 
 def read_array(location: str | Path) -> NDArray[Any]:
-    """Read one array whole (dark, flat, bad-pixel map) from a file of any format that frames have.
+    """Read one whole array (dark, flat, bad-pixel map) from a file of any frame format.
 
     Parameters
     ----------
     location : str or Path
-        The file; "file.npz:key", "file.fits:EXTNAME" or "store.zarr:path" choose one of several arrays.
+        File; "file.npz:key", "file.fits:EXTNAME" or "store.zarr:path" select one of several arrays.
 
     Returns
     -------
     ndarray
-        Real or boolean values in native byte order, of the shape that is stored.
+        Real or boolean values in native byte order, with the stored shape.
 
     Raises
     ------
@@ -206,7 +208,7 @@ def _find_array(location: str | Path, key: str | None) -> StoredArray:
 
 
 def _check_frames(array: StoredArray) -> None:
-    """Refuse what cannot be a cube or a frame."""
+    """Refuse an array that is neither a cube nor a frame."""
     if array.dtype.kind not in "iuf":
         raise InputError(f"{array.name}: expected frames of real numbers, got dtype {array.dtype}")
     if len(array.shape) not in (2, 3):

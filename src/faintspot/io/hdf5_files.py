@@ -1,4 +1,4 @@
-"""Frames in HDF5 files, which are those of MATLAB's version 7.3, too."""
+"""Frames in HDF5 files, including those of MATLAB's version 7.3."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _MOST_OBJECTS = 10_000
 
 
 class Hdf5(FileFormat):
-    """Frames in a data set, named by its path in the file."""
+    """Frames in a data set, selected by its path in the file."""
 
     name = "HDF5"
     signatures: tuple[bytes, ...] = (b"\x89HDF\r\n\x1a\n",)
     matlab = False
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return the data set at `key`, that named `frames`, or the only one of 2 or 3 dimensions."""
+        """Return the data set at `key`, the one named `frames`, or the only one of 2 or 3 dimensions."""
         h5py = load_hdf5()
         try:
             with h5py.File(path, "r") as file:
@@ -37,12 +37,12 @@ class Hdf5(FileFormat):
                 return _DataSet(path, chosen, file[chosen], reverse=self.matlab)
         except InputError:
             raise
-        except Exception as error:  # a damaged file makes h5py raise many things
+        except Exception as error:  # h5py raises many kinds of errors on damaged files
             raise InputError(f"{path}: expected a whole {self.name} file ({one_line(error)})") from None
 
 
 class Matlab73(Hdf5):
-    """Variables of a MATLAB file, whose axes HDF5 has in the opposite order: (height, width, frames)."""
+    """Variables of a MATLAB file; HDF5 stores their axes in reverse order: (height, width, frames)."""
 
     name = "MATLAB"
     signatures = (b"MATLAB 7",)
@@ -57,7 +57,7 @@ def _data_sets(h5py: Any, file: Any) -> dict[str, int]:
     def visit(name: str, item: Any) -> bool | None:
         nonlocal seen
         seen += 1
-        if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # what MATLAB keeps to itself
+        if isinstance(item, h5py.Dataset) and not name.startswith("#"):  # MATLAB's internal data
             found[name] = len(item.shape or ())
         return True if seen >= _MOST_OBJECTS else None
 
@@ -66,7 +66,7 @@ def _data_sets(h5py: Any, file: Any) -> dict[str, int]:
 
 
 class _DataSet:
-    """A data set that is read in parts; the file is opened again for the first of them."""
+    """A data set that is read in parts; the file is reopened for the first of them."""
 
     def __init__(self, path: Path, key: str, item: Any, *, reverse: bool) -> None:
         self.name = f"{path}:{key}"
@@ -79,7 +79,7 @@ class _DataSet:
         self.shape: tuple[int, ...] = shape
         self._file: Any = None
         if item.is_virtual or item.external:
-            raise InputError(f"{self.name}: expected the numbers in this file, they are in others")
+            raise InputError(f"{self.name}: expected data in this file, they are stored in other files")
         if item.dtype.hasobject:
             raise InputError(f"{self.name}: expected numbers, got {item.dtype}")
         if item.chunks is not None:
@@ -100,7 +100,7 @@ class _DataSet:
             values = np.asarray(item[tuple(part)])
         except InputError:
             raise
-        except Exception as error:  # each filter raises its own kind
+        except Exception as error:  # each filter raises its own kind of error
             self.close()
             raise InputError(
                 f"{self.name}: frames {start} to {stop - 1} (counted from 0) cannot be read: "
@@ -117,7 +117,7 @@ class _DataSet:
             self._file = None
 
     def _check_chunks(self, item: Any, part: list[slice]) -> None:
-        """Refuse chunks of this part that inflate to more than they should."""
+        """Refuse chunks of this part that inflate to more than twice their stated size."""
         if item.chunks is None or item.compression is None:
             return
         most = 2 * int(np.prod(item.chunks)) * item.dtype.itemsize

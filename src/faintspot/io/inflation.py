@@ -1,4 +1,4 @@
-"""How much compressed data inflates to, found out before a decoder that asks for all of it is called."""
+"""Inflated size of compressed data, checked before a decoder allocates it."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from faintspot.base.sizes import check_bytes
 from faintspot.io.raw import MOST_WHOLE_BYTES
 
 _PIECE_BYTES, _ALWAYS_BYTES = 1 << 20, 1 << 26
-_DEFLATE_RATIO = 1032  # at most, by its format
+_DEFLATE_RATIO = 1032  # largest ratio that deflate can reach
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def check_inflated(name: str, data: bytes, most: int = MOST_WHOLE_BYTES) -> None:
-    """Refuse data, compressed in a way that its first bytes tell, of more than `most` bytes.
+    """Refuse compressed data that inflate to more than `most` bytes; recognise the format by content.
 
-    Below 64 MiB everything passes.
+    Limits below 64 MiB are raised to that.
 
-    Sizes that Zstandard and Blosc state are believed: their decoders stop there. Others are inflated piece by
-    piece, unless deflate cannot exceed the limit. Damage is left to the decoder to find.
+    Sizes stated by Zstandard and Blosc are trusted, because their decoders stop there. Other data are
+    inflated piece by piece, unless deflate cannot exceed the limit. Damaged data are left to the decoder.
 
     Raises
     ------
     InputError
-        When it inflates to more.
+        When they inflate to more.
     """
     total, most = 0, max(most, _ALWAYS_BYTES)
     try:
@@ -43,7 +43,7 @@ def check_inflated(name: str, data: bytes, most: int = MOST_WHOLE_BYTES) -> None
 
 
 def _sizes(data: bytes, most: int) -> Iterator[int]:
-    """Yield the number of bytes in each piece of the content, as far as it has to be known."""
+    """Yield the size of each piece of the content, as far as it must be known."""
     if data.startswith(_ZSTD):
         yield _zstandard(data)
     elif data[1:2] == b"\1" and int.from_bytes(data[12:16], "little") == len(data):
@@ -65,7 +65,7 @@ def _sizes(data: bytes, most: int) -> Iterator[int]:
 
 
 def _zstandard(data: bytes) -> int:
-    """Return the content size of a Zstandard frame (RFC 8878, section 3.1.1.1), 0 where it is not stated."""
+    """Return the content size of a Zstandard frame (RFC 8878, section 3.1.1.1), 0 if it is not stated."""
     described = data[4] if len(data) > 4 else 0
     single = described >> 5 & 1
     length = (single, 2, 4, 8)[described >> 6]

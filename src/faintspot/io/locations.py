@@ -1,4 +1,4 @@
-"""Which array in which file: "file", "file.npz:key", "file.fits:EXTNAME", "store.zarr:path"."""
+"""Locations of arrays in files: "file", "file.npz:key", "file.fits:EXTNAME", "store.zarr:path"."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class StoredArray(Protocol):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Data type of what `read` returns."""
+        """Data type of the values that `read` returns."""
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return items `start` to `stop` of the first axis, in native byte order."""
 
     def close(self) -> None:
-        """Close what is open; a later `read` opens it again."""
+        """Close the file; a later `read` opens it again."""
 
 
 def split_location(location: str | Path) -> tuple[Path, str | None]:
-    """Split "file:key" into file and key; a name that exists as it stands has no key.
+    """Split "file:key" into file and key; the name of an existing file has no key.
 
     Raises
     ------
@@ -55,10 +55,10 @@ def split_location(location: str | Path) -> tuple[Path, str | None]:
 
 
 def _exists(path: Path) -> bool:
-    """Say whether there is such a file; there is none whose name no file can have."""
+    """Return whether the file exists; False for names that no file can have."""
     try:
         return path.exists()
-    except (OSError, ValueError):  # too long, or with a character that names do not have
+    except (OSError, ValueError):  # name too long, or with characters that are not allowed
         return False
 
 
@@ -72,12 +72,12 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
     dimensions : mapping
         Number of dimensions of every array in the file.
     key : str or None
-        The name that was asked for.
+        The requested name.
 
     Raises
     ------
     InputError
-        When there is no such array, or no way to choose one.
+        When there is no such array, or several and none is requested.
     """
     listed = ", ".join(list(dimensions)[:_MOST_LISTED]) or "none"
     if len(dimensions) > _MOST_LISTED:
@@ -98,5 +98,5 @@ def choose_name(path: Path, dimensions: Mapping[str, int], key: str | None) -> s
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error of another library in one line."""
+    """Return the message of another library's error in one line."""
     return " ".join(str(error).split()) or type(error).__name__

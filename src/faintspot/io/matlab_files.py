@@ -22,24 +22,24 @@ _HEADER_BYTES, _COMPRESSED = 128, 15
 
 
 class Matlab(FileFormat):
-    """Frames in a variable, (height, width, frames), which is read whole."""
+    """Frames in a variable (height, width, frames), which is read whole."""
 
     name = "MATLAB"
     signatures = (b"MATLAB 5",)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return the variable `key`, that named `frames`, or the only one of 2 or 3 dimensions."""
-        import scipy.io  # takes a tenth of a second
+        """Return the variable `key`, the one named `frames`, or the only one of 2 or 3 dimensions."""
+        import scipy.io  # slow import: a tenth of a second
 
         _check_elements(path)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 stored = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(path)}
-        except Exception as error:  # a damaged file makes SciPy raise many things
+        except Exception as error:  # SciPy raises many kinds of errors on damaged files
             raise InputError(f"{path}: expected a whole MATLAB file ({one_line(error)})") from None
         dimensions = {
-            name: len(shape) if max(shape, default=0) > 1 else 0  # MATLAB's numbers are 1 x 1
+            name: len(shape) if max(shape, default=0) > 1 else 0  # MATLAB stores numbers as 1 x 1 arrays
             for name, (shape, kind) in stored.items()
             if kind in _TYPES
         }

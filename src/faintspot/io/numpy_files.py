@@ -1,4 +1,4 @@
-"""NumPy's .npy and .npz files: frames, never unpickled and never read whole; slopes in .npz."""
+"""NumPy's .npy and .npz files: frames, read in parts and without unpickling; slopes in .npz."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Npy(FileFormat):
 
 
 class Npz(FileFormat):
-    """Frames in an array of a .npz file; slopes with every quantity in an array of its name."""
+    """Frames in an array of a .npz file; slopes with each quantity in an array of its name."""
 
     name = ".npz"
     signatures = (b"PK\x03\x04",)
@@ -41,7 +41,7 @@ class Npz(FileFormat):
         return _find_npz(path, key)
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
-        """Write every variable and coordinate, and the attributes as a JSON text named `attributes`."""
+        """Write each variable and coordinate, and the attributes as a JSON text named `attributes`."""
         arrays = {**slopes.variables, **slopes.coordinates}
         arrays["attributes"] = np.array(json.dumps(dict(slopes.attributes)))
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
@@ -67,11 +67,11 @@ class Npz(FileFormat):
         return StoredSlopes(variables, arrays, attributes, True, len(variables["x"]))
 
     def has_slopes(self, path: Path) -> bool:
-        """Tell by the names of the arrays."""
+        """Return whether the arrays have the names of slopes."""
         try:
             archive, members = open_archive(path)
         except DAMAGE:
-            return False  # whoever reads it says what is wrong with it
+            return False  # its reader gives the reason
         archive.close()
         return {*REQUIRED, "attributes"} <= members.keys()
 
@@ -82,10 +82,10 @@ def _find_npy(path: Path, key: str | None) -> StoredArray:
     Raises
     ------
     InputError
-        When the file is not whole, holds Python objects, or a key is given.
+        When the file is incomplete, holds Python objects, or a key is given.
     """
     if key is not None:
-        raise InputError(f"{path}: a .npy file holds one array without a name, got key {key!r}")
+        raise InputError(f"{path}: a .npy file holds one unnamed array, expected no key, got {key!r}")
     with path.open("rb") as stream:
         header = read_header(str(path), stream, path.stat().st_size)
     if header.fortran_order and len(header.shape) > 1:
@@ -106,23 +106,23 @@ def _find_npz(path: Path, key: str | None) -> StoredArray:
     Raises
     ------
     InputError
-        When the file is damaged, or has no such array, or several and no key is given.
+        When the file is damaged, has no such array, or has several and no key is given.
     """
     try:
         archive, members = open_archive(path)
         archive.close()
         wanted = PREFERRED_NAME if key is None else key
-        # The headers decide which one to read only where nothing is named.
+        # Without a name, the headers decide which array to read.
         headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
     except DAMAGE as error:
-        raise InputError(f"{path}: expected a whole .npz file, which it is not ({one_line(error)})") from None
+        raise InputError(f"{path}: expected a valid .npz file ({one_line(error)})") from None
     dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
     chosen = choose_name(path, dimensions, key)
     return _npz_array(path, chosen, members[chosen], headers[chosen])
 
 
 def _npz_array(path: Path, key: str, member: zipfile.ZipInfo, header: Header) -> StoredArray:
-    """Return the array of a zip member; Fortran order cannot be streamed by frame, only loaded."""
+    """Return the array of a zip member; one in Fortran order cannot be read by frame, only as a whole."""
     name = f"{path}:{key}"
     if header.fortran_order and len(header.shape) > 1:
         if len(header.shape) > 2:

@@ -8,7 +8,7 @@ from faintspot.base.errors import MissingExtraError
 
 
 def load_fits() -> Any:
-    """Return the package astropy.io.fits; MissingExtraError when it is not installed."""
+    """Return the package astropy.io.fits; raise MissingExtraError when it is not installed."""
     try:
         from astropy.io import fits
     except ImportError:
@@ -17,7 +17,7 @@ def load_fits() -> Any:
 
 
 def load_hdf5() -> Any:
-    """Return the package h5py; MissingExtraError when it is not installed."""
+    """Return the package h5py; raise MissingExtraError when it is not installed."""
     try:
         import h5py
     except ImportError:
@@ -26,7 +26,7 @@ def load_hdf5() -> Any:
 
 
 def load_pillow() -> Any:
-    """Return the module PIL.Image; MissingExtraError when it is not installed."""
+    """Return the module PIL.Image; raise MissingExtraError when it is not installed."""
     try:
         from PIL import Image
     except ImportError:
@@ -35,7 +35,7 @@ def load_pillow() -> Any:
 
 
 def load_zarr() -> Any:
-    """Return the package zarr; MissingExtraError when it is not installed."""
+    """Return the package zarr; raise MissingExtraError when it is not installed."""
     try:
         import zarr
     except ImportError:

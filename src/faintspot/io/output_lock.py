@@ -1,4 +1,4 @@
-"""One writer at a time: a lock file beside the output, held by the operating system while it is written."""
+"""Lock file beside an output, held through the operating system, so that only one program writes it."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from pathlib import Path
 from faintspot.base.errors import InputError
 
 _OWNER_BYTES = 200
-# File systems that know no locks: there the mark in the output, read before every write, has to do.
+# File systems without locks: there only the mark in the output, read before every write, protects it.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 class OutputLock:
-    """Holds the lock of an output from the beginning until `release`, or until the program ends.
+    """Lock of an output, held until `release` or the end of the program.
 
     Parameters
     ----------
     path : Path
-        The output; the lock is ".NAME.lock" beside it.
+        Output; the lock is ".NAME.lock" beside it.
 
     Raises
     ------
     InputError
-        When somebody else holds it; it says who.
+        When another program holds the lock; the message names it.
     OSError
         When the lock file cannot be made.
     """
@@ -36,14 +36,14 @@ class OutputLock:
         self._file = path.with_name(f".{path.name}.lock")
         self._descriptor = -1
         while not self._is_held():
-            self.release(keep_file=True)  # of one that its holder has removed while we waited for it
+            self.release(keep_file=True)  # close the file if its holder removed it meanwhile
             self._descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             self._take(path)
         os.ftruncate(self._descriptor, 0)
         os.pwrite(self._descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
 
     def release(self, *, keep_file: bool = False) -> None:
-        """Let others write; nothing happens when it is released already."""
+        """Release the lock; repeated calls do nothing."""
         if self._descriptor >= 0:
             if not keep_file:
                 self._file.unlink(missing_ok=True)
@@ -61,8 +61,8 @@ class OutputLock:
             owner = os.pread(self._descriptor, _OWNER_BYTES, 0).decode(errors="replace").strip()
             self.release(keep_file=True)
             raise InputError(
-                f"{path}: is being written by {owner or 'another program'}: "
-                "wait until that has ended or choose another name"
+                f"{path}: is being written by {owner or 'another program'}; "
+                "wait until it has ended or choose another name"
             ) from None
         except OSError as error:
             if error.errno not in _NO_LOCKS:
@@ -70,7 +70,7 @@ class OutputLock:
                 raise
 
     def _is_held(self) -> bool:
-        """Whether what is locked is the file that others would find."""
+        """Return whether the locked file is still the one at its path."""
         if self._descriptor < 0:
             return False
         try:

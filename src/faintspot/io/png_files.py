@@ -1,4 +1,4 @@
-"""Frames in PNG files, one each."""
+"""Frames in PNG files, one per file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TYPES = {"L": "u1", "I;16": "u2", "I": "i4"}
 
 
 class Png(FileFormat):
-    """A grey image of 8 or 16 bits."""
+    """A greyscale image of 8 or 16 bits."""
 
     name = "PNG"
     signatures = (b"\x89PNG\r\n\x1a\n",)
@@ -24,12 +24,12 @@ class Png(FileFormat):
     def find(self, path: Path, key: str | None) -> StoredArray:
         """Return the image."""
         if key is not None:
-            raise InputError(f"{path}: a PNG file holds one image without a name, got key {key!r}")
+            raise InputError(f"{path}: a PNG file holds one unnamed image, expected no key, got {key!r}")
         image = load_pillow()
         try:
             with image.open(path, formats=["PNG"]) as opened:
                 (width, height), mode = opened.size, opened.mode
-        except Exception as error:  # a damaged file makes Pillow raise many things
+        except Exception as error:  # Pillow raises many kinds of errors on damaged files
             raise InputError(f"{path}: expected a whole PNG file ({one_line(error)})") from None
         if mode not in _TYPES:
             raise InputError(f"{path}: expected a grey image of 8 or 16 bits, got mode {mode}")

@@ -1,4 +1,4 @@
-"""Arrays that lie as plain bytes in a file or a compressed stream, read block by block."""
+"""Arrays stored as plain bytes in a file or a compressed stream, read block by block."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ GZIP_SIGNATURE = b"\x1f\x8b"
 _PIECE_BYTES = 1 << 20
 _PIECE_NUMBERS = 1 << 18
 MOST_WHOLE_BYTES = 1 << 30
-"""Of an array, or a part of one, that can only be read whole."""
+"""Largest size of an array, or of a part of one, that can only be read whole."""
 
 
 def open_plain_or_gzip(path: Path) -> IO[bytes]:
-    """Open a file for reading; one that starts with the gzip signature is decompressed on the way."""
+    """Open a file for reading; a file with the gzip signature is decompressed."""
     return cast(IO[bytes], gzip.open(path, "rb")) if is_gzip(path) else path.open("rb")
 
 
 def is_gzip(path: Path) -> bool:
-    """Tell by its first bytes whether a regular file is gzip-compressed."""
+    """Return whether a regular file is gzip-compressed, by its first bytes."""
     check_regular(path)
     with path.open("rb") as stream:
         return stream.read(2) == GZIP_SIGNATURE
 
 
 def pieces(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """Yield a C-ordered array in pieces of bounded size along its first axis, to be written one by one."""
+    """Yield a C-ordered array in pieces of bounded size along its first axis."""
     if array.ndim == 0:
         yield array
         return
@@ -47,10 +47,10 @@ def pieces(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
 
 
 class RawArray:
-    """A C-ordered array at a byte offset of a file or of a stream that only runs forward.
+    """A C-ordered array at a byte offset of a file, or of a stream that can only be read forward.
 
-    A stream is decompressed once from front to back as long as blocks are asked for in order; going
-    back starts it again. Memory use is one block, whatever the size of the file.
+    A stream is decompressed once from front to back if blocks are read in order; going back restarts it.
+    Memory use is one block, whatever the size of the file.
 
     Parameters
     ----------
@@ -59,16 +59,16 @@ class RawArray:
     open_stream : callable
         Opens the stream at its first byte.
     offset : int
-        Where the array starts, in bytes (of the decompressed stream).
+        Start of the array in bytes of the (decompressed) stream.
     dtype : numpy.dtype
-        How the numbers are stored, in any byte order.
+        Type of the stored numbers, in any byte order.
     shape : tuple of int
         Shape of the array; at least one dimension.
     forward_only : bool
-        Whether the stream is compressed: going forward means reading, and its checksum is verified
-        after the last item.
+        Whether the stream is compressed: skipping means reading, and the checksum is verified after the last
+        item.
     convert : callable, optional
-        Makes the values from the stored numbers (native byte order), block by block.
+        Converts stored numbers (native byte order) to values, block by block.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class RawArray:
         Raises
         ------
         InputError
-            When the file is damaged or ends too early; it names the first item that is lost.
+            When the file is damaged or ends too early; the message names the first lost item.
         """
         block = np.empty((stop - start, *self.shape[1:]), self._stored)
         view = memoryview(block.reshape(-1).view(np.uint8).data)
@@ -139,30 +139,30 @@ class RawArray:
         while self._position < position:
             piece = self._stream.read(min(_PIECE_BYTES, position - self._position))
             if not piece:
-                raise EOFError("it ends too early")
+                raise EOFError("the data end too early")
             self._position += len(piece)
 
     def _fill(self, view: memoryview) -> None:
-        """Fill `view` from the stream, from a compressed one item by item so that a loss is located."""
+        """Fill `view` from the stream; from a compressed stream item by item, to locate damage."""
         assert self._stream is not None
         filled = 0
         while filled < len(view):
             piece = self._item_bytes if self._forward_only else len(view)
             read = self._stream.readinto(view[filled : filled + piece])  # type: ignore[attr-defined]
             if not read:
-                raise EOFError("it ends too early")
+                raise EOFError("the data end too early")
             filled += read
             self._position += read
 
     def _read_to_end(self) -> None:
-        """Read what follows the array: only at its end does a compressed stream verify its checksum."""
+        """Read the rest of the stream: a compressed stream verifies its checksum only at its end."""
         assert self._stream is not None
         while piece := self._stream.read(_PIECE_BYTES):
             self._position += len(piece)
 
 
 class WholeArray:
-    """An array that can only be read whole, which its first reading does.
+    """An array that can only be read whole, on first use.
 
     Parameters
     ----------
@@ -170,9 +170,9 @@ class WholeArray:
         File and key, for messages.
     shape : tuple of int
     dtype : numpy.dtype
-        Shape and type that the file states: before anything is read, they must not take too much memory.
+        Shape and type stated by the file; they are checked against the memory limit before reading.
     load : callable
-        Returns the array; it may raise whatever a damaged file leads to.
+        Returns the array; may raise any error on damaged files.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class WholeArray:
                 raise ValueError(f"its shape is {array.shape} instead of {self.shape}")
         except InputError:
             raise
-        except Exception as error:  # decoders raise whatever they like
+        except Exception as error:  # decoders raise many kinds of errors
             raise InputError(
                 f"{self.name}: cannot be read: the file is damaged ({one_line(error)})"
             ) from None
@@ -200,12 +200,12 @@ class WholeArray:
         return np.array(array[start:stop], dtype=self.dtype, order="C")
 
     def close(self) -> None:
-        """Forget the array; a later `read` reads it again."""
+        """Discard the array; a later `read` loads it again."""
         self._array = None
 
 
 class MappedArray:
-    """An array that NumPy has mapped."""
+    """An array that NumPy has memory-mapped."""
 
     def __init__(self, name: str, array: NDArray[Any]) -> None:
         self.name = name
@@ -218,4 +218,4 @@ class MappedArray:
         return np.array(self._array[start:stop], dtype=self.dtype, order="C")
 
     def close(self) -> None:
-        """Nothing is open beyond the mapping."""
+        """Do nothing: only the mapping is open."""

@@ -17,24 +17,24 @@ from faintspot.io.slopes_format import StoredSlopes
 
 
 def read_reference(location: str | Path) -> NDArray[Any]:
-    """Read reference positions as `SlopePipeline` takes them.
+    """Read reference positions for `SlopePipeline`.
 
     Parameters
     ----------
     location : str or Path
-        A file of slopes that faintspot has written, of a flat wavefront for example: the mean of each
-        sub-aperture's valid slopes, on top of the reference that they were measured with. Where none is
-        valid, that reference, or else the sub-aperture's centre. Or an array, as for `read_array`.
+        File of slopes written by faintspot, e.g. of a flat wavefront, or an array as for `read_array`. Slopes
+        give the mean of each sub-aperture's valid positions, including the reference that was subtracted. A
+        sub-aperture without valid slopes keeps that reference, by default its centre.
 
     Returns
     -------
     (n, 2) array
-        x and y, px; an array as it is stored, which may be (2n,), too: all x, then all y.
+        x and y, px; an array is returned as stored, and may also be (2n,): all x, then all y.
 
     Raises
     ------
     InputError
-        When the file is missing, damaged, of another format, or has no valid slope at all.
+        When the file is missing, damaged, of another format, or has no valid slopes.
     MissingExtraError
         When the package that reads the format is not installed.
     """
@@ -52,7 +52,7 @@ def _mean_positions(path: Path, slopes: StoredSlopes) -> NDArray[np.float64]:
     valid = slopes.variables["valid"]
     count = np.count_nonzero(valid, axis=0)
     if not count.any():
-        raise InputError(f"{path}: expected slopes to take as reference, found none that is valid")
+        raise InputError(f"{path}: expected valid slopes to take as reference, found none")
     sums = [np.sum(slopes.variables[name], axis=0, where=valid, dtype=np.float64) for name in ("x", "y")]
     means: NDArray[np.float64] = np.stack(sums, axis=1) / np.maximum(count, 1)[:, np.newaxis]
     before: NDArray[np.float64] = np.asarray(

@@ -1,4 +1,4 @@
-"""Slopes out: one writer by the name's ending, resumable; and slopes read back."""
+"""Output of slopes by a resumable writer whose format follows the file name, and reading them back."""
 
 from __future__ import annotations
 
@@ -47,32 +47,32 @@ def create_writer(
 ) -> SlopeWriter:
     """Return a writer of slopes to `path`: .zarr, .fits, .fits.gz, .npz or .csv.
 
-    A .zarr store is there, valid and readable, from the start, and says whether it is complete. The others
-    appear only when complete; until then the slopes are in the hidden folder ".NAME.partial" beside them.
-    Interrupted in whatever way, the same call continues where the output stopped.
+    A .zarr store is valid and readable from the start and states whether it is complete. Other files appear
+    only when complete; until then the slopes are in the hidden folder ".NAME.partial" beside them. After an
+    interruption, the same call continues where the output stopped.
 
     Parameters
     ----------
     path : str or Path
-        The output; its folder must exist.
+        Output; its folder must exist.
     n_frames, n_subapertures : int
-        The size of the whole result.
+        Size of the complete result.
     attributes : mapping
-        JSON values that describe the run; `fingerprint` is required and says which runs are the same one.
-        Usual others: configuration (a TOML text), sources, faintspot_version.
+        JSON values that describe the run. `fingerprint` is required and identifies runs that may continue
+        each other's output. Common others: configuration (a TOML text), sources, faintspot_version.
     coordinates : mapping
-        Per sub-aperture, (n_subapertures,) each, as centre_x and centre_y in px.
+        Values per sub-aperture, (n_subapertures,) each, such as centre_x and centre_y in px.
     resume : bool
-        Continue an unfinished output of the same fingerprint; a finished one is then left as it is.
+        Continue an unfinished output of the same fingerprint; a finished one is then left unchanged.
     overwrite : bool
-        Replace a finished output, or another run's: a file when the new one is complete, a .zarr store
-        at once. An unfinished output of the same run is still resumed if `resume`.
+        Replace a finished output, or another run's: a file when the new one is complete, a .zarr store at
+        once. An unfinished output of the same run is still resumed if `resume` is set.
 
     Raises
     ------
     InputError
-        When the name's ending is unknown, the folder is missing or not writable, or the output is another
-        run's and `overwrite` is False.
+        When the ending is unknown, the folder is missing or not writable, or the output is another run's and
+        `overwrite` is False.
     MissingExtraError
         When the package that writes the format is not installed.
 
@@ -91,7 +91,7 @@ def create_writer(
     run = _checked_run(n_frames, n_subapertures, attributes, coordinates)
     with output_errors(path):
         if not path.parent.is_dir():
-            raise InputError(f"{path}: the folder {path.parent} does not exist: create it or choose another")
+            raise InputError(f"{path}: the folder {path.parent} does not exist; create it or choose another")
         form = slope_format(path)
         form.require()
         if not overwrite and _is_finished(path, form, run, resume=resume):
@@ -114,19 +114,19 @@ def create_writer(
 
 
 def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
-    """Read slopes that `create_writer` wrote; of a .zarr store or a ".partial" folder what is finished.
+    """Read slopes that `create_writer` wrote; from a .zarr store or a ".partial" folder the finished frames.
 
     Parameters
     ----------
     path : str or Path
     unit : {"px", "arcsec"}
-        Of positions and their standard errors, whichever the file holds; attributes["unit"] says it again.
+        Unit of the returned positions and standard errors, stated in attributes["unit"].
 
     Raises
     ------
     InputError
-        When there is no such file, it is damaged, it does not hold slopes, or it does not say the scale of
-        pixels that another unit needs.
+        When the file is missing or damaged, does not hold slopes, or lacks the pixel scale that the unit
+        needs.
     MissingExtraError
         When the package that reads the format is not installed.
 
@@ -146,7 +146,7 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
     path = Path(path)
     if not path.exists():
         partial = partial_folder(path)
-        hint = f"; an unfinished run has left {partial}" if is_partial(partial) else ""
+        hint = f"; an unfinished run left {partial}" if is_partial(partial) else ""
         raise InputError(f"{path}: no such file{hint}")
     if not path.is_dir():
         check_regular(path)
@@ -168,7 +168,7 @@ def read_slopes(path: str | Path, *, unit: str = "px") -> StoredSlopes:
 
 
 def _consistent(slopes: StoredSlopes) -> StoredSlopes:
-    """Return slopes whose quantities are all there for all frames; ValueError otherwise."""
+    """Return slopes if all quantities are present for all frames; raise ValueError otherwise."""
     shape = slopes.variables["x"].shape
     for name, variable in VARIABLES.items():
         array = slopes.variables[name]
@@ -185,29 +185,29 @@ def _consistent(slopes: StoredSlopes) -> StoredSlopes:
 
 
 def _read(path: Path, read: Callable[[Path], _What]) -> _What:
-    """Read something of slopes, with errors in one line."""
+    """Read slopes or a part of them, with errors in one line."""
     try:
         return read(path)
     except (InputError, MissingExtraError):
         raise
-    except Exception as error:  # something else than slopes, or damaged: each package raises its own
+    except Exception as error:  # not slopes, or damaged: each package raises its own errors
         raise InputError(f"{path}: expected slopes written by faintspot ({one_line(error)})") from None
 
 
 def _checked_run(
     n_frames: int, n_subapertures: int, attributes: Mapping[str, Any], coordinates: Mapping[str, Any]
 ) -> RecordingHeader:
-    """Check what describes the run and bring it into the form that is stored."""
+    """Check the description of the run and convert it to the stored form."""
     frames = int(number_between("n_frames", n_frames, 1, integer=True))
     subapertures = int(number_between("n_subapertures", n_subapertures, 1, integer=True))
     if not isinstance(attributes.get("fingerprint"), str):
-        raise InputError("attributes: expected a text named 'fingerprint', which tells one run from another")
+        raise InputError("attributes: expected a text named 'fingerprint', which identifies the run")
     for name in RESERVED_ATTRIBUTES & set(attributes):
-        raise InputError(f"attributes: {name!r} is written by faintspot itself: expected another name")
+        raise InputError(f"attributes: {name!r} is reserved by faintspot; choose another name")
     values = {}
     for name, coordinate in coordinates.items():
         if name in VARIABLES or name == "attributes":
-            raise InputError(f"coordinates: {name!r} is the name of a variable: expected another")
+            raise InputError(f"coordinates: {name!r} is the name of a variable; choose another name")
         array = finite_array(f"coordinates: {name}", coordinate)
         if array.shape != (subapertures,):
             raise InputError(f"coordinates: {name}: expected shape ({subapertures},), got {array.shape}")
@@ -216,13 +216,13 @@ def _checked_run(
 
 
 def _is_finished(path: Path, form: FileFormat, run: RecordingHeader, *, resume: bool) -> bool:
-    """Tell whether this very run has completed the output before; refuse when another has."""
+    """Return whether this run has completed the output before; refuse another run's output."""
     begun = _read(path, form.finished)
     return begun is not None and begun.may_be_continued(path, run, resume=resume, overwrite=False)
 
 
 def _remove_leftovers(path: Path, form: FileFormat, run: RecordingHeader) -> None:
-    """Remove what this run has left when it ended between making the file and tidying up."""
+    """Remove what this run left if it ended between making the file and cleaning up."""
     if form.leftovers(path):
         lock = OutputLock(path)
         try:

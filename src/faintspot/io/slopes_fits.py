@@ -1,4 +1,4 @@
-"""Slopes in FITS files, written piece by piece, with checksums (FITS standard 4.0, section 4.4.2.7)."""
+"""Slopes in FITS files, written in parts, with checksums (FITS standard 4.0, section 4.4.2.7)."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ fits = load_fits()
 _BLOCK_BYTES = 2880
 _PIECE_BYTES = 1 << 20
 _NO_CHECKSUM = "0" * 16
-# Characters between digits, capitals and small letters, which a checksum must not have.
+# Characters between digits, capitals and small letters, which a checksum must not contain.
 _NOT_ALLOWED = frozenset(range(0x3A, 0x41)) | frozenset(range(0x5B, 0x61))
 
 
 def write_fits(stream: IO[bytes], slopes: StoredSlopes) -> None:
-    """Write an image extension for every variable and coordinate, and ATTRIBUTES: a JSON text as bytes."""
+    """Write an image extension for each variable and coordinate, and ATTRIBUTES: a JSON text as bytes."""
     count, width = slopes.variables["x"].shape
     primary = fits.Header(
         [
@@ -56,7 +56,7 @@ def read_fits(path: Path) -> StoredSlopes:
             with open_plain_or_gzip(path) as stream, fits.open(stream, memmap=False, checksum=True) as units:
                 arrays = {unit.name.lower(): _native(unit.data) for unit in units[1:]}
                 while stream.read(_PIECE_BYTES):
-                    pass  # only at its end does gzip verify its checksum
+                    pass  # gzip verifies its checksum only at its end
         except Warning as warning:
             raise ValueError(str(warning)) from None
     variables = {name: arrays.pop(name).astype(variable.dtype) for name, variable in VARIABLES.items()}
@@ -65,10 +65,10 @@ def read_fits(path: Path) -> StoredSlopes:
 
 
 def _write_image(stream: IO[bytes], name: str, array: NDArray[Any], units: str, comment: str) -> None:
-    """Write one image extension; numbers in FITS are big-endian, and a bool is a byte."""
+    """Write one image extension; FITS stores big-endian numbers and bool as bytes."""
     stored = array.dtype if array.dtype != np.bool_ else np.dtype(np.uint8)
     if stored.kind == "u" and stored.itemsize > 1:
-        raise InputError(f"slopes: {name}: dtype {array.dtype} has no plain FITS form: expected int or float")
+        raise InputError(f"slopes: {name}: dtype {array.dtype} is not supported, expected int or float")
     bits = 8 * stored.itemsize
     axes = [(f"NAXIS{axis}", length) for axis, length in enumerate(array.shape[::-1], 1)]
     header = fits.Header(
@@ -96,7 +96,7 @@ def _write_image(stream: IO[bytes], name: str, array: NDArray[Any], units: str, 
 
 
 def _write_header(stream: IO[bytes], header: Any, data_sum: int) -> None:
-    """Write a header with the sum of its data, and what makes the sum over both that of all ones."""
+    """Write a header with the checksum of its data, and the value that completes the total to all ones."""
     header["CHECKSUM"] = _NO_CHECKSUM
     header["DATASUM"] = str(data_sum)
     total = _sum([header.tostring().encode("ascii")], data_sum)
@@ -105,7 +105,7 @@ def _write_header(stream: IO[bytes], header: Any, data_sum: int) -> None:
 
 
 def _sum(content: Iterator[bytes] | list[bytes], start: int = 0) -> int:
-    """Return the sum of big-endian 32-bit words in ones' complement: what overflows is added at the end."""
+    """Return the ones' complement sum of big-endian 32-bit words: overflow is added at the low end."""
     total, rest = start, b""
     for piece in content:
         joined = rest + piece
@@ -119,11 +119,11 @@ def _sum(content: Iterator[bytes] | list[bytes], start: int = 0) -> int:
 
 
 def _encoded(number: int) -> str:
-    """Return 16 letters and digits that add as much to the sum of the header as `number` does to zeros.
+    """Return 16 letters and digits that add `number` to the header's sum, relative to zeros.
 
-    Each byte of the number is shared out among four characters, which stand one word apart. A character that
-    is neither letter nor digit gives one to its neighbour until both are. The value of a card starts one
-    character before a word ends, so the last character comes first.
+    Each byte of the number is shared among four characters, one word apart. A character that is neither
+    letter nor digit passes one on to its neighbour until both are. The value of a card starts one character
+    before a word boundary, so the last character comes first.
     """
     columns = []
     for byte in number.to_bytes(4, "big"):

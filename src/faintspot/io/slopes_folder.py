@@ -1,7 +1,8 @@
-"""Slopes of an unfinished run in a hidden folder beside the file that is made of them at the end.
+"""Slopes of an unfinished run in a hidden folder beside the output file.
 
-The folder ".NAME.partial" holds a flat binary file for each variable and a mark: how many frames are whole,
-and of which run. The file itself appears by renaming, complete. Until then its data exist twice on the disk.
+The folder ".NAME.partial" holds a flat binary file for each variable, and a mark: the number of complete
+frames and the run's fingerprint. The output appears complete by renaming; until then the data exist twice on
+the disk.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ _MARK = "finished"
 
 
 class FolderStorage:
-    """Collects slopes in a folder and makes the file of them when all are there.
+    """Storage of slopes in a folder, from which the output file is made when all are there.
 
     Parameters
     ----------
     path : Path
-        The file to be made.
+        Output file.
     run : Run
-        What it will contain.
+        Description of its contents.
     export : callable
         Writes the file: export(stream, slopes).
     """
@@ -50,7 +51,7 @@ class FolderStorage:
         self._export = export
 
     def begun(self) -> ExistingOutput | None:
-        """Return what is there, or None."""
+        """Return the description of the existing folder, or None."""
         if not is_partial(self.place):
             return None
         description = _read_description(self.place)
@@ -62,7 +63,7 @@ class FolderStorage:
         shutil.rmtree(self.place)
 
     def create(self) -> None:
-        """Create the folder; run.json comes last and marks that it is usable."""
+        """Create the folder; run.json is written last and marks it as usable."""
         shutil.rmtree(self.place, ignore_errors=True)
         self.place.mkdir()
         for name in VARIABLES:
@@ -77,20 +78,20 @@ class FolderStorage:
         replace_file(self.place / _RUN, json.dumps(description))
 
     def open(self) -> None:
-        """Nothing stays open."""
+        """Do nothing: no file stays open."""
 
     def marked(self) -> tuple[str, int]:
-        """Return fingerprint and number of whole frames."""
+        """Return the fingerprint and the number of complete frames."""
         return _read_mark(self.place)
 
     def mark(self, finished: int) -> None:
-        """Wait for the disk, then say how many frames are whole."""
+        """Wait for the disk, then write the number of complete frames."""
         for name in VARIABLES:
             sync_file(self.place / name)
         replace_file(self.place / _MARK, f"{finished}\n{self._run.fingerprint}")
 
     def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return frames that are stored."""
+        """Return stored frames."""
         stored = read_partial(self.place).variables
         return {name: np.array(array[start:stop]) for name, array in stored.items()}
 
@@ -103,7 +104,7 @@ class FolderStorage:
 
     def finish(self) -> None:
         """Make the file and remove the folder."""
-        temporary = self.place / "output"  # goes with the folder when this is interrupted
+        temporary = self.place / "output"  # removed with the folder after an interruption
         with temporary.open("wb") as stream:
             self._export(stream, read_partial(self.place))
             stream.flush()
@@ -114,17 +115,17 @@ class FolderStorage:
 
 
 def partial_folder(path: Path) -> Path:
-    """Return the hidden folder beside `path` where an unfinished run keeps its slopes."""
+    """Return the hidden folder beside `path` for the slopes of an unfinished run."""
     return path.with_name(f".{path.name}.partial")
 
 
 def is_partial(folder: Path) -> bool:
-    """Tell whether a folder is an unfinished run's."""
+    """Return whether a folder belongs to an unfinished run."""
     return (folder / _RUN).is_file()
 
 
 def read_partial(folder: Path) -> StoredSlopes:
-    """Return what an unfinished run has stored so far, mapped from the disk."""
+    """Return the slopes that an unfinished run has stored, memory-mapped."""
     description = _read_description(folder)
     finished = _read_mark(folder)[1]
     shape = (finished, description["n_subapertures"])
@@ -152,7 +153,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
 
 
 def _read_mark(folder: Path) -> tuple[str, int]:
-    """Return fingerprint and number of whole frames."""
+    """Return the fingerprint and the number of complete frames."""
     try:
         finished, _, fingerprint = read_bytes(folder / _MARK, "a mark", 1 << 10).decode().partition("\n")
         return fingerprint, int(finished)
@@ -161,4 +162,4 @@ def _read_mark(folder: Path) -> tuple[str, int]:
 
 
 def _damaged(folder: Path) -> InputError:
-    return InputError(f"{folder}: damaged, it cannot be resumed: delete it")
+    return InputError(f"{folder}: damaged, cannot be resumed; delete it")

@@ -1,4 +1,4 @@
-"""What a file of slopes contains, and what all writers share."""
+"""Contents of a file of slopes, and functions shared by all writers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from faintspot.base.sizes import check_bytes, memory_bytes
 
 @dataclass(frozen=True)
 class Variable:
-    """One quantity of every frame and sub-aperture."""
+    """Definition of a quantity that has a value for every frame and sub-aperture."""
 
     dtype: str
     units: str
     long_name: str
     csv_name: str
     if_absent: float | None = None
-    """What takes its place where it is not given."""
+    """Value used if it is not given."""
 
 
 VARIABLES: Mapping[str, Variable] = {
@@ -49,7 +49,7 @@ REQUIRED = frozenset(name for name, variable in VARIABLES.items() if variable.if
 RESERVED_ATTRIBUTES = frozenset({"n_frames", "n_subapertures", "finished_frames", "complete", "coordinates"})
 
 UNITS = ("px", "arcsec")
-"""Of positions, in files and when they are read."""
+"""Units of positions, in files and for reading."""
 
 COORDINATE_UNITS: Mapping[str, str] = {"centre_x": "px", "centre_y": "px"}
 
@@ -64,13 +64,13 @@ class StoredSlopes:
         x, y (px, or as attributes["unit"] says), flux (e-), valid, flags, iterations, bad_pixels,
         standard_error_x, standard_error_y (as x), each (n_finished, n_subapertures).
     coordinates : mapping
-        Per sub-aperture (n_subapertures,), as centre_x and centre_y (px in the frame).
+        Values per sub-aperture (n_subapertures,), such as centre_x and centre_y (px in the frame).
     attributes : mapping
-        What the writer was given: configuration, sources, fingerprint; a .csv has none.
+        Attributes given to the writer: configuration, sources, fingerprint; a .csv file has none.
     complete : bool
-        Whether all frames of the run are there.
+        Whether all frames of the run are present.
     n_finished : int
-        Number of frames that are there.
+        Number of frames present.
 
     Examples
     --------
@@ -94,17 +94,17 @@ class StoredSlopes:
 
 
 def most_slopes_bytes() -> int:
-    """Return how much memory slopes that are read from a file may take: half of what the machine has."""
+    """Return the largest size of slopes read from a file: half of the machine's memory."""
     return memory_bytes() // 2
 
 
 def check_stated(path: Path, shapes: Mapping[str, tuple[int, ...]], n_frames: int | None = None) -> None:
-    """Refuse slopes whose file states shapes that do not fit together, or too much memory to be read.
+    """Refuse slopes whose file states shapes that do not fit together or need too much memory.
 
     Parameters
     ----------
     path : Path
-        The file, for messages.
+        File, for messages.
     shapes : mapping
         Shapes of variables and coordinates.
     n_frames : int, optional
@@ -125,13 +125,13 @@ def check_stated(path: Path, shapes: Mapping[str, tuple[int, ...]], n_frames: in
 
 
 def unit_of(name: str, attributes: Mapping[str, Any]) -> str:
-    """Return the unit of a variable in a file with such attributes."""
+    """Return the unit of a variable in a file with these attributes."""
     units = VARIABLES[name].units
     return str(attributes.get("unit", units)) if units == "px" else units
 
 
 def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
-    """Return a pixel in a unit of positions; InputError when its scale is needed and not known."""
+    """Return the size of a pixel in a unit of positions; raise InputError if the pixel scale is not known."""
     if unit == "px":
         return 1.0
     scale = attributes.get("pixel_scale_arcsec")
@@ -144,7 +144,7 @@ def pixels_in(unit: str, attributes: Mapping[str, Any]) -> float:
 
 
 def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> dict[str, NDArray[Any]]:
-    """Return variables with positions and their errors times a factor."""
+    """Return variables with positions and their errors multiplied by a factor."""
     return {
         name: values * np.float32(factor) if factor != 1 and VARIABLES[name].units == "px" else values
         for name, values in variables.items()
@@ -153,7 +153,7 @@ def scaled_positions(variables: Mapping[str, NDArray[Any]], factor: float) -> di
 
 @dataclass(frozen=True)
 class RecordingHeader:
-    """What is to be written: sizes, attributes (JSON values, with a fingerprint) and coordinates."""
+    """Description of an output: sizes, attributes (JSON values with a fingerprint) and coordinates."""
 
     n_frames: int
     n_subapertures: int
@@ -162,17 +162,17 @@ class RecordingHeader:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Frames and sub-apertures."""
+        """Numbers of frames and sub-apertures."""
         return self.n_frames, self.n_subapertures
 
     @property
     def fingerprint(self) -> str:
-        """What two runs have in common when one may continue the other's output."""
+        """Identifier that runs share if one may continue the other's output."""
         return str(self.attributes["fingerprint"])
 
 
 class SlopeWriter(Protocol):
-    """Takes slopes block by block; a `with` statement closes it.
+    """Writer of slopes, block by block; a `with` statement closes it.
 
     Examples
     --------
@@ -187,12 +187,12 @@ class SlopeWriter(Protocol):
     """
 
     def finished(self) -> int:
-        """Return how many frames it has: the next block starts there."""
+        """Return the number of frames so far: the next block starts there."""
 
     def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
         """Add frames `start`, `start` + 1 ...: every variable of `VARIABLES`, (n, n_subapertures).
 
-        Those that may be absent need not be given.
+        Variables with a default may be omitted.
 
         Raises
         ------
@@ -201,7 +201,7 @@ class SlopeWriter(Protocol):
         """
 
     def close(self) -> None:
-        """Finish the output when it has all frames; otherwise leave it to be resumed."""
+        """Finish the output if it has all frames; otherwise leave it to be resumed."""
 
     def __enter__(self) -> Self: ...
 
@@ -213,7 +213,7 @@ class SlopeWriter(Protocol):
 def checked_block(
     run: RecordingHeader, finished: int, start: int, block: Mapping[str, Any]
 ) -> dict[str, NDArray[Any]]:
-    """Return the block's variables in the file's types, or say what is wrong with them."""
+    """Return the block's variables in the file's types, after checking them."""
     if start != finished:
         raise InputError(f"slopes: expected the block that starts at frame {finished}, got frame {start}")
     if set(block) - set(VARIABLES) or REQUIRED - set(block):
@@ -231,7 +231,7 @@ def checked_block(
 
 
 def _with_absent(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all variables in their order, those that are absent filled; KeyError when one is needed."""
+    """Return all variables in order, with defaults; raise KeyError when a required one is missing."""
     return {
         name: np.full(np.shape(found["x"]), variable.if_absent, variable.dtype)
         if name not in found and variable.if_absent is not None
@@ -260,10 +260,10 @@ def json_values(name: str, value: Mapping[str, Any]) -> dict[str, Any]:
 def belongs_to_another_run(path: Path) -> InputError:
     """Return the error for an output that a different run has begun or finished."""
     return InputError(
-        f"{path}: belongs to another run (other frames or configuration): choose another name or --overwrite"
+        f"{path}: belongs to another run (other frames or configuration); choose another name or --overwrite"
     )
 
 
 def exists_already(path: Path) -> InputError:
-    """Return the error for an output that is not to be touched."""
-    return InputError(f"{path}: exists already: choose another name or --overwrite")
+    """Return the error for an existing output that must not be replaced."""
+    return InputError(f"{path}: already exists; choose another name or --overwrite")

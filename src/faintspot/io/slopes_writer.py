@@ -1,4 +1,4 @@
-"""The writer of slopes, whatever the format: whole chunks, marks, and nobody else at the same time."""
+"""Writer of slopes for all formats: stores whole chunks, marks progress, and locks the output."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ _MARK_SECONDS = 1.0
 
 @dataclass(frozen=True)
 class ExistingOutput:
-    """What an output that is there says of itself."""
+    """Description of an existing output."""
 
     fingerprint: str | None
-    """None where the format has no place for it."""
+    """Fingerprint of the run; None if the format does not store it."""
     sizes: tuple[int, int]
     complete: bool
 
     def may_be_continued(self, place: Path, run: RecordingHeader, *, resume: bool, overwrite: bool) -> bool:
-        """Say whether `run` goes on with it (True) or replaces it (False).
+        """Return whether `run` continues the output (True) or replaces it (False).
 
         Raises
         ------
         InputError
-            When it may do neither; `place` is named.
+            When it may do neither; the message names `place`.
         """
         equal = self.fingerprint == run.fingerprint and self.sizes == run.sizes
         if equal and resume and not (overwrite and self.complete):
@@ -54,64 +54,64 @@ class ExistingOutput:
 
 
 class Storage(Protocol):
-    """Where the slopes of an unfinished run are kept: a folder of flat files, or a Zarr store.
+    """Storage of the slopes of an unfinished run: a folder of flat files, or a Zarr store.
 
-    OSErrors may come out of every method.
+    Every method may raise OSError.
     """
 
     @property
     def place(self) -> Path:
-        """The folder, for messages."""
+        """Folder, for messages."""
 
     @property
     def chunk(self) -> int:
-        """How many frames are written at once; known when it is open."""
+        """Number of frames written at once; known after opening."""
 
     def begun(self) -> ExistingOutput | None:
-        """Return what is there; InputError when that is something else than slopes, or damaged."""
+        """Return the existing output; raise InputError if it is not slopes, or damaged."""
 
     def remove(self) -> None:
-        """Delete what is there."""
+        """Delete the existing output."""
 
     def create(self) -> None:
-        """Begin, with no frames; it is never seen half made."""
+        """Create an empty storage; it never appears incomplete."""
 
     def open(self) -> None:
-        """Get ready to write into what is there; InputError when it is damaged."""
+        """Prepare to write to an existing storage; raise InputError if it is damaged."""
 
     def marked(self) -> tuple[str, int]:
-        """Return fingerprint and number of frames by the mark that is on the disk."""
+        """Return the fingerprint and the number of frames from the mark on the disk."""
 
     def mark(self, finished: int) -> None:
-        """Wait until what was written is on the disk, then say there that so many frames are whole."""
+        """Wait until the data are on the disk, then write the number of complete frames."""
 
     def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return frames that are stored."""
+        """Return stored frames."""
 
     def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Store frames from `start` on, which is the first of a chunk."""
 
     def finish(self) -> None:
-        """Make the output of it when all frames are marked."""
+        """Make the final output when all frames are marked."""
 
 
 class BlockWriter(Closing):
-    """Writes slopes to a storage that exists, from where it stopped.
+    """Writer of slopes to an existing storage, from where it stopped.
 
-    Frames of a chunk that is not full wait in memory until it is, or until `close`. Before every write the
-    mark on the disk must be the one that this writer has set: else somebody has replaced the output, which
-    the lock prevents where the file system has locks.
+    Frames of an incomplete chunk are kept in memory until it is full, or until `close`. Before every write,
+    the mark on the disk must be the one that this writer has set; otherwise another program has replaced the
+    output. On file systems with locks, the lock prevents that.
 
     Parameters
     ----------
     path : Path
-        The output.
+        Output.
     run : Run
-        What it will contain.
+        Description of its contents.
     storage : Storage
-        Where it is kept until then.
+        Storage until the output is complete.
     lock : OutputLock
-        Released by `close`.
+        Lock, which `close` releases.
     """
 
     def __init__(self, path: Path, run: RecordingHeader, storage: Storage, lock: OutputLock) -> None:
@@ -131,7 +131,7 @@ class BlockWriter(Closing):
 
     @property
     def _stored(self) -> int:
-        """Frames that are stored."""
+        """Number of stored frames."""
         return self._state[0]
 
     @property
@@ -140,11 +140,11 @@ class BlockWriter(Closing):
         return self._state[1]
 
     def finished(self) -> int:
-        """Return how many frames it has, stored or waiting: the next block starts there."""
+        """Return the number of frames, stored or waiting: the next block starts there."""
         return self._stored + sum(len(block["x"]) for block in self._waiting)
 
     def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
-        """Add a block of frames; whole chunks go to the disk."""
+        """Add a block of frames; write complete chunks to the disk."""
         if not self._is_open:
             raise InputError(f"{self._path}: expected no more slopes after close(), got frame {start}")
         arrays = checked_block(self._run, self.finished(), start, block)
@@ -161,7 +161,7 @@ class BlockWriter(Closing):
             raise
 
     def close(self) -> None:
-        """Store and mark what waits, and finish the output when it has all frames."""
+        """Store and mark waiting frames, and finish the output if it has all frames."""
         if not self._is_open:
             return
         self._is_open = False
@@ -180,7 +180,7 @@ class BlockWriter(Closing):
             self._lock.release()
 
     def _store(self, count: int) -> None:
-        """Write the first `count` waiting frames, then, when it is time, the mark."""
+        """Write the first `count` waiting frames and, if it is due, the mark."""
         joined = {name: np.concatenate([block[name] for block in self._waiting]) for name in VARIABLES}
         finished = self._stored + count
         with output_errors(self._path):
@@ -192,14 +192,14 @@ class BlockWriter(Closing):
         self._state = finished, [rest] if len(rest["x"]) else []
 
     def _take_back_last_chunk(self) -> None:
-        """Take frames of a chunk that is not full back into memory, so that it is written again whole."""
+        """Read frames of an incomplete chunk back into memory, to write the whole chunk again."""
         start = self._stored - self._stored % self._storage.chunk
         taken_back = self._storage.read(start, self._stored)
         self._mark(start)
         self._state = start, [taken_back]
 
     def _mark(self, finished: int) -> None:
-        self._marks.add(finished)  # interrupted in between, either may be on the disk
+        self._marks.add(finished)  # after an interruption either may be on the disk
         self._storage.mark(finished)
         self._marks = {finished}
         self._next_mark = time.monotonic() + _MARK_SECONDS
@@ -212,13 +212,13 @@ class BlockWriter(Closing):
             ours = False
         if not ours:
             raise InputError(
-                f"{self._path}: another program has replaced what this run had written: "
-                "this run ends here, choose another name for it"
+                f"{self._path}: another program has replaced the output of this run, which ends here; "
+                "choose another name for it"
             )
 
 
 class FinishedWriter(Closing):
-    """Stands for an output that an earlier, equal run has completed: nothing is left to do."""
+    """Writer for an output that an equal run has completed: nothing is left to do."""
 
     def __init__(self, n_frames: int) -> None:
         self._n_frames = n_frames
@@ -228,8 +228,8 @@ class FinishedWriter(Closing):
         return self._n_frames
 
     def append(self, start: int, block: Mapping[str, NDArray[Any]]) -> None:
-        """Refuse: the output is complete."""
-        raise InputError(f"slopes: the output is complete with {self._n_frames} frames, got frame {start}")
+        """Raise InputError: the output is complete."""
+        raise InputError(f"slopes: expected no more frames, {self._n_frames} are complete, got frame {start}")
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: nothing is open."""

@@ -1,8 +1,8 @@
-"""Slopes in a Zarr store (format 3) that xarray reads, also while it is being written.
+"""Slopes in a Zarr store (format 3) that xarray can read, even while it is being written.
 
-A chunk holds a number of frames and is written once, whole and with a checksum (crc32c). When chunks are on
-the disk, the mark `finished_frames` in the group's attributes is replaced. However the program ends, the
-store is valid and the mark includes only what is whole.
+A chunk holds a number of frames and is written once, as a whole and with a checksum (crc32c). After chunks
+are on the disk, the mark `finished_frames` in the group's attributes is replaced. However the program ends,
+the store is valid and the mark counts complete frames only.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ _COMPLETE = "complete"
 _COORDINATES = "coordinates"
 _AT_ONCE = 16
 _CHUNK_NUMBERS = 1 << 16
-# As "c.12.0", not a folder for each: folders have to be synchronised, too.
+# As "c.12.0" instead of a folder for each: folders must be synchronised, too.
 _CHUNK_NAMES: dict[str, Any] = {"name": "default", "separator": "."}
 
 
 class StoreStorage:
-    """Keeps slopes in the Zarr store that is the output itself.
+    """Storage of slopes in the Zarr store that is the output.
 
     Parameters
     ----------
     path : Path
-        The store.
+        Store.
     run : Run
-        What it will contain.
+        Description of its contents.
     """
 
     def __init__(self, path: Path, run: RecordingHeader) -> None:
@@ -69,7 +69,7 @@ class StoreStorage:
         self._not_synchronised: set[Path] = set()
 
     def begun(self) -> ExistingOutput | None:
-        """Return what is there, or None."""
+        """Return the description of the existing store, or None."""
         return describe_store(self.place)
 
     def remove(self) -> None:
@@ -86,7 +86,7 @@ class StoreStorage:
         hidden.mkdir()
         _create_arrays(hidden, self._run)
         with warnings.catch_warnings():
-            # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are absent.
+            # Consolidated metadata are not yet in the standard of Zarr; xarray warns when they are missing.
             warnings.simplefilter("ignore")
             zarr.consolidate_metadata(str(hidden))
         for file in (*hidden.rglob("*"), hidden):
@@ -95,28 +95,28 @@ class StoreStorage:
         sync_folder(self.place.parent)
 
     def open(self) -> None:
-        """Open the arrays, and remove what an interrupted replacement of the mark has left."""
+        """Open the arrays, and remove the remains of an interrupted replacement of the mark."""
         for leftover in self.place.glob(".*.new"):
             leftover.unlink()
         group: Any = zarr.open_group(str(self.place), mode="r+", use_consolidated=False)
         try:
-            # A chunk of zeros is written like any other: one that is not there has been lost.
+            # Write chunks of zeros, too, so that a missing chunk means lost data.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self._arrays = {name: group[name] for name in VARIABLES}
         except (KeyError, ValueError) as error:
             raise InputError(
-                f"{self.place}: damaged, it cannot be resumed: delete it ({one_line(error)})"
+                f"{self.place}: damaged, cannot be resumed; delete it ({one_line(error)})"
             ) from None
         self.chunk = int(self._arrays["x"].chunks[0])
 
     def marked(self) -> tuple[str, int]:
-        """Return fingerprint and number of whole frames."""
+        """Return the fingerprint and the number of complete frames."""
         attributes = _stored_attributes(self.place)
         return attributes["fingerprint"], attributes[_MARK]
 
     def mark(self, finished: int) -> None:
-        """Wait for the disk, then say how many frames are whole."""
-        with ThreadPoolExecutor(_AT_ONCE) as threads:  # one after the other takes several times as long
+        """Wait for the disk, then write the number of complete frames."""
+        with ThreadPoolExecutor(_AT_ONCE) as threads:  # several times faster than one after another
             list(threads.map(sync_file, self._not_synchronised))
         for folder in {file.parent for file in self._not_synchronised}:
             sync_folder(folder)
@@ -124,7 +124,7 @@ class StoreStorage:
         replace_attributes(self.place, {_MARK: finished, _COMPLETE: finished == self._run.n_frames})
 
     def read(self, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Return frames that are stored."""
+        """Return stored frames."""
         return {name: read_items(self.place, array, start, stop) for name, array in self._arrays.items()}
 
     def write(self, start: int, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -135,23 +135,25 @@ class StoreStorage:
             self._not_synchronised.update(chunk_files(self.place, array, start, start + len(values)))
 
     def finish(self) -> None:
-        """The mark says it all."""
+        """Do nothing: the mark is sufficient."""
 
 
 def describe_store(path: Path) -> ExistingOutput | None:
-    """Return what the store of slopes says of itself; None when nothing is there.
+    """Return the description of a store of slopes; None if the path does not exist.
 
     Raises
     ------
     InputError
-        When something else is there.
+        When the path is something else.
     """
     if not path.exists():
         return None
     try:
         attributes = _stored_attributes(path)
     except (OSError, ValueError, KeyError):
-        raise InputError(f"{path}: exists and holds no slopes of faintspot: choose another name") from None
+        raise InputError(
+            f"{path}: expected slopes or nothing, found other data; choose another name"
+        ) from None
     sizes = (attributes["n_frames"], attributes["n_subapertures"])
     return ExistingOutput(attributes["fingerprint"], sizes, attributes[_COMPLETE])
 
@@ -162,10 +164,10 @@ def read_store(path: Path) -> StoredSlopes:
     Raises
     ------
     InputError
-        When it is no such store, or a chunk is damaged or lost.
+        When it is not a store of slopes, or a chunk is damaged or missing.
     """
     if not is_store(path):
-        raise InputError(f"{path}: expected slopes, this directory is not a Zarr store")
+        raise InputError(f"{path}: expected a Zarr store of slopes, got another directory")
     attributes = _stored_attributes(path)
     finished, complete = int(attributes.pop(_MARK)), bool(attributes.pop(_COMPLETE))
     coordinates = attributes.pop(_COORDINATES, "").split()
@@ -221,7 +223,7 @@ def _create_arrays(path: Path, run: RecordingHeader) -> None:
 
 
 def _stored_attributes(path: Path) -> dict[str, Any]:
-    """Return the attributes of a store of slopes; KeyError when it is something else."""
+    """Return the attributes of a store of slopes; raise KeyError if it is something else."""
     attributes = stored_attributes(path)
     for name in (_MARK, _COMPLETE, "fingerprint", "n_frames", "n_subapertures"):
         attributes[name]

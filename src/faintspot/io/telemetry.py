@@ -1,8 +1,7 @@
 """Telemetry in a Zarr store (format 3) that grows while the engine runs, and reading it back.
 
-Whatever is written goes to the end of the arrays, in chunks with checksums (crc32c); then the counters in the
-group's attributes are replaced. However the recording ends, the store is valid and the counters include only
-what is whole.
+Data are appended to the arrays in chunks with checksums (crc32c); then the counters in the group's attributes
+are replaced. However the recording ends, the store is valid and the counters count complete data only.
 """
 
 from __future__ import annotations
@@ -53,15 +52,15 @@ _NO_LOOP: dict[str, NDArray[Any]] = {
     "loop": np.zeros((0,), np.int64),
     "commands": np.zeros((0, 0), np.float32),
 }
-"""Of a frame, in recordings of engines that make no commands."""
-_NOT_STORED = "sequence"  # of the rings, which a store has no use for
+"""Loop state and commands of a frame in recordings without commands."""
+_NOT_STORED = "sequence"  # used by the rings only
 
 
 @dataclass(frozen=True, repr=False)
 class Telemetry:
-    """What was recorded of a running engine: (n_frames,) or (n_frames, n_subapertures), as it came.
+    """Recorded telemetry of an engine: arrays (n_frames,) or (n_frames, n_subapertures), in order of arrival.
 
-    Frames that were lost are absent; `frame` tells.
+    Lost frames are absent, which shows in `frame`.
 
     Examples
     --------
@@ -71,47 +70,47 @@ class Telemetry:
     """
 
     frame: NDArray[np.int64]
-    """The camera's number of each frame."""
+    """Frame numbers of the camera."""
     arm: NDArray[np.int64]
-    """Which of interleaved settings it was measured with, a place in ``attributes["arms"]``; 0 without."""
+    """Number of the interleaved configuration, an index into ``attributes["arms"]``; 0 without."""
     change: NDArray[np.int64]
-    """Number of the last change of settings that it was measured with, see `changes`; 0: none."""
+    """Number of the last change of settings that applies, see `changes`; 0: none."""
     last_row_time_ns: NDArray[np.int64]
-    """When its last row had arrived, CLOCK_MONOTONIC, ns."""
+    """Arrival of the last row, CLOCK_MONOTONIC, ns."""
     published_time_ns: NDArray[np.int64]
-    """When its slopes were published."""
+    """Publication of the slopes, CLOCK_MONOTONIC, ns."""
     clock_offset_ns: NDArray[np.int64]
-    """Added to the times: Unix time by the wall clock of that moment, which may be set meanwhile."""
+    """Offset from these times to Unix time by the wall clock at that moment, which may be reset meanwhile."""
     x: NDArray[np.float32]
-    """Slopes, px, as in `faintspot.Slopes`; so are the next ones."""
+    """Slopes, px, as in `faintspot.Slopes`; likewise the next ones."""
     y: NDArray[np.float32]
     flux: NDArray[np.float32]
-    """Electrons."""
+    """Flux in electrons."""
     standard_error_x: NDArray[np.float32]
-    """px."""
+    """Standard error of x, px."""
     standard_error_y: NDArray[np.float32]
     iterations: NDArray[np.int32]
     flags: NDArray[np.uint8]
     """Bits of `faintspot.SubapertureFlag`."""
     loop: NDArray[np.int64]
-    """The loop's state: 0 there is none, 1 open, 2 closed."""
+    """State of the loop: 0 no loop, 1 open, 2 closed."""
     commands: NDArray[np.float32]
-    """Commands that followed from each frame, in the interaction matrix's unit, (n_frames, commands)."""
+    """Commands that follow from each frame, in the interaction matrix's unit, (n_frames, commands)."""
     image_frame: NDArray[np.int64]
-    """Numbers of the frames whose images were recorded, (n_images,)."""
+    """Numbers of the frames with recorded images, (n_images,)."""
     raw: NDArray[np.float32]
     """Those frames, ADU, (n_images, height, width)."""
     denoised: NDArray[np.float32]
-    """Their sub-aperture images after denoising, electrons, (n_images, n_subapertures, ny, nx)."""
+    """Their denoised sub-aperture images, electrons, (n_images, n_subapertures, ny, nx)."""
     changes: list[dict[str, Any]]
     """Changes of settings: frame (the first with it), number, changes (values by name), where (None: all)."""
     attributes: dict[str, Any]
-    """Plain values: layout (``Layout(**attributes["layout"])``), settings to begin with (TOML text), arms
-    (names of the interleaved settings), reference (slopes that were subtracted, or None), dropped_records,
+    """Plain values: layout (``Layout(**attributes["layout"])``), initial settings (TOML), arms (names of the
+    interleaved configurations), reference (slopes that were subtracted, or None), dropped_records,
     dropped_images, dropped_changes, complete, ended_because."""
 
     def __repr__(self) -> str:
-        """Say how much there is."""
+        """Return the numbers of frames, sub-apertures, images and changes."""
         return (
             f"Telemetry({len(self.frame)} frames, {self.x.shape[-1]} sub-apertures, "
             f"{len(self.image_frame)} images, {len(self.changes)} changes of settings)"
@@ -119,7 +118,7 @@ class Telemetry:
 
     @property
     def slopes(self) -> NDArray[np.float32]:
-        """All x, then all y, px, (n_frames, 2 n_subapertures): what a reconstructor multiplies."""
+        """Slopes for a reconstructor, px, (n_frames, 2 n_subapertures): all x, then all y."""
         return np.concatenate([self.x, self.y], axis=-1)
 
     @property
@@ -129,14 +128,14 @@ class Telemetry:
 
     @property
     def latency_s(self) -> NDArray[np.float64]:
-        """From the last row to the slopes, (n_frames,)."""
+        """Latency from the last row to the slopes, (n_frames,)."""
         return (self.published_time_ns - self.last_row_time_ns) / 1e9
 
     @property
     def unix_time_s(self) -> NDArray[np.float64]:
-        """When the last row had arrived, Unix time, (n_frames,).
+        """Unix time of the arrival of the last row, (n_frames,).
 
-        By the wall clock at the first frame: it never goes back, also where the wall clock was set.
+        Taken from the wall clock at the first frame: it never decreases, even if the wall clock was reset.
         """
         offset = self.clock_offset_ns[0] if len(self.clock_offset_ns) else 0
         return (self.last_row_time_ns + offset) / 1e9
@@ -147,21 +146,21 @@ _ARRAYS = tuple(field.name for field in fields(Telemetry) if field.name not in (
 
 
 class TelemetryStore:
-    """Writes telemetry to a new Zarr store.
+    """Writer of telemetry to a new Zarr store.
 
     Parameters
     ----------
     path : path
         A directory that does not exist yet.
     record_type, image_type : structured dtype
-        Of what is appended: a field an array of the store.
+        Types of the items to append; each field becomes an array of the store.
     attributes : mapping
         JSON values.
 
     Raises
     ------
     InputError
-        When something is there already, or it cannot be written.
+        When the path exists or cannot be written.
     """
 
     def __init__(
@@ -173,24 +172,24 @@ class TelemetryStore:
     ) -> None:
         self.path = Path(path)
         if self.path.exists():
-            raise InputError(f"{self.path}: exists already: choose another name")
+            raise InputError(f"{self.path}: already exists; choose another name")
         self.frames = self.images = 0
-        """Frames and images that are whole in the store."""
+        """Numbers of complete frames and images in the store."""
         counters = {"format": FORMAT, "version": 1, _FRAMES: 0, _IMAGES: 0, "changes": [], "complete": False}
         with output_errors(self.path):
             _create(self.path, (record_type, image_type), {**attributes, **counters})
         group: Any = zarr.open_group(str(self.path), mode="r+")
-        # A chunk of zeros is written like any other: one that is not there has been lost.
+        # Write chunks of zeros, too, so that a missing chunk means lost data.
         with zarr.config.set({"array.write_empty_chunks": True}):
             self._arrays: dict[str, Any] = dict(group.arrays())
 
     def append(self, records: NDArray[Any], images: NDArray[Any], attributes: Mapping[str, Any]) -> None:
-        """Add records and images and replace attributes; when it returns, they are in the store.
+        """Append records and images and replace attributes; on return they are in the store.
 
         Raises
         ------
         InputError
-            When the disk is full or not writable; what was there before can still be read.
+            When the disk is full or not writable; earlier data can still be read.
         """
         with output_errors(self.path):
             for name, values in (*_columns(records), *_columns(images)):
@@ -207,14 +206,14 @@ class TelemetryStore:
 
 
 def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
-    """Read what `faintspot realtime record` has written, also while it is still writing.
+    """Read a recording of `faintspot realtime record`, even while it is being written.
 
     Parameters
     ----------
     path : path
         The Zarr store.
     images : bool
-        Whether to read the images, which need the most memory; else there are none.
+        Whether to read the images, which need the most memory; otherwise there are none.
 
     Returns
     -------
@@ -223,7 +222,7 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
     Raises
     ------
     InputError
-        When it is not a store of telemetry, or damaged.
+        When it is not a telemetry store, or damaged.
 
     Examples
     --------
@@ -255,18 +254,18 @@ def read_telemetry(path: str | Path, *, images: bool = True) -> Telemetry:
         changes = attributes.pop("changes")
     except InputError:
         raise
-    except Exception as error:  # a broken store makes zarr raise many things
+    except Exception as error:  # zarr raises many kinds of errors on broken stores
         raise InputError(f"{store}: the store is damaged ({one_line(error)})") from None
     return Telemetry(**arrays, changes=changes, attributes=attributes)
 
 
 def attributes_of(store: Path) -> dict[str, Any]:
-    """Return what a store of telemetry says of itself.
+    """Return the attributes of a telemetry store.
 
     Raises
     ------
     InputError
-        When it is none.
+        When the path is not a telemetry store.
     """
     if not store.exists():
         raise InputError(f"{store}: no such file or directory")
@@ -278,25 +277,23 @@ def attributes_of(store: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError):
         known = False
     if not (known and is_store(store)):
-        raise InputError(
-            f"{store}: expected a Zarr store of telemetry, as `faintspot realtime record` writes"
-        )
+        raise InputError(f"{store}: expected a Zarr store of telemetry from `faintspot realtime record`")
     return attributes
 
 
 def finished_of(attributes: Mapping[str, Any]) -> tuple[int, int]:
-    """Return how many frames and images are whole in a store with these attributes."""
+    """Return the numbers of complete frames and images in a store with these attributes."""
     return int(attributes[_FRAMES]), int(attributes[_IMAGES])
 
 
 def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mapping[str, Any]) -> None:
-    """Create the store under a hidden name and rename it, so that it is never seen half made."""
+    """Create the store under a hidden name and rename it, so that it never appears incomplete."""
     hidden = path.with_name(f".{path.name}.new")
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir()
     rest = {name: value for name, value in attributes.items() if name != _PARTS}
     group = zarr.create_group(str(hidden), zarr_format=3, attributes=rest)
-    # Large, and written once: the attributes of the store are replaced with every block of frames.
+    # Large and written once; the store's other attributes are replaced with every block of frames.
     group.create_group(_PARTS, attributes={_PARTS: attributes.get(_PARTS)})
     for kind in kinds:
         for name, values in _columns(np.empty(0, kind)):
@@ -320,15 +317,15 @@ def _create(path: Path, kinds: tuple[np.dtype[np.void], ...], attributes: Mappin
 
 
 def _columns(items: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
-    """The fields of a structured array that are stored, by name."""
+    """Return the stored fields of a structured array, by name."""
     return [(name, items[name]) for name in stored_names(items.dtype)]
 
 
 def stored_names(kind: np.dtype[np.void]) -> list[str]:
-    """Return the fields of records or images that a store has an array for."""
+    """Return the fields of records or images that have an array in a store."""
     return [name for name in kind.names or () if name != _NOT_STORED]
 
 
 def _dimensions(name: str, count: int) -> tuple[str, ...]:
-    """Names of an array's dimensions."""
+    """Return the names of an array's dimensions."""
     return _DIMENSIONS.get(name, ("frame", "subaperture")[:count])

@@ -1,4 +1,4 @@
-"""Reading a store of telemetry in parts: more than memory holds, or while it is played."""
+"""Reading a telemetry store in parts, for long recordings and for playback."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from faintspot.io.zarr_store import open_store, read_items
 
 
 class StoredTelemetry:
-    """A store of telemetry, as it is when this is made, also while it is still written.
+    """A telemetry store at the time of opening, even while it is being written.
 
     Parameters
     ----------
@@ -27,16 +27,16 @@ class StoredTelemetry:
     ----------
     path : Path
     attributes : dict
-        As `Telemetry.attributes`.
+        See `Telemetry.attributes`.
     changes : list of dict
-        As `Telemetry.changes`.
+        See `Telemetry.changes`.
     frames, images : int
-        That are whole in the store.
+        Numbers of complete frames and images in the store.
 
     Raises
     ------
     InputError
-        When it is not a store of telemetry, or damaged.
+        When it is not a telemetry store, or damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -47,21 +47,21 @@ class StoredTelemetry:
             self.frames, self.images = finished_of(self.attributes)
             self.changes: list[dict[str, Any]] = self.attributes.pop("changes")
             self.frames_together = int(self._group["x"].chunks[0])
-            """Frames in one chunk of slopes, which is read as a whole."""
-        except Exception as error:  # a broken store makes zarr raise many things
+            """Number of frames in a chunk of slopes, which is read as a whole."""
+        except Exception as error:  # zarr raises many kinds of errors on broken stores
             raise InputError(f"{self.path}: the store is damaged ({one_line(error)})") from None
 
     def __contains__(self, name: str) -> bool:
-        """Whether there is such an array."""
+        """Return whether the store has an array."""
         return name in self._group
 
     def check_shapes(self, kinds: Sequence[np.dtype[np.void]]) -> None:
-        """Refuse a store whose arrays are not those of such records and images.
+        """Refuse a store whose arrays do not have these types of records and images.
 
         Raises
         ------
         InputError
-            When one is missing, or its items have another shape.
+            When an array is missing, or its items have another shape.
         """
         for kind in kinds:
             for name in stored_names(kind):

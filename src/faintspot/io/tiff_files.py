@@ -1,4 +1,4 @@
-"""Frames in TIFF files: single pages and stacks, as cameras and ImageJ write them."""
+"""Frames in TIFF files: single pages and stacks, as written by cameras and ImageJ."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from faintspot.io.locations import StoredArray, one_line
 from faintspot.io.optional_packages import load_pillow
 from faintspot.io.raw import RawArray
 
-_PLAIN = (1, 8, 32946)  # not compressed, or deflated
+_PLAIN = (1, 8, 32946)  # uncompressed or deflated
 
 
 class Tiff(FileFormat):
-    """Frames as pages, or as one stack behind the first page; BigTIFF, too."""
+    """Frames as pages, or as one stack after the first page; including BigTIFF."""
 
     name = "TIFF"
     signatures = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -29,7 +29,8 @@ class Tiff(FileFormat):
     def find(self, path: Path, key: str | None) -> StoredArray:
         """Return the pages of a file, or those of the series whose number is `key`.
 
-        tifffile calls a series what was written together. Raises InputError when pages are not alike.
+        A series in tifffile is a set of pages written together. Raises InputError when pages differ in size
+        or type.
         """
         _check_chain(path)
         complaints = _Complaints()
@@ -40,7 +41,7 @@ class Tiff(FileFormat):
                 array = _array(name, path, [file.series[number] for number in chosen], chosen)
         except (InputError, OSError, MissingExtraError):
             raise
-        except Exception as error:  # a broken file makes tifffile raise many things
+        except Exception as error:  # tifffile raises many kinds of errors on broken files
             raise InputError(f"{path}: expected a whole TIFF file ({one_line(error)})") from None
         if complaints.first:
             raise InputError(f"{path}: expected a whole TIFF file ({complaints.first})")
@@ -48,7 +49,7 @@ class Tiff(FileFormat):
 
 
 def _check_chain(path: Path) -> None:
-    """Refuse pages that follow each other in a circle, which tifffile would read for ever."""
+    """Refuse pages that link to each other in a circle, which tifffile would read without end."""
     with path.open("rb") as stream:
         start = stream.read(8)
         order: Literal["little", "big"] = "little" if start[:2] == b"II" else "big"
@@ -60,7 +61,7 @@ def _check_chain(path: Path) -> None:
         while 0 < offset < end:
             if offset in seen:
                 raise InputError(
-                    f"{path}: expected a whole TIFF file (its pages follow each other in a circle)"
+                    f"{path}: expected a whole TIFF file (its pages link to each other in a circle)"
                 )
             seen.add(offset)
             stream.seek(offset)
@@ -70,14 +71,14 @@ def _check_chain(path: Path) -> None:
 
 
 class _Complaints(logging.Handler):
-    """Notes the first error that tifffile logs, where it goes on with fewer pages; a context."""
+    """Context that keeps the first error that tifffile logs when it drops pages."""
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)
         self.first = ""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep its message in one line."""
+        """Keep the message in one line."""
         self.first = self.first or " ".join(record.getMessage().split())
 
     def __enter__(self) -> None:
@@ -99,7 +100,7 @@ def _load_tifffile() -> Any:
 
 
 def _choose(path: Path, series: list[Any], key: str | None) -> list[int]:
-    """Return the numbers of the series to read: that which is named, or all when they are alike."""
+    """Return the numbers of the series to read: the named one, or all when they are alike."""
     everything = list(range(len(series)))
     if key is None and len({(item.keyframe.shape, item.dtype) for item in series}) == 1:
         return everything
@@ -109,7 +110,7 @@ def _choose(path: Path, series: list[Any], key: str | None) -> list[int]:
     if key is None:
         raise InputError(
             f"{path}: expected pages of one size and type; it contains {listed}; "
-            f"choose some with {path.name}:NUMBER"
+            f"select some with {path.name}:NUMBER"
         )
     if not key.isdecimal() or int(key) not in everything:
         raise InputError(f"{path}: no pages {key!r}; it contains {listed}")
@@ -117,7 +118,7 @@ def _choose(path: Path, series: list[Any], key: str | None) -> list[int]:
 
 
 def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> StoredArray:
-    """Return the pages of series as one array: as plain bytes where they lie in a row, else page by page."""
+    """Return the pages of series as one array: as plain bytes if contiguous, else page by page."""
     series = chosen[0]
     size = tuple(series.keyframe.shape)
     if series.keyframe.samplesperpixel != 1 or len(size) != 2:
@@ -129,7 +130,7 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
         needed = series.dataoffset + int(np.prod(shape)) * dtype.itemsize
         if path.stat().st_size < needed:
             raise InputError(
-                f"{name}: truncated: it promises data up to byte {needed}, "
+                f"{name}: truncated: it states data up to byte {needed}, "
                 f"the file has {path.stat().st_size} bytes"
             )
         return RawArray(
@@ -144,7 +145,7 @@ def _array(name: str, path: Path, chosen: list[Any], numbers: list[int]) -> Stor
 
 
 class _Pages:
-    """Pages that are decompressed one by one."""
+    """Pages that are decompressed individually."""
 
     def __init__(
         self, name: str, path: Path, numbers: list[int], shape: tuple[int, ...], dtype: np.dtype[Any]
@@ -158,7 +159,7 @@ class _Pages:
         self._pages: list[Any] = []
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Return pages `start` to `stop`, in native byte order; of a single page all rows."""
+        """Return pages `start` to `stop`, in native byte order; for a single page, rows."""
         if len(self.shape) == 2:
             return self._page(0)[start:stop]
         return np.stack([self._page(number) for number in range(start, stop)])
@@ -171,7 +172,7 @@ class _Pages:
             self._pages = []
 
     def _decoded(self, page: Any) -> NDArray[Any]:
-        """Decode a page: with tifffile where it can, else with Pillow."""
+        """Decode a page with tifffile if possible, else with Pillow."""
         with self._path.open("rb") as stream:
             for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
                 stream.seek(offset)
@@ -190,7 +191,7 @@ class _Pages:
                 self._file = _load_tifffile().TiffFile(self._path)
                 self._pages = [page for i in self._numbers for page in self._file.series[i].pages]
             values = self._decoded(self._pages[number])
-        except Exception as error:  # the decompressors raise whatever they like
+        except Exception as error:  # decompressors raise many kinds of errors
             self.close()
             raise InputError(
                 f"{self.name}: frame {number} (counted from 0) cannot be read ({one_line(error)})"

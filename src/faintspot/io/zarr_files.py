@@ -19,7 +19,7 @@ from faintspot.io.slopes_format import RecordingHeader, StoredSlopes
 from faintspot.io.slopes_writer import ExistingOutput, Storage
 from faintspot.io.zarr_store import check_array, is_store, open_store
 
-_MOST_ABSENT = 1000  # chunks for each that is there
+_MOST_ABSENT = 1000  # missing chunks per existing chunk
 
 
 class Zarr(FileFormat):
@@ -29,13 +29,13 @@ class Zarr(FileFormat):
     endings = (".zarr",)
 
     def has_frames(self, path: Path, start: bytes) -> bool:
-        """Tell whether it is a folder."""
+        """Return whether the path is a folder."""
         return not start
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return the store itself when it is an array, or that at path `key`, `frames` or the only one.
+        """Return the array at path `key`, the store itself, its array `frames`, or its only array.
 
-        Chunks that are absent from a store are its fill value by Zarr's definition, not an error.
+        By Zarr's definition, missing chunks hold the fill value; that is not an error.
         """
         if not is_store(path):
             raise InputError(f"{path}: expected a Zarr store or a file of frames, this directory is neither")
@@ -47,7 +47,7 @@ class Zarr(FileFormat):
                 node = arrays[choose_name(path, {name: array.ndim for name, array in arrays.items()}, None)]
         except InputError:
             raise
-        except Exception as error:  # broken metadata makes zarr raise many things
+        except Exception as error:  # zarr raises many kinds of errors on broken metadata
             where = f"{path}:{key}" if key else str(path)
             raise InputError(f"{where}: cannot be opened as a Zarr array ({one_line(error)})") from None
         name = f"{path}:{node.path}" if node.path else str(path)
@@ -56,7 +56,7 @@ class Zarr(FileFormat):
         return _ZarrArray(name, node)
 
     def require(self) -> None:
-        """Raise MissingExtraError when zarr is absent."""
+        """Raise MissingExtraError when zarr is not installed."""
         load_zarr()
 
     def read(self, path: Path) -> StoredSlopes:
@@ -67,7 +67,7 @@ class Zarr(FileFormat):
         return read_store(path)
 
     def has_slopes(self, path: Path) -> bool:
-        """Tell by the attributes of the store."""
+        """Return whether the store's attributes are those of slopes."""
         from faintspot.io.slopes_zarr import describe_store
 
         try:
@@ -76,14 +76,14 @@ class Zarr(FileFormat):
             return False
 
     def finished(self, path: Path) -> ExistingOutput | None:
-        """Return what a complete store says of itself."""
+        """Return the description of a complete store."""
         from faintspot.io.slopes_zarr import describe_store
 
         begun = describe_store(path)
         return begun if begun is not None and begun.complete else None
 
     def leftovers(self, path: Path) -> bool:
-        """Tell that nothing lies beside a store."""
+        """Return False: there are no files beside a store."""
         return False
 
     def storage(self, path: Path, run: RecordingHeader) -> Storage:
@@ -94,7 +94,7 @@ class Zarr(FileFormat):
 
 
 def _check_presence(path: Path, name: str, array: Any) -> None:
-    """Refuse an array of which hardly a chunk is there: its frames would be the fill value, for ever."""
+    """Refuse an array with hardly any chunk present: reading its fill values would take for ever."""
     parts = array.shards or array.chunks
     promised = math.prod(-(-side // part) for side, part in zip(array.shape, parts, strict=True))
     if promised <= _MOST_ABSENT:
@@ -117,11 +117,11 @@ class _ZarrArray:
         """Return items `start` to `stop` of the first axis, in native byte order."""
         try:
             return np.asarray(self._array[start:stop]).astype(self.dtype, copy=False)
-        except Exception as error:  # a broken chunk makes each codec raise its own kind
+        except Exception as error:  # each codec raises its own kind of error on broken chunks
             raise InputError(
                 f"{self.name}: frames {start} to {stop - 1} (counted from 0) cannot be read: "
                 f"the store is damaged ({one_line(error)})"
             ) from None
 
     def close(self) -> None:
-        """A store keeps nothing open."""
+        """Do nothing: a store keeps no file open."""

@@ -1,4 +1,4 @@
-"""What a Zarr store is on the disk."""
+"""Zarr stores on the disk: opening, checks, codecs and damaged chunks."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from faintspot.io.optional_packages import load_zarr
 from faintspot.io.raw import MOST_WHOLE_BYTES
 
 TELEMETRY = "faintspot telemetry"
-"""What a store of telemetry has as its format."""
+"""Format attribute of a telemetry store."""
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
 _METADATA = (*_MARKS, ".zattrs", ".zmetadata")
 _COMPRESSORS = ("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd")
 
 
 def is_store(path: Path) -> bool:
-    """Tell whether a directory is a Zarr group or array."""
+    """Return whether a directory is a Zarr group or array."""
     return any((path / mark).is_file() for mark in _MARKS)
 
 
 def open_store(path: Path, key: str = "") -> Any:
-    """Open a group or an array of a store to be read.
+    """Open a group or an array of a store for reading.
 
-    A pipe or a device in place of a file, and a chunk that inflates to more than `MOST_WHOLE_BYTES`, are
-    refused when they are read.
+    On access, it refuses a pipe or a device in place of a file, and a chunk that inflates to more than
+    `MOST_WHOLE_BYTES`.
 
     Raises
     ------
     Exception
-        Broken metadata makes zarr raise many things.
+        On broken metadata zarr raises many kinds of errors.
     """
     zarr = load_zarr()
     local: Any = zarr.storage.LocalStore
@@ -65,12 +65,12 @@ def open_store(path: Path, key: str = "") -> Any:
 
 
 def check_array(name: str, array: Any) -> None:
-    """Refuse an array whose chunks are too large when unpacked, or compressed twice, or Python objects.
+    """Refuse an array of Python objects, or with chunks that are too large unpacked or compressed twice.
 
     Raises
     ------
     InputError
-        When it is such an array.
+        When the array is refused.
     """
     codecs = [
         getattr(codec, "codec_id", type(codec).__name__) for codec in (*array.filters, *array.compressors)
@@ -84,12 +84,12 @@ def check_array(name: str, array: Any) -> None:
 
 
 def stored_attributes(path: Path) -> dict[str, Any]:
-    """Return the attributes of the group that a store is.
+    """Return the attributes of a store that is a group.
 
     Raises
     ------
     OSError, ValueError, KeyError, TypeError
-        When it is no group of format 3.
+        When it is not a group of format 3.
     """
     text = read_bytes(path / "zarr.json", "metadata", MOST_TEXT_BYTES)
     attributes: dict[str, Any] = parse_json(text)["attributes"]
@@ -97,7 +97,7 @@ def stored_attributes(path: Path) -> dict[str, Any]:
 
 
 def holds_telemetry(path: Path) -> bool:
-    """Tell whether a path is a store of telemetry, as `faintspot.io.telemetry` writes it."""
+    """Return whether a path is a telemetry store written by `faintspot.io.telemetry`."""
     try:
         return bool(stored_attributes(path)["format"] == TELEMETRY)
     except (OSError, ValueError, KeyError, TypeError):
@@ -105,25 +105,25 @@ def holds_telemetry(path: Path) -> bool:
 
 
 def replace_attributes(path: Path, changed: Mapping[str, Any]) -> None:
-    """Change attributes of a group in one step, which the store's own setter does not promise."""
+    """Replace attributes of a group in one step, which the store's own setter does not guarantee."""
     metadata = parse_json((path / "zarr.json").read_text(encoding="utf-8"))
     metadata["attributes"].update(changed)
     replace_file(path / "zarr.json", json.dumps(metadata, indent=2))
 
 
 def checked_codecs() -> tuple[Any, ...]:
-    """Return the codecs of a chunk that is compressed and has a checksum."""
+    """Return the codecs for compressed chunks with a checksum."""
     zarr = load_zarr()
     return zarr.codecs.ZstdCodec(level=0), zarr.codecs.Crc32cCodec()
 
 
 def read_items(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
-    """Return items of an array, or say that some are lost: to Zarr, a lost chunk is its fill value.
+    """Return items of an array; a missing chunk is an error here, while zarr would return its fill value.
 
     Raises
     ------
     InputError
-        When a chunk is damaged or lost.
+        When a chunk is damaged or missing.
     """
     for number, file in enumerate(chunk_files(path, array, start, stop), start // array.chunks[0]):
         if not file.is_file():
@@ -134,14 +134,14 @@ def read_items(path: Path, array: Any, start: int, stop: int) -> NDArray[Any]:
     check_array(f"{path}: {array.basename}", array)
     try:
         return np.asarray(array[start:stop])
-    except Exception as error:  # a broken chunk makes each codec raise its own kind
+    except Exception as error:  # each codec raises its own kind of error on broken chunks
         raise InputError(
             f"{path}: the store is damaged: {array.basename} cannot be read ({one_line(error)})"
         ) from None
 
 
 def chunk_files(path: Path, array: Any, start: int, stop: int) -> Iterator[Path]:
-    """Yield the files of the chunks that hold items `start` to `stop`; a chunk spans all later axes."""
+    """Yield the files of the chunks with items `start` to `stop`; a chunk spans all later axes."""
     length = array.chunks[0]
     rest = (0,) * (array.ndim - 1)
     numbers = range(start // length, -(-stop // length))

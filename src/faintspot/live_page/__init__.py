@@ -1,1 +1,1 @@
-"""A web page of the running engine, or of a recording."""
+"""A web page that shows a running engine or a recording."""

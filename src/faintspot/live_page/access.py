@@ -1,4 +1,4 @@
-"""Who may see the page and change things: hosts, origins and the token."""
+"""Access control of the page: permitted hosts and origins, and the token."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?", re.I
 
 
 class Access:
-    """The rules.
+    """Rules that decide who may read the page and change settings.
 
-    A page of another site must neither read nor change anything, also where its name is made to lead here
-    (DNS rebinding): hosts are numbers, "localhost" or this machine's name, and a web socket comes from a page
-    of the same host and port. Changes need the token; where others than this machine reach the server,
-    reading does, too.
+    Pages of other sites must neither read nor change anything, even if their name is made to resolve to this
+    machine (DNS rebinding). So hosts must be numbers, "localhost" or this machine's name, and a web socket
+    must come from a page of the same host and port. Changes need the token; if other machines can reach the
+    server, reading needs it, too.
 
     Parameters
     ----------
     address : str
-        To which the server is bound.
+        Address to which the server is bound.
     private : bool
-        Whether reading needs the token also on this machine, which others may use.
+        Whether reading needs the token even on this machine, which other users may share.
 
     Raises
     ------
     InputError
-        When it is not an IP address.
+        When the address is not an IP address.
     """
 
     def __init__(self, address: str, private: bool = False) -> None:
@@ -46,7 +46,7 @@ class Access:
         self.reading_needs_token = private or not parsed.is_loopback
 
     def permits_host(self, host: str | None) -> bool:
-        """Whether a request's Host header names this machine."""
+        """Return whether a request's Host header names this machine."""
         match = _HOST.fullmatch(host or "")
         if match is None:
             return False
@@ -59,10 +59,10 @@ class Access:
 
     @staticmethod
     def permits_origin(headers: Mapping[str, str]) -> bool:
-        """Whether a request for the web socket comes from the page itself."""
+        """Return whether a request for the web socket comes from the page itself."""
         origin, host = headers.get("Origin"), headers.get("Host")
         return bool(host) and origin == f"http://{host}"
 
     def knows(self, token: object) -> bool:
-        """Whether it is the token; takes as long for any other."""
+        """Compare with the token, in a time that does not depend on the content."""
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self.token.encode())

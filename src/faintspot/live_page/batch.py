@@ -1,4 +1,4 @@
-"""What came since the last look, from a running engine or a recording."""
+"""Data that arrived since the last read, from a running engine or a recording."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame and its denoised images, with the record of that frame where it is still known."""
+    """A frame and its denoised images, with the record of that frame if still available."""
 
     frame: int
     raw: NDArray[np.float32]
@@ -26,41 +26,41 @@ class Picture:
 
 @dataclass(frozen=True)
 class Batch:
-    """What came since the last look."""
+    """Data that arrived since the last read."""
 
     records: NDArray[Any]
-    """As `faintspot.realtime.telemetry_segment.record_type`."""
+    """Records, as in `faintspot.realtime.telemetry_segment.record_type`."""
     missed: int = 0
-    """Records that the page was too slow for."""
+    """Number of records for which the page was too slow."""
     picture: Picture | None = None
-    """The newest."""
+    """The newest picture."""
     truth: tuple[int, float, float] | None = None
-    """Of the newest frame whose truth is known: frame, Strehl ratio, rms wavefront in nm."""
+    """Truth of the newest frame that has one: frame, Strehl ratio, rms wavefront error [nm]."""
     commands: Floats | None = None
-    """The newest, as they came."""
+    """The newest commands, in the engine's unit."""
     changes: list[dict[str, Any]] = field(default_factory=list)
     """Changes of settings."""
     anew: bool = False
-    """Whether what was gathered before has nothing to do with it."""
+    """Whether earlier data belong to another engine or another part of the recording."""
 
 
 class Source(Protocol):
-    """Where batches come from."""
+    """Interface of a source of batches."""
 
     name: str
     layout: Layout | None
-    """None before there is any."""
+    """Layout of the sensor; None until it is known."""
     arms: list[str]
-    """Names of the arms of settings in turn."""
+    """Names of the interleaved configurations."""
 
     def read(self) -> Batch | None:
-        """Return what came since the last call; None where there is no source."""
+        """Return the data since the last call; None if there is no source."""
         ...
 
     def place(self) -> dict[str, Any]:
-        """Say where it comes from, as plain values for the page."""
+        """Return the state of the source as plain values for the page."""
         ...
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
         ...

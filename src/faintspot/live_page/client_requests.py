@@ -1,4 +1,4 @@
-"""What a client may ask for, and what it is answered."""
+"""Requests that a client may make, and their answers."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _MOST_CHANGES = 100
 
 
 class ClientRequests(Protocol):
-    """What a page may ask for, by name; each raises InputError where it is refused."""
+    """Requests that a page may make, by name; a refused request raises InputError."""
 
     def known(self) -> Mapping[str, ClientRequest]:
-        """Return the functions."""
+        """Return the functions of the requests, by name."""
         ...
 
 
 def answered(client_requests: ClientRequests, asked: dict[str, Any]) -> dict[str, Any]:
-    """Carry out a wish; whatever happens, there is an answer."""
+    """Carry out a request; always return an answer."""
     known = client_requests.known()
     try:
         wish = known.get(asked["do"])
@@ -37,19 +37,19 @@ def answered(client_requests: ClientRequests, asked: dict[str, Any]) -> dict[str
         return {"ok": True, **wish(asked)}
     except InputError as error:
         return {"ok": False, "error": str(error)}
-    except Exception as error:  # a fault of one must not end the server
+    except Exception as error:  # a fault in a request must not end the server
         return {"ok": False, "error": " ".join(f"{type(error).__name__}: {error}".split())[:500]}
 
 
 class EngineRequests:
-    """Passes wishes on to an engine's control channel, which checks them, and records its telemetry.
+    """Requests passed on to an engine's control channel, which checks them; and recording of telemetry.
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     folder : path
-        Where recordings go.
+        Folder of recordings.
     """
 
     def __init__(self, name: str, folder: str | Path) -> None:
@@ -57,7 +57,7 @@ class EngineRequests:
         self.recording = Recording(name, Path(folder))
 
     def known(self) -> Mapping[str, ClientRequest]:
-        """Return the functions."""
+        """Return the functions of the requests, by name."""
         return {
             "set": self._set,
             "interleave": self._interleave,
@@ -71,7 +71,7 @@ class EngineRequests:
         self.recording.stop()
 
     def _set(self, asked: dict[str, Any]) -> Mapping[str, Any]:
-        """As `faintspot realtime set`: "changes", a list of NAME=VALUE, and "subapertures", "" for all."""
+        """Change settings: "changes" (a list of NAME=VALUE) and "subapertures" ("" for all)."""
         texts, where = asked.get("changes"), asked.get("subapertures") or ""
         if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
             raise InputError("changes: expected a list of NAME=VALUE")
@@ -85,12 +85,12 @@ class EngineRequests:
         return {"text": _since(reply["frame"])}
 
     def _interleave(self, asked: dict[str, Any]) -> Mapping[str, Any]:
-        """As `faintspot realtime interleave`."""
+        """Interleave configurations as `faintspot realtime interleave`."""
         reply = self._ask("interleave", arms=asked.get("arms"), every=asked.get("every"))
         return {"text": _since(reply.get("frame"))}
 
     def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:
-        """As `faintspot realtime control`: "action" open, close, flat or gain, with "gain"."""
+        """Control the loop: "action" open, close, flat or gain, with "gain"."""
         fields = {name: asked[name] for name in ("action", "gain") if asked.get(name) is not None}
         loop = self._ask("loop", **fields)["loop"]
         gain = "" if loop.get("gain") is None else f", gain {loop['gain']:g}"
@@ -101,12 +101,12 @@ class EngineRequests:
 
 
 class Recording:
-    """One recording at a time, in a thread of its own.
+    """Recordings, one at a time, in a separate thread.
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     folder : Path
     """
 
@@ -118,19 +118,19 @@ class Recording:
         self._said: dict[str, Any] = {"running": False}
 
     def start(self, file: Any) -> Mapping[str, Any]:
-        """Begin a new store.
+        """Start a recording to a new store.
 
         Raises
         ------
         InputError
-            When the name is not one of a file ending in .zarr, the store is there already, there is no
-            engine, or a recording runs.
+            When the file name does not end in .zarr, the store already exists, there is no engine, or a
+            recording is running.
         """
         if not isinstance(file, str) or not _FILE.fullmatch(file):
             raise InputError(f"file = {file!r:.80}: expected a name such as night.zarr, without a folder")
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
-                raise InputError("file: a recording runs already; stop it first")
+                raise InputError("file: a recording is already running; stop it first")
             recorder = Recorder(self._name, self._folder / file)
             self._stopping.clear()
             self._said = {"running": True, "file": file, "frames": 0}
@@ -141,7 +141,7 @@ class Recording:
         return {"text": f"recording to {file}"}
 
     def stop(self) -> Mapping[str, Any]:
-        """End the recording; nothing where there is none."""
+        """End the recording, if there is one."""
         with self._lock:
             self._stopping.set()
             if self._thread is not None:
@@ -149,7 +149,7 @@ class Recording:
         return {"text": self.status().get("text", "nothing is being recorded")}
 
     def status(self) -> dict[str, Any]:
-        """Say what is being recorded, or was."""
+        """Return the state of the present or last recording."""
         return dict(self._said)
 
     def _record(self, recorder: Recorder, file: str) -> None:

@@ -1,4 +1,4 @@
-"""A telescope, an engine that closes its loop, and its page; and what the arms in turn are worth."""
+"""A simulated telescope, an engine that closes its loop and its page; with a comparison of methods."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
 Floats = NDArray[np.float64]
 
 _CONFIGURATION = "camera_3e"
-# Chosen in the simulated loop, on other air than is shown.
+# Chosen in the simulated loop with other realisations of the turbulence than the one shown.
 _PRIOR_PX, _GAIN, _WINDOW_WIDTH = 1.0, 0.4, 2.8  # the last one in widths of the spots
 _TURN_S = 1.0
 _IMAGES_EVERY = 10
-_SETTLE_FRAMES = 20  # of a turn, in which the loop forgets the arm before
-_OPEN_FRAMES = 100  # before the loop is closed: the guard learns what is too much
-_COMPILING_S = 600.0  # for the engine, the first time on a machine
+_SETTLE_FRAMES = 20  # start of a turn, affected by the previous method
+_OPEN_FRAMES = 100  # before the loop is closed, to set the guard's limit
+_COMPILING_S = 600.0  # time limit of the engine, which compiles on first use
 _PATIENCE_S = 60.0
 _LOOKS_PER_FRAME = 4
 _LEAST_LOOK_S = 1e-3
@@ -53,22 +53,22 @@ _STREHL, _COMMAND_FRAME = TRUTH.index("strehl"), TRUTH.index("command_frame")
 
 @dataclass(frozen=True)
 class LiveDemonstration:
-    """What is shown.
+    """A live demonstration of closed-loop operation.
 
     Parameters
     ----------
     folder : path
-        For configurations, matrices and what the processes say.
+        Folder of configurations, matrices and log files.
     photons : float
-        Photo-electrons of a fully lit sub-aperture in a frame.
+        Photo-electrons per fully illuminated sub-aperture and frame.
     rate_hz : float
-        Frames a second; the air moves as far in a frame as it does at the configuration's rate.
+        Frames per second; the turbulence moves as far per frame as at the configuration's rate.
     name : str
-        Of the engine and all streams.
+        Name of the engine and all streams.
     port : int
-        Of the page; 0: any that is free.
+        Port of the page; 0: any free one.
     seed : int
-        Of air and noise.
+        Seed of turbulence and noise.
     """
 
     folder: Path
@@ -80,21 +80,22 @@ class LiveDemonstration:
 
     @property
     def observed(self) -> LoopConfiguration:
-        """The simulated loop."""
+        """Configuration of the simulated loop."""
         star = load_loop(_CONFIGURATION).replace("camera", photons_per_subaperture=self.photons)
         return star.replace("control", gain=_GAIN).slowed_to(self.rate_hz)
 
     @property
     def turn_frames(self) -> int:
-        """Frames until it is the next arm's turn."""
+        """Number of frames per turn of a method."""
         return max(2 * _SETTLE_FRAMES, round(_TURN_S * self.rate_hz))
 
     @cached_property
     def arms(self) -> dict[str, str]:
-        """What takes turns, by its name: as `faintspot realtime interleave` understands it.
+        """Methods that take turns, by name, in the format of `faintspot realtime interleave`.
 
-        The window is told its centroid gain on speckled spots, as a system would have measured it. "map" is
-        told what the Kalman filter expects. Brightest pixels do better without their gain, which is very low.
+        The window uses its centroid gain for speckled spots, as a system would have measured it. "map" uses
+        the Kalman filter's prediction. Brightest pixels do better without a correction of their very low
+        gain.
         """
         observed = self.observed
         width = _WINDOW_WIDTH * observed.scene.seen_fwhm_px
@@ -108,21 +109,22 @@ class LiveDemonstration:
         }
 
     def write_files(self) -> tuple[Path, Path]:
-        """Write the loop's configuration, and all that the engine needs; return both.
+        """Write the configurations of the loop and of the engine; return both paths.
 
-        The interaction matrix is the simulation's: measuring it takes the telescope some ten seconds.
+        The interaction matrix is taken from the simulation: measuring it takes the telescope some ten
+        seconds.
 
         Raises
         ------
         InputError
-            For values out of range, and when a file cannot be written.
+            When a value is out of range, or a file cannot be written.
         """
         observed = self.observed
         with output_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         loop = self.folder / "loop.toml"
         write_atomically(loop, observed.to_text())
-        # What is particular to one of the arms the others do not look at.
+        # Settings of one method, which the other methods ignore.
         settings = Settings("map", prior_std_px=_PRIOR_PX, flux_e=self.photons)
         engine = self.folder / "faintspot.toml"
         configuration_file.save(engine, settings)
@@ -131,24 +133,24 @@ class LiveDemonstration:
         return loop, engine
 
     def run(self, stop: StopEvent, seconds: float, say: Callable[[str], None]) -> Shown:
-        """Start everything, close the loop and watch it for so long, or until `stop` is set; end everything.
+        """Start all processes, watch the closed loop for `seconds` or until `stop` is set, and end them.
 
         Parameters
         ----------
         stop : event
         seconds : float
-            With a closed loop.
+            Time with a closed loop.
         say : function
-            Told in a line what happens, and where the page is.
+            Called with one-line messages about progress and the page's address.
 
         Raises
         ------
         InputError
-            For values out of range, files that cannot be written, a process that ends by itself, and one that
-            does not do what it is waited for.
+            When a value is out of range, a file cannot be written, or a process ends or does not become
+            ready.
         """
         self._check_name()
-        say(f"a telescope is simulated, a Kalman filter learns from its loop: a minute; files: {self.folder}")
+        say(f"simulating a telescope and training a Kalman filter (one minute); files: {self.folder}")
         loop, engine = self.write_files()
         shown = Shown(list(self.arms), self.observed.control.delay_frames)
         if stop.is_set():
@@ -160,7 +162,7 @@ class LiveDemonstration:
             images = ["--images-every", str(_IMAGES_EVERY)]
             processes.start(_TELESCOPE, ["realtime", "telescope", "run", str(loop), *name, *seed])
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
-            say("telescope and engine start; the first time the engine compiles its code for a minute")
+            say("starting telescope and engine; on first use the engine compiles for about a minute")
 
             def wait(condition: Callable[[], bool], what: str, timeout_s: float) -> None:
                 processes.wait_until(lambda: stop.is_set() or condition(), what, timeout_s)
@@ -171,30 +173,30 @@ class LiveDemonstration:
             if stop.is_set():
                 return shown
             processes.check()
-            say(f"{processes.said(_PAGE)[0]}\nOpen it in a browser; Ctrl-C ends everything, with a table")
+            say(f"{processes.said(_PAGE)[0]}\nOpen it in a browser; Ctrl-C ends it and prints a table")
             begun = self._frames_measured()
             wait(lambda: self._frames_measured() >= begun + _OPEN_FRAMES, "frames", _PATIENCE_S)
             with _Watcher(self.name, shown, _LOOKS_PER_FRAME * self.rate_hz) as watcher:
                 watcher.watch(processes, stop, _OPEN_FRAMES / self.rate_hz)
                 self._asked("loop", action="close")
-                say(f"the loop is closed; in turn for {seconds:g} s: {', '.join(self.arms)}")
+                say(f"the loop is closed; methods compared for {seconds:g} s: {', '.join(self.arms)}")
                 watcher.watch(processes, stop, seconds)
             shown.status = self._asked("status")
         return shown
 
     def _check_name(self) -> None:
-        """Refuse the name of an engine that runs: its loop is somebody else's."""
+        """Refuse the name of a running engine, whose loop belongs to someone else."""
         try:
             self._asked("status")
         except InputError:
             return
-        raise InputError(f"name = {self.name!r}: expected one that no engine has; that one runs already")
+        raise InputError(f"name = {self.name!r}: an engine of that name is running, expected an unused name")
 
     def _asked(self, command: str, **fields: Any) -> dict[str, Any]:
         return request(socket_path(self.name), command, **fields)
 
     def _frames_measured(self) -> int:
-        """Return how many frames the engine has measured; 0 while it does not answer yet."""
+        """Return how many frames the engine has measured; 0 while it does not answer."""
         try:
             return int(self._asked("status")["counters"]["processed"])
         except InputError:
@@ -203,42 +205,42 @@ class LiveDemonstration:
 
 @dataclass(eq=False)
 class Shown:
-    """What was seen of the loop."""
+    """Data gathered from the loop."""
 
     arms: list[str]
     delay_frames: int
     rows: list[tuple[float, ...]] = field(default_factory=list)
-    """Of every frame: its number, arm, state of the loop, latency in us."""
+    """Rows of all frames: number, method, state of the loop, latency [us]."""
     truth: dict[int, tuple[float, float]] = field(default_factory=dict)
-    """By frame number, where it was read: Strehl ratio, frame whose commands acted."""
+    """Strehl ratio, and frame whose commands acted, by frame number; for the frames that were read."""
     status: dict[str, Any] | None = None
-    """What the engine said of itself at the end."""
+    """Status of the engine at the end."""
 
     @property
     def table(self) -> Floats:
-        """(frames, 6): `rows` and `truth`, NaN where that is not known."""
+        """`rows` and `truth` together, (frames, 6); NaN where the truth is not known."""
         known = [self.truth.get(int(row[0]), (np.nan, np.nan)) for row in self.rows]
         return np.hstack([np.array(self.rows).reshape(-1, 4), np.array(known).reshape(-1, 2)])
 
     @property
     def open_strehl(self) -> float:
-        """Mean Strehl ratio before the loop was closed; NaN where nothing is known."""
+        """Mean Strehl ratio before the loop was closed; NaN if it is not known."""
         frames = self.table
         values = frames[frames[:, 2] != STATES.index(CLOSED), 4]
         return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
     @property
     def on_time(self) -> float:
-        """Part of the closed loop's frames in which the commands acted after the delay that is set."""
+        """Fraction of the closed loop's frames whose commands acted after the configured delay."""
         frames = self.table
         frames = frames[(frames[:, 2] == STATES.index(CLOSED)) & np.isfinite(frames[:, 5])]
         late = frames[:, 0] - frames[:, 5]
         return float(np.mean(late == self.delay_frames)) if len(late) else float("nan")
 
     def by_arm(self) -> list[ArmShown]:
-        """Return what every arm has done in the closed loop; empty before each had a turn.
+        """Return the result of every method in the closed loop; empty before each has had a turn.
 
-        Of each turn the first frames, in which the loop forgets the arm before, do not count for the Strehl
+        The first frames of each turn, still affected by the previous method, do not count towards the Strehl
         ratio.
         """
         frames = self.table
@@ -257,7 +259,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class ArmShown:
-    """One arm: its Strehl ratio, frames, and latencies from the last row to the slopes."""
+    """Result of one method: Strehl ratio, frames, and latencies from the last row to the slopes."""
 
     strehl: ArmDifference
     frames: int
@@ -266,7 +268,7 @@ class ArmShown:
 
 
 class _Watcher:
-    """Reads telemetry and truth as they come."""
+    """Reader of telemetry and truth as they arrive."""
 
     def __init__(self, name: str, shown: Shown, looks_hz: float) -> None:
         self._shown, self._look_s = shown, max(1 / looks_hz, _LEAST_LOOK_S)
@@ -282,7 +284,7 @@ class _Watcher:
         self._reader.close()
 
     def watch(self, processes: ChildProcesses, stop: StopEvent, seconds: float) -> None:
-        """Write down what comes, for so long."""
+        """Gather data for `seconds`."""
         end = time.monotonic() + seconds
         while not stop.is_set() and time.monotonic() < end:
             processes.check()

@@ -1,4 +1,4 @@
-"""A running engine as the page sees it: through shared memory, as any recorder does."""
+"""Data of a running engine, read from shared memory."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.realtime.telescope import TRUTH
 from faintspot.sensor.layout import Layout
 
-_STALE_S = 0.25  # between two questions whether the engine lives
+_STALE_S = 0.25  # between two checks whether the engine is alive
 _TRUTH_FIELDS = tuple(TRUTH.index(name) for name in ("strehl", "rms_nm"))
 
 
 class EngineSource:
-    """Telemetry of the engine of a name, the truth and commands where there are any.
+    """Telemetry of an engine, with the truth and commands if available.
 
-    It waits for the engine, and for its return.
+    It waits for the engine to start, and to restart.
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     """
 
     def __init__(self, name: str) -> None:
@@ -44,13 +44,13 @@ class EngineSource:
         self._asked_s = 0.0
 
     def read(self) -> Batch | None:
-        """Return what came since the last call; None while there is no engine."""
+        """Return the data since the last call; None while there is no engine."""
         anew = self._reader is None and self._attached()
         reader = self._reader
         if reader is None:
             return None
         truth = self._newest_truth()
-        # Images first: the record of each was written before it, so that it is among these or older ones.
+        # Images first: each image's record was written before it, so it is among these records or older ones.
         images, self._cursors[1], _ = reader.images_since(max(self._cursors[1], reader.newest_image - 1))
         records, self._cursors[0], missed = reader.records_since(self._cursors[0])
         changes, self._cursors[2], _ = reader.changes_since(self._cursors[2])
@@ -72,12 +72,12 @@ class EngineSource:
         )
 
     def place(self) -> dict[str, Any]:
-        """Say whether there is an engine."""
+        """Return the engine's name and whether it is running."""
         there = self._reader is not None
         return {"kind": "engine", "name": self.name, "there": there}
 
     def close(self) -> None:
-        """Let go of shared memory."""
+        """Close the shared memory."""
         self._truth.close()
         self._commands.close()
         if self._reader is not None:
@@ -85,7 +85,7 @@ class EngineSource:
             self._reader = None
 
     def _attached(self) -> bool:
-        """Look for the engine's telemetry; return whether it is there."""
+        """Look for the engine's telemetry; return whether it is available."""
         try:
             reader = TelemetryReader.attach(self.name)
         except InputError:
@@ -99,7 +99,7 @@ class EngineSource:
         return True
 
     def _let_go_if_stale(self, reader: TelemetryReader) -> None:
-        """Give up an engine that has ended, when all that it left behind has been read."""
+        """Close the telemetry of an engine that has ended, after reading all of it."""
         if time.monotonic() - self._asked_s < _STALE_S:
             return
         self._asked_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""The newest message of every kind, for clients that take them at their own pace."""
+"""The newest message of each kind, for clients that read at their own pace."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import asyncio
 
 
 class LatestMessages:
-    """Holds one message of each kind; a newer one replaces it, whoever has read it or not.
+    """One message of each kind; a newer one replaces it whether or not it has been read.
 
-    So a client that is slow misses messages, and nothing is kept for it. For one event loop.
+    A slow client misses messages, and nothing is queued for it. For use in one event loop.
     """
 
     def __init__(self) -> None:
@@ -17,14 +17,14 @@ class LatestMessages:
         self._changed = asyncio.Event()
 
     def post(self, kind: str, message: bytes) -> None:
-        """Put up a message."""
+        """Set the message of a kind."""
         self._posted += 1
         self._messages[kind] = self._posted, message
         self._changed.set()
         self._changed = asyncio.Event()
 
     def forget(self, kind: str) -> None:
-        """Take a message down: those who come later do not get it."""
+        """Remove the message of a kind: later clients do not get it."""
         self._messages.pop(kind, None)
 
     async def newer(self, seen: int) -> list[tuple[int, bytes]]:

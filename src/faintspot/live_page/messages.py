@@ -1,8 +1,8 @@
-"""What the page is sent: values as JSON and arrays behind them, in one binary message.
+"""Binary messages to the page: values as JSON, followed by arrays.
 
-Four bytes with the length of the JSON text, little-endian; the text, padded to eight bytes:
-{"kind": ..., "values": {...}, "arrays": {name: [type, shape, offset]}}; the arrays, each padded to eight
-bytes; offsets count from the first.
+A message starts with the length of the JSON text in four bytes, little-endian. The text follows, padded to
+eight bytes: {"kind": ..., "values": {...}, "arrays": {name: [type, shape, offset]}}. Then come the arrays,
+each padded to eight bytes; offsets count from the first one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def packed(kind: str, values: Mapping[str, Any], arrays: Mapping[str, NDArray[An
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold: null for numbers that are not finite, lists for arrays."""
+    """Return a value as JSON allows it: null for numbers that are not finite, lists for arrays."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):

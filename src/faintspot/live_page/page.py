@@ -1,4 +1,4 @@
-"""The page's own work: look at the source ten times a second and say what has changed."""
+"""The page's updates: read the source about ten times a second and send the changes."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from faintspot.live_page.page_state import PageState, flag_names
 from faintspot.live_page.pictures import FrameDrawing
 
 UPDATE_S = 0.08
-"""Between two updates of the page."""
+"""Interval between two updates of the page [s]."""
 _FIGURES_S, _ARMS_S = 0.5, 2.0
 
 
 class Page:
-    """Looks at a source and tells what the page is to show; by one thread.
+    """Reader of a source that sends updates to the page; for one thread.
 
     Parameters
     ----------
     source : Source
     tell : function
-        Given kind and message (None: what was told of that kind is not so any more).
+        Called with kind and message; None withdraws the last message of that kind.
     """
 
     def __init__(self, source: Source, tell: Callable[[str, bytes | None], None]) -> None:
@@ -36,7 +36,7 @@ class Page:
         self._place: dict[str, Any] | None = None
 
     def step(self) -> None:
-        """Look once."""
+        """Read the source once and send updates."""
         try:
             batch = self.source.read()
             place = self.source.place()
@@ -57,7 +57,7 @@ class Page:
             self._tell("place", packed("place", place))
 
     def _begin(self) -> None:
-        """Forget what another engine, or another part of the recording, has given."""
+        """Clear data of another engine, or of another part of the recording."""
         layout = self.source.layout
         assert layout is not None
         self.page_state = PageState(self.source.arms)

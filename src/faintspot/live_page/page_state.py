@@ -1,4 +1,4 @@
-"""What the page knows of the frames so far: the newest one, and a few numbers of each of the last minute."""
+"""Data that the page shows: the newest frame, and a few numbers of each frame of the last minute."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from faintspot.realtime.interleaving import arms_after
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
 
 STRIP_S = 30.0
-"""What strip charts show."""
+"""Time span of the strip charts [s]."""
 FRAMES_S = 60.0
-"""What percentiles, the histogram and the arms' figures are of."""
-_MOST_FRAMES = 1 << 17  # also of cameras that are very fast
-_MOST_CHANGES = 20  # that are kept to be shown
-_MEAN_FRAMES = 500  # over which a sub-aperture's mean slope is taken, about which the rms is
-_FEWEST_FRAMES = 10  # of which a mean is one
+"""Time span of percentiles, the histogram and the comparison of methods [s]."""
+_MOST_FRAMES = 1 << 17  # limit for very fast cameras
+_MOST_CHANGES = 20  # kept for display
+_MEAN_FRAMES = 500  # time constant of a sub-aperture's mean slope, about which the rms is taken
+_FEWEST_FRAMES = 10  # needed for a mean
 _STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
-"""A row of the strip charts: what one look at the telemetry gave."""
+"""Row of the strip charts: result of one read of the telemetry."""
 _FRAME = ("time_s", "arm", "latency_us", "rms_px", "flux_e", "valid", "strehl")
-"""A row of the last frames."""
+"""Row of the last frames."""
 _BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
 _COMPARED = {
     "rms of slopes (px)": ("rms_px", 1.0),
@@ -38,12 +38,12 @@ _COMPARED = {
 
 
 class PageState:
-    """Numbers of the frames of one engine or recording.
+    """Statistics of the frames of one engine or recording.
 
     Parameters
     ----------
     arms : list of str
-        Names of the arms of settings in turn; none or one without.
+        Names of the interleaved configurations; none or one without interleaving.
     """
 
     def __init__(self, arms: list[str]) -> None:
@@ -52,19 +52,19 @@ class PageState:
         """Record of the newest frame."""
         self.changes: list[dict[str, Any]] = []
         self.seen = self.lost = self.missed = 0
-        """Frames, frame numbers that did not come, and records that the page was too slow for."""
+        """Numbers of frames, of missing frame numbers, and of records for which the page was too slow."""
         self.commands: Floats | None = None
         self._strip: deque[tuple[float, ...]] = deque()
         self._frames: deque[Floats] = deque()
-        self._first_arm = 0  # of the interleaving that runs
-        self._means: dict[int, Floats] = {}  # of the slopes, by arm, and of how many frames
+        self._first_arm = 0  # number of the first method of the present interleaving
+        self._means: dict[int, Floats] = {}  # mean slopes by method, and their numbers of frames
         self._seen_of: defaultdict[int, int] = defaultdict(int)
         # The last ones: a frame's truth may be known before its record.
         self._truths: deque[tuple[int, float, float]] = deque(maxlen=4)
-        self._last: NDArray[Any] | None = None  # records of the look before
+        self._last: NDArray[Any] | None = None  # records of the previous read
 
     def add(self, batch: Batch) -> None:
-        """Take in what came."""
+        """Add the data of a batch."""
         self.changes = (self.changes + batch.changes)[-_MOST_CHANGES:]
         self.arms, self._first_arm = arms_after(self.arms, batch.changes, self._first_arm)
         self.missed += batch.missed
@@ -76,7 +76,7 @@ class PageState:
         if not len(records):
             return
         rows = self._rows(records)
-        for frame, strehl, _ in self._truths:  # known of a few frames alone
+        for frame, strehl, _ in self._truths:  # known for a few frames only
             rows[records["frame"] == frame, _FRAME.index("strehl")] = strehl
         lost = self._lost_in(records)
         self.seen, self.lost = self.seen + len(records), self.lost + lost
@@ -86,16 +86,16 @@ class PageState:
         self._forget(rows[-1, 0])
 
     def record_of(self, frame: int) -> NDArray[Any] | None:
-        """Return the record of a frame of the last look, None where it is older."""
+        """Return the record of a frame from the last read; None if it is older."""
         if self._last is None:
             return None
         places = np.flatnonzero(self._last["frame"] == frame)
         return self._last[places[-1]] if len(places) else None
 
-    # What the page is sent ------------------------------------------------------------------------------
+    # Messages to the page ------------------------------------------------------------------------------
 
     def now(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return values and arrays of the newest frame, and of the strip charts."""
+        """Return values and arrays of the newest frame and of the strip charts."""
         newest = self.newest
         strip = np.array(self._strip, np.float64).reshape(-1, len(_STRIP))
         if len(strip):
@@ -138,7 +138,7 @@ class PageState:
         }
 
     def arms_compared(self) -> list[dict[str, Any]]:
-        """Return the figures of the arms in turn now, with errors; empty where there is only one.
+        """Return the figures of the present methods, with errors; empty if there is only one.
 
         Takes some 50 ms, most of it for the bootstrap of the errors.
         """
@@ -160,7 +160,7 @@ class PageState:
                     row["figures"][title] = _in_plain(compared)
         return rows
 
-    # Of one look -----------------------------------------------------------------------------------------
+    # One read -----------------------------------------------------------------------------------------
 
     def _rows(self, records: NDArray[Any]) -> Floats:
         """Return a row of `_FRAME` for each record."""
@@ -181,7 +181,7 @@ class PageState:
         return rows
 
     def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
-        """Return the rms of each frame's slopes about the sub-apertures' running means in their arm."""
+        """Return the rms of each frame's slopes about the sub-apertures' running means for its method."""
         squares = np.full(len(records), np.nan)
         for arm in np.unique(records["arm"]):
             own = records["arm"] == arm
@@ -199,7 +199,7 @@ class PageState:
         return np.asarray(np.sqrt(squares / (2 * some)))
 
     def _lost_in(self, records: NDArray[Any]) -> int:
-        """Return how many frame numbers did not come; none where the camera began anew."""
+        """Return the number of missing frame numbers; 0 if the camera restarted its numbering."""
         frames = records["frame"]
         if self.newest is not None:
             frames = np.concatenate([[self.newest["frame"]], frames])
@@ -218,7 +218,7 @@ class PageState:
         )
 
     def _forget(self, now_s: float) -> None:
-        """Let go of what is too old."""
+        """Discard old data."""
         while self._strip and not now_s - STRIP_S <= self._strip[0][0] <= now_s:
             self._strip.popleft()
         most = sum(len(rows) for rows in self._frames)
@@ -233,7 +233,7 @@ class PageState:
 
 
 def flag_names() -> list[dict[str, Any]]:
-    """Return the flags that a sub-aperture may have, for the page's legend."""
+    """Return the possible flags of a sub-aperture, for the page's legend."""
     return [
         {"bit": int(flag), "name": str(flag.name).lower().replace("_", " "), "invalid": bool(flag & INVALID)}
         for flag in SubapertureFlag
@@ -241,7 +241,7 @@ def flag_names() -> list[dict[str, Any]]:
 
 
 def _in_plain(compared: ArmDifference) -> dict[str, Any]:
-    """A figure with its half interval, and by how much it differs from the first arm's."""
+    """Return a figure with half its confidence interval, and its difference from the first method's."""
     mean, difference = compared.mean, compared.difference
     row: dict[str, Any] = {"mean": mean.value, "half": (mean.high - mean.low) / 2}
     if difference is not None:

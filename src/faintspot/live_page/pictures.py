@@ -1,4 +1,4 @@
-"""Frames as the page draws them: one byte a pixel, with the values that black and white stand for."""
+"""Frames as pictures of one byte per pixel, with the values that black and white represent."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from faintspot.live_page.messages import packed
 from faintspot.sensor.layout import Layout
 from faintspot.sensor.pupil import lenslet_outlines
 
-_PERCENTILES = (1.0, 99.9)  # that black and white stand for: one hot pixel does not darken the rest
+_PERCENTILES = (1.0, 99.9)  # shown as black and white, so that one hot pixel does not darken the rest
 _MOST_SAMPLES = 1 << 16  # for the percentiles
 
 
 class FrameDrawing:
-    """Pictures of a sensor, and what the page needs to know of it.
+    """Pictures of a sensor, and its geometry for the page.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class FrameDrawing:
         self._places = np.broadcast_arrays(rows, columns)
 
     def sensor(self) -> bytes:
-        """Return the message that says what the sensor is: positions in pixels of the frame."""
+        """Return the message with the sensor's geometry: positions in pixels of the frame."""
         layout = self.layout
         values = {"frame_shape": layout.frame_shape, "window": layout.window, "subapertures": len(layout)}
         arrays = {
@@ -43,7 +43,7 @@ class FrameDrawing:
         return packed("sensor", values, arrays)
 
     def message(self, picture: Picture, record: NDArray[Any] | None) -> bytes:
-        """Return the message of a frame; without spots where its record is not known any more."""
+        """Return the message of a frame; without spots if its record is no longer available."""
         raw, raw_range = _in_bytes(picture.raw)
         stack, denoised_range = _in_bytes(picture.denoised)
         denoised = np.zeros(self.layout.frame_shape, np.uint8)
@@ -56,7 +56,7 @@ class FrameDrawing:
 
 
 def _in_bytes(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """Return values as bytes, and what 0 and 255 stand for; what is not finite is 0."""
+    """Return values as bytes, and the values of 0 and 255; values that are not finite become 0."""
     finite = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
     samples = finite.ravel()[:: max(1, finite.size // _MOST_SAMPLES)]
     low, high = (float(value) for value in np.percentile(samples, _PERCENTILES))

@@ -1,4 +1,4 @@
-"""A recording that is played again."""
+"""Playback of a recording."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from faintspot.live_page.client_requests import ClientRequest
 from faintspot.realtime.telemetry_segment import image_type, record_type
 from faintspot.sensor.layout import Layout
 
-_MOST_RECORDS = 4096  # in one look: of what is played faster than that, the newest
+_MOST_RECORDS = 4096  # per read; faster playback shows the newest
 _FASTEST = 100.0
 
 
 class RecordingSource:
-    """Telemetry of a store, as time goes by; everybody who watches sees the same moment.
+    """Telemetry from a store, played in real time; all clients see the same moment.
 
     Parameters
     ----------
     path : path
-        As `faintspot realtime record` writes it.
+        Store written by `faintspot realtime record`.
 
     Raises
     ------
     InputError
-        When it is not a store of telemetry, damaged, or without frames.
+        When it is not a telemetry store, damaged, or without frames.
     """
 
     def __init__(self, path: str | Path) -> None:
         self._store = store = StoredTelemetry(path)
         if not store.frames:
-            raise InputError(f"{path}: expected frames, got a recording without any")
+            raise InputError(f"{path}: expected a recording with frames, got none")
         self.name = store.path.name
         try:
             self.layout: Layout | None = Layout(**store.attributes["layout"])
@@ -59,7 +59,7 @@ class RecordingSource:
         self._pictures = places_of(store.read("image_frame", 0, store.images), frames)
         self._change_places = np.searchsorted(frames, changed)
         self._told = 0
-        self._lock = threading.Lock()  # of what follows: watched by one thread, moved by others
+        self._lock = threading.Lock()  # for the state below: read by one thread, changed by others
         self._playing, self._speed, self._position_s = True, 1.0, 0.0
         self._looked_s = time.monotonic()
         self._next, self._shown_picture, self._moved = 0, -1, True
@@ -67,11 +67,11 @@ class RecordingSource:
 
     @property
     def length_s(self) -> float:
-        """From the first frame to the last."""
+        """Time from the first frame to the last [s]."""
         return float(self._times_s[-1])
 
     def read(self) -> Batch | None:
-        """Return the frames of the time that went by since the last call."""
+        """Return the frames of the time that passed since the last call."""
         with self._lock:
             now, moved = time.monotonic(), self._moved
             self._moved = False
@@ -92,7 +92,7 @@ class RecordingSource:
         )
 
     def place(self) -> dict[str, Any]:
-        """Say which moment is shown."""
+        """Return the moment that is shown, and whether it is playing."""
         with self._lock:
             return {
                 "kind": "recording",
@@ -106,16 +106,16 @@ class RecordingSource:
             }
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resources are held."""
 
-    # What clients may ask for -------------------------------------------------------------------------------
+    # Requests of clients -------------------------------------------------------------------------------
 
     def known(self) -> Mapping[str, ClientRequest]:
-        """Return the functions."""
+        """Return the functions of the requests, by name."""
         return {"play": self._play}
 
     def _play(self, asked: dict[str, Any]) -> Mapping[str, Any]:
-        """Move to "position_s", play or pause ("playing"), and how fast ("speed")."""
+        """Move to "position_s", play or pause ("playing"), and set the "speed"."""
         position, speed, playing = (asked.get(name) for name in ("position_s", "speed", "playing"))
         if position is not None:
             position = number_between("position_s", position, 0)
@@ -125,7 +125,7 @@ class RecordingSource:
             raise InputError(f"playing = {playing!r:.40}: expected true or false")
         with self._lock:
             if position is None and playing and not self._playing and self._position_s >= self.length_s:
-                position = 0.0  # from the beginning again
+                position = 0.0  # restart at the beginning
             if position is not None:
                 self._position_s, self._moved = min(position, self.length_s), True
             if speed is not None:
@@ -137,7 +137,7 @@ class RecordingSource:
     # Reading ------------------------------------------------------------------------------------------------
 
     def _records(self, first: int, end: int) -> NDArray[Any]:
-        """Return the records of frames `first` to `end`, in order of the store."""
+        """Return the records of frames `first` to `end`, in the order of the store."""
         together = self._store.frames_together
         parts = [np.empty(0, self._type)]
         for number in range(first // together, -(-end // together)):
@@ -146,7 +146,7 @@ class RecordingSource:
         return np.concatenate(parts)
 
     def _of_block(self, number: int, together: int) -> NDArray[Any]:
-        """Return the records of one chunk of the store, the last one from memory."""
+        """Return the records of one chunk of the store; the last chunk is cached."""
         if self._block[0] != number:
             start, stop = number * together, min((number + 1) * together, self._store.frames)
             records = np.zeros(stop - start, self._type)
@@ -156,7 +156,7 @@ class RecordingSource:
         return self._block[1]
 
     def _picture(self, end: int) -> Picture | None:
-        """Return the newest picture, where it has not been shown yet."""
+        """Return the newest picture if it has not been shown yet."""
         newest = int(np.searchsorted(self._pictures, end)) - 1
         if newest < 0 or newest == self._shown_picture:
             return None
@@ -168,23 +168,23 @@ class RecordingSource:
         return Picture(int(frame), raw, denoised)
 
     def _commands(self, end: int) -> Floats | None:
-        """Return the commands of the newest frame, where they were recorded."""
+        """Return the commands of the newest frame, if they were recorded."""
         if "commands" not in self._store:
             return None
         return np.asarray(self._store.read("commands", end - 1, end)[0], np.float64)
 
     def _changes(self, end: int, anew: bool) -> list[dict[str, Any]]:
-        """Return the changes of settings up to this moment that have not been told yet."""
+        """Return the changes of settings up to this moment that have not been sent yet."""
         told = 0 if anew else self._told
         self._told = int(np.searchsorted(self._change_places, end))
         return self._store.changes[told : self._told]
 
 
 def places_of(wanted: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the place of each wanted frame among the frames, both in the order in which they came.
+    """Return the index of each wanted frame among the frames, both in order of arrival.
 
-    A camera may begin its numbers anew: a number is looked for behind the place of the one before it. What is
-    not there has the place before it.
+    A camera may restart its frame numbers, so each number is searched for after the previous match. A missing
+    frame gets the index before it.
     """
     places = np.zeros(len(wanted), np.int64)
     candidates: dict[int, list[int]] = {}

@@ -1,4 +1,4 @@
-"""The server of the page: a few files of the package, and a web socket."""
+"""The page's server: a few files of the package, and a web socket."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ except ImportError:
 
 LARGEST_REQUEST = 16 * 1024
 MOST_CLIENTS = 32
-_HELLO_S = 10.0  # for a client to say who it is
-_SLOW_S = 30.0  # for a client to take one message; then it is let go
-_REST_S = 0.02  # between two looks, however long one takes
-_PAUSE_S = 0.05  # between two requests of one client
+_HELLO_S = 10.0  # time limit for a client's first message
+_SLOW_S = 30.0  # time limit for a client to receive one message
+_REST_S = 0.02  # pause between two updates, in addition to their duration
+_PAUSE_S = 0.05  # pause between two requests of one client
 _WRONG_TOKEN_S = 0.5
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 _HEADERS = {
@@ -51,26 +51,26 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 _LOG_INTERVAL_S = 60.0
-_GARBAGE, _TOO_SLOW, _NOT_ALLOWED = 1008, 1013, 1008  # codes of closing a web socket
+_GARBAGE, _TOO_SLOW, _NOT_ALLOWED = 1008, 1013, 1008  # close codes of web sockets
 
 
 class LiveServer:
-    """Serves the page of a source, in the event loop that runs.
+    """Server of a source's page in the running event loop.
 
     Parameters
     ----------
     source : Source
     client_requests : Wishes
-        What clients may ask for.
+        Requests that clients may make.
     access : Access
     address : str
     port : int
-        0: any free one.
+        Port; 0: any free one.
 
     Raises
     ------
     InputError
-        When nothing can be bound there.
+        When the address cannot be bound.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class LiveServer:
         return f"http://{host}:{self.port}/#{self.access.token}"
 
     async def run(self, stop: StopEvent) -> None:
-        """Look at the source and serve until the event is set."""
+        """Update the page and serve it until the event is set."""
         try:
             while not stop.is_set():
                 next_s = self._loop.time() + UPDATE_S
@@ -134,11 +134,11 @@ class LiveServer:
             self._looking.shutdown()
 
     def tell(self, kind: str, values: Mapping[str, Any]) -> None:
-        """Put a message on the board, from any thread."""
+        """Set the message of a kind, from any thread."""
         self._tell(kind, packed(kind, values))
 
     def _tell(self, kind: str, message: bytes | None) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+        with contextlib.suppress(RuntimeError):  # the event loop may have ended
             if message is None:
                 self._loop.call_soon_threadsafe(self.latest_messages.forget, kind)
             else:
@@ -146,7 +146,7 @@ class LiveServer:
 
 
 class _RateLimit(logging.Filter):
-    """Passes one record in `_LOG_INTERVAL_S`, with the number of records left out since the last one."""
+    """Filter for one record per `_LOG_INTERVAL_S`, with the number of records left out since the last."""
 
     _next_s, _left_out = 0.0, 0
 
@@ -166,7 +166,7 @@ _rate_limit = _RateLimit()
 
 
 def _limit_logging() -> None:
-    """Keep clients from filling the log: no record of their mistakes, few of the server's errors."""
+    """Keep clients from filling the log: drop records of their errors, limit those of the server's."""
     for name in ("tornado.access", "tornado.general"):
         logging.getLogger(name).addHandler(logging.NullHandler())
     for name in ("tornado.application", "asyncio"):
@@ -174,7 +174,7 @@ def _limit_logging() -> None:
 
 
 def _assets() -> dict[str, tuple[str, bytes]]:
-    """The page's files by name, with their types; the page itself is ""."""
+    """Return the page's files by name, with their types; the page itself is ""."""
     contents = {}
     for item in files("faintspot.live_page").joinpath("assets").iterdir():
         kind = _TYPES.get(item.name.rpartition(".")[2])
@@ -184,34 +184,34 @@ def _assets() -> dict[str, tuple[str, bytes]]:
 
 
 class _Guarded(RequestHandler):
-    """Refuses requests whose Host is another's."""
+    """Handler that refuses requests with a foreign Host header."""
 
     def initialize(self, server: LiveServer) -> None:
-        """Tornado's own beginning."""
+        """Store the server; called by tornado."""
         self.server = server
 
     def prepare(self) -> None:
-        """Refuse a forged host."""
+        """Refuse a foreign Host header."""
         if not self.server.access.permits_host(self.request.headers.get("Host")):
             raise HTTPError(403)
 
     def set_default_headers(self) -> None:
-        """Say what the page may load: nothing but its own files."""
+        """Restrict the page to its own files by security headers."""
         for name, value in _HEADERS.items():
             self.set_header(name, value)
         self.clear_header("Server")
 
     def write_error(self, status_code: int, **_: Any) -> None:
-        """Give the number alone."""
+        """Send the status code only."""
         self.set_header("Content-Type", "text/plain")
         self.finish(f"{status_code}\n")
 
 
 class Asset(_Guarded):
-    """One of the page's files."""
+    """Handler of the page's files."""
 
     def get(self, name: str) -> None:
-        """Send it."""
+        """Send the file."""
         if name not in self.server.assets:
             raise HTTPError(404)
         kind, content = self.server.assets[name]
@@ -220,13 +220,13 @@ class Asset(_Guarded):
 
 
 class Client(_Guarded, WebSocketHandler):
-    """One open page: it says hello, is fed, and asks for things one after the other."""
+    """An open page: identifies itself, receives updates and makes requests one after another."""
 
     _feeding: asyncio.Task[None] | None = None
     _may_change = False
 
     def prepare(self) -> None:
-        """Refuse pages of others, and more clients than there is room for."""
+        """Refuse foreign pages, and more clients than the limit."""
         super().prepare()
         if not self.server.access.permits_origin(self.request.headers):
             raise HTTPError(403)
@@ -234,23 +234,23 @@ class Client(_Guarded, WebSocketHandler):
             raise HTTPError(503)
 
     def check_origin(self, origin: str) -> bool:
-        """It was checked before; tornado's own check knows less."""
+        """Return True: `prepare` has checked the origin more strictly than tornado does."""
         return True
 
     def open(self, *_: str, **__: str) -> None:
-        """Give the client some time to say hello."""
+        """Give the client time to identify itself."""
         self.server.clients.add(self)
         self._too_late = asyncio.get_running_loop().call_later(_HELLO_S, self.close, _NOT_ALLOWED)
 
     def on_close(self) -> None:
-        """Feed it no more."""
+        """Stop sending updates."""
         self.server.clients.discard(self)
         self._too_late.cancel()
         if self._feeding is not None:
             self._feeding.cancel()
 
     async def on_message(self, message: str | bytes) -> None:
-        """Answer a request; the next one is looked at afterwards."""
+        """Answer a request; the next one is read afterwards."""
         try:
             request = _parsed(message)
         except InputError as error:
@@ -260,9 +260,9 @@ class Client(_Guarded, WebSocketHandler):
         if self._feeding is None or request.get("do") == "hello":
             reply = await self._greeted(request)
         elif not self._may_change:
-            reply = {"ok": False, "error": "watching only: changes need the token printed at the start"}
+            reply = {"ok": False, "error": "read-only: changes need the token that was printed at the start"}
         else:
-            # In a thread, since the engine may take its time.
+            # In a thread, because the engine may take long to answer.
             reply = await in_thread(partial(answered, self.server.client_requests, request))
         with contextlib.suppress(WebSocketClosedError):
             await self.write_message(json.dumps({"id": number, **plain(reply)}, allow_nan=False))
@@ -271,7 +271,7 @@ class Client(_Guarded, WebSocketHandler):
         await asyncio.sleep(_PAUSE_S)
 
     async def _greeted(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Let a client in; its token says what it may."""
+        """Admit a client with the rights of its token."""
         token, access = request.get("token"), self.server.access
         known = request.get("do") == "hello" and access.knows(token)
         if not known and (token or access.reading_needs_token):
@@ -283,11 +283,11 @@ class Client(_Guarded, WebSocketHandler):
             self._too_late.cancel()
             self._feeding = asyncio.get_running_loop().create_task(self._feed())
         if token and not known:
-            return {"ok": False, "error": "that is not the token that was printed at the start"}
+            return {"ok": False, "error": "wrong token, expected the one that was printed at the start"}
         return {"ok": True, "may_change": self._may_change}
 
     async def _feed(self) -> None:
-        """Send what is newest, one message after the other; what a slow client missed is never sent."""
+        """Send the newest messages one after another; messages missed by a slow client are skipped."""
         seen = 0
         with contextlib.suppress(WebSocketClosedError):
             while True:
@@ -301,7 +301,7 @@ class Client(_Guarded, WebSocketHandler):
 
 
 def _parsed(message: str | bytes) -> dict[str, Any]:
-    """Return a request: a JSON object that says what to do, of values that JSON can send back."""
+    """Return a request: a JSON object with "do", whose values can be sent back as JSON."""
     try:
         request = parse_json(message) if isinstance(message, str) else None
         json.dumps(request, allow_nan=False, ensure_ascii=False).encode()  # NaN, infinity, lone surrogates

@@ -1,4 +1,4 @@
-"""The page of an engine or a recording, from beginning to end."""
+"""Serving the page of an engine or a recording."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ def serve_engine(
     Parameters
     ----------
     name : str
-        The engine's; it may come later, and go and come back.
+        Name of the engine, which may start later and restart.
     stop : event
     ready : function
-        Called when clients may come.
+        Called when the server is ready.
     address : str
-        To bind to; with another one than this machine's own (127.0.0.1), reading needs the token, too.
+        Address to bind to; other than this machine's own (127.0.0.1), reading needs the token, too.
     port : int
-        0: any free one.
+        Port; 0: any free one.
     private : bool
-        Whether watching needs the token also on this machine.
+        Whether reading needs the token even on this machine.
     folder : path
-        For recordings that the page begins.
+        Folder for recordings started from the page.
 
     Raises
     ------
     InputError
-        When the address is not one, or cannot be bound.
+        When the address is not valid, or cannot be bound.
     MissingExtraError
-        Without tornado or pyshmem.
+        When tornado or pyshmem is not installed.
     """
 
     async def work() -> None:
@@ -90,7 +90,7 @@ def serve_recording(
     Raises
     ------
     InputError
-        When it is not a recording, and for addresses as `serve_engine`.
+        When the file is not a recording, or the address as for `serve_engine`.
     """
 
     async def work() -> None:

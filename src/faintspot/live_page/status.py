@@ -1,4 +1,4 @@
-"""What the engine says of itself on its control channel, asked now and then in a thread of its own."""
+"""Status and settings of the engine, requested regularly from its control channel in a separate thread."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from faintspot.realtime.private_socket import socket_path
 
 _EVERY_S = 0.5
 _PATIENCE_S = 3.0
-_FEW = 4  # values of sub-apertures that are shown one by one
+_FEW = 4  # sub-apertures whose values are shown individually
 
 
 class StatusPoller:
-    """Asks for status, and for settings where they have changed.
+    """Thread that requests the status regularly, and the settings when they have changed.
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     tell : function
-        Given kind ("status" or "settings") and values, from the poller's thread.
+        Called with kind ("status" or "settings") and values, in the poller's thread.
     """
 
     def __init__(self, name: str, tell: Callable[[str, dict[str, Any]], None]) -> None:
@@ -37,7 +37,7 @@ class StatusPoller:
         self._thread.start()
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop requesting."""
         self._stopping.set()
         self._thread.join()
 
@@ -52,7 +52,7 @@ class StatusPoller:
 
     def _ask(self) -> None:
         status = request(self._path, "status", timeout_s=_PATIENCE_S)
-        # Before the settings are asked for: what changes in between is asked for again.
+        # Noted before the settings are requested: a change in between leads to another request.
         counters, source = status["counters"], status["source"]
         version = (counters["settings_changes"], status["estimator"], source and source["pid"])
         self._tell("status", {"there": True, **status})
@@ -63,12 +63,12 @@ class StatusPoller:
 
 
 def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return settings as rows of a form: name, value as text, meaning, what is allowed, choices.
+    """Return settings as rows of a form: name, value as text, meaning, permitted range, choices.
 
     Parameters
     ----------
     values : dict
-        As the engine's "get" answers.
+        Reply of the engine to "get".
     """
     kinds = estimators()
     kind = kinds.get(str(values.get("estimator")))
@@ -77,7 +77,7 @@ def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
     for name, value in values.items():
         row = {"name": name, "value": _as_text(value), "meaning": "", "allowed": "", "choices": []}
         if name == "estimator":
-            row |= {"meaning": "How a position is found.", "choices": list(kinds)}
+            row |= {"meaning": "Method that finds the position.", "choices": list(kinds)}
         elif name in declared:
             option = declared[name]
             row |= {"meaning": option.meaning, "allowed": allowed_in_words(option), "unit": option.unit}
@@ -87,7 +87,7 @@ def settings_rows(values: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _as_text(value: Any) -> str:
-    """Write a value as a person would for `faintspot realtime set`; many are told by their ends."""
+    """Format a value as for `faintspot realtime set`; long lists are abbreviated to both ends."""
     if value is None:
         return "none"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""The newest values of a pyshmem stream that may be missing, or made anew."""
+"""The newest values of a pyshmem stream that may be missing or recreated."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from faintspot.base.errors import InputError
 from faintspot.live_page.batch import Floats
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
-_LOOK_S = 1.0  # between two looks for a stream, or whether it is still the same
-_READ_S = 1e-3  # for a writer that is writing at this moment
+_LOOK_S = 1.0  # between two checks whether the stream exists and is the same
+_READ_S = 1e-3  # to wait for a writer in the middle of a publication
 
 
 class NewestOfStream:
-    """Reads a stream of real numbers now and then; one that fails is as one that is not there.
+    """Newest values of a stream of real numbers; an unreadable stream is treated as missing.
 
     Parameters
     ----------
     name : str
-        Of the stream; it need not exist.
+        Name of the stream, which need not exist.
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     """
 
     def __init__(self, name: str) -> None:
@@ -37,7 +37,7 @@ class NewestOfStream:
         self._seen = 0
 
     def take(self) -> tuple[int, Floats] | None:
-        """Return frame number and values where there are new ones, else None."""
+        """Return frame number and values if they are new, else None."""
         if time.monotonic() >= self._next_look_s:
             self._next_look_s = time.monotonic() + _LOOK_S
             self._look()
@@ -46,25 +46,25 @@ class NewestOfStream:
             return None
         try:
             publication = stream.read_publication(timeout=_READ_S)
-        except (OSError, ValueError, RuntimeError):  # half written, mostly
+        except (OSError, ValueError, RuntimeError):  # usually incomplete
             return None
         self._seen = publication.count
         return int(publication.frame_id), np.asarray(publication.payload, np.float64).ravel()
 
     def close(self) -> None:
-        """Let go of the stream."""
+        """Close the stream."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
 
     def _look(self) -> None:
-        """Open the stream where there is one, and let go of one that was removed or made anew."""
+        """Open the stream if it exists, and close one that was removed or recreated."""
         try:
             if self._stream is not None:
                 if self._pyshmem.stat(self.name)["instance_id"] == self._stream.instance_id:
                     return
                 self.close()
-            lock_file(self.name)  # refuses a place that is not private
+            lock_file(self.name)  # refuse a folder that is not private
             stream = self._pyshmem.open(self.name, gpu_device=False)
         except (OSError, ValueError, InputError):
             self.close()

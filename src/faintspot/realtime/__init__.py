@@ -1,1 +1,1 @@
-"""The engine between camera and reconstructor: pixels stream in by rows, slopes stream out."""
+"""The engine between camera and reconstructor: reads pixels row by row and publishes slopes."""

@@ -1,10 +1,9 @@
-"""Frames of a stream into a pixel ring: for cameras, simulators and controllers, which publish them.
+"""Copy the frames of a stream into a pixel ring.
 
-How it waits: while frames come it looks at the stream's count again and again, which notices one within a
-microsecond. When nothing has come for `SPIN_S` it leaves the processor alone and waits: a producer that posts
-semaphores (ImageStreamIO) or notifies (pyshmem, ``notify=True``) wakes it, for others it looks every half
-millisecond.
-With fewer than `SPINNING_NEEDS` processors it always does: it would displace the engine or the camera.
+While frames come, the bridge polls the stream's counter and notices a new frame within a microsecond. After
+`SPIN_S` without a frame it sleeps. A producer that posts semaphores (ImageStreamIO) or notifies (pyshmem,
+``notify=True``) wakes it; for other producers it polls every half millisecond. With fewer than
+`SPINNING_NEEDS` processors it always sleeps, because polling would displace the engine or the camera.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from faintspot.realtime.replay import ring_type
 from faintspot.realtime.stream import Follower
 
 SPIN_S = 0.02
-"""For so long after a frame the next one is waited for without a pause."""
+"""Time after a frame during which the bridge polls for the next one without a pause [s]."""
 SPINNING_NEEDS = 3
-"""Processors: for the engine, the bridge, and the producer."""
+"""Processors that polling needs: for the engine, the bridge and the producer."""
 STALL_S = 1.0
-"""A stream that was silent for so long, after frames had come, has stalled."""
+"""Silence after which a stream that has published frames counts as stalled [s]."""
 _PARK_S = 0.05
-_LOOK_S = 0.1  # between two looks for a stream that is not there
+_LOOK_S = 0.1  # between two attempts to open a missing stream
 
 
 @dataclass(slots=True)
 class BridgeCounters:
-    """What a bridge has seen and done; plain numbers, changed in place."""
+    """Counters of a bridge, changed in place."""
 
     frames: int = 0
     """Frames published in the ring."""
@@ -46,39 +45,39 @@ class BridgeCounters:
     not_ahead: int = 0
     """Frames whose number was not above that of the frame before: two writers, or a source that restarted."""
     incomplete: int = 0
-    """Publications whose writer died, or paused, in the middle."""
+    """Publications whose writer died or paused before they were complete."""
     stalls: int = 0
-    """How often nothing came for `STALL_S`."""
+    """Number of times that no frame came for `STALL_S`."""
     restarts: int = 0
-    """How often the stream was made anew, or its count of publications jumped."""
+    """Number of times that the stream was recreated or its publication count jumped."""
 
 
 class StreamBridge:
-    """Follows a stream by its name, through its producer's restarts; its frames go into a pixel ring.
+    """Bridge that copies a stream's frames into a pixel ring, also after restarts of the producer.
 
-    A frame's number is pyshmem's `frame_id` where the producer sets one, else the stream's count less one, so
-    that both begin with 0. uint16 frames stay so, all other real ones become float32. When the stream comes
-    back with frames of another size or type, the ring is closed and another one of that name made.
+    A frame's number is pyshmem's `frame_id` where the producer sets one, else the publication count minus
+    one; both start at 0. uint16 frames stay uint16; all other real types become float32. If the stream comes
+    back with frames of another size or type, the ring is closed and a new one of the same name is made.
 
     Parameters
     ----------
     stream : str
-        Name of the stream, which need not exist yet: pyshmem's, isio:NAME or dao:FILE.
+        Name of the stream, which need not exist yet: NAME (pyshmem), isio:NAME or dao:FILE.
     name : str
-        Of the pixel ring.
+        Name of the pixel ring.
     say : function, optional
-        Told in one line what happens to the stream.
+        Called with a one-line message when the stream appears, stalls or changes.
     slots : int
         Frames in the ring.
     spins : bool, optional
-        Whether to wait for the next frame without a pause. Default: with enough processors.
+        Whether to poll for the next frame without a pause. Default: with enough processors.
 
     Raises
     ------
     InputError
-        For a name that no stream can have.
+        When no stream can have that name.
     MissingExtraError
-        For one of pyshmem's without pyshmem.
+        When the stream is pyshmem's and pyshmem is not installed.
     """
 
     def __init__(
@@ -100,13 +99,13 @@ class StreamBridge:
         self._arrived, self._silent = -math.inf, True
 
     def run(self, n_frames: int | None = None, stop: StopEvent | None = None) -> BridgeCounters:
-        """Follow the stream until so many frames have passed or `stop` is set.
+        """Copy frames until `n_frames` have passed or `stop` is set.
 
         Raises
         ------
         InputError
-            When somebody else writes into the ring, shared memory is short, or the folder of pyshmem's locks
-            is not private.
+            When another process writes into the ring, shared memory is short, or pyshmem's lock folder is not
+            private.
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
         counters = self.counters
@@ -118,7 +117,7 @@ class StreamBridge:
         return counters
 
     def step(self) -> bool:
-        """Follow the stream for a moment, 0.1 s at most; return whether a frame has come through.
+        """Follow the stream for at most 0.1 s; return whether a frame was copied.
 
         Raises
         ------
@@ -135,7 +134,7 @@ class StreamBridge:
         return False
 
     def close(self) -> None:
-        """Let go of the stream and remove the ring."""
+        """Close the stream and remove the ring."""
         self._let_go()
         if self._ring is not None:
             self._ring.close()
@@ -144,7 +143,7 @@ class StreamBridge:
     # ---- one frame
 
     def _new_one(self) -> bool:
-        """Wait for a publication; False when there is none for a while."""
+        """Wait for a publication; return False if none comes in time."""
         source, seen = self._follower.source, self._seen
         assert source is not None
         end = self._arrived + self._spin_s
@@ -160,14 +159,14 @@ class StreamBridge:
         assert ring is not None
         expected = source.number
         slot = ring.begin(expected)
-        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite: a bad pixel
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
             publication = source.read(slot, _PARK_S)
         if publication is None:
             counters.incomplete += 1
             self._seen = source.count
             return False
         number = publication.number
-        if number != expected:  # a newer one came meanwhile
+        if number != expected:  # a newer frame was published meanwhile
             ring.begin(number)[...] = slot.copy()
         ring.end()
         counters.frames += 1
@@ -176,7 +175,7 @@ class StreamBridge:
         counters.restarts += missed < 0 and publication.total > self._seen
         counters.not_ahead += number <= self._last_number
         if self._silent and self._last_number >= 0:
-            self._follower.say("goes on")
+            self._follower.say("resumed")
         self._seen, self._last_number = publication.total, number
         self._arrived, self._silent = time.monotonic(), False
         return True
@@ -184,11 +183,11 @@ class StreamBridge:
     # ---- the stream
 
     def _open(self) -> bool:
-        """Open the stream and make the ring for it; return whether nothing stands in the way."""
+        """Open the stream and make its ring; return whether both succeeded."""
         source = self._follower.open()
         if source is None:
             return False
-        # What was published before a stream is first met is not missed; what a new producer had published is.
+        # Publications before the first contact are not missed; those of a new producer are.
         self._seen = source.count if self._ring is None else 0
         self._last_number = -1
         rows, columns = source.shape
@@ -197,7 +196,7 @@ class StreamBridge:
         return True
 
     def _make_ring(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        """Have a ring of that shape and type."""
+        """Make a ring of that shape and type, unless there is one."""
         ring = self._ring
         if ring is not None and (ring.shape, ring.dtype) == (shape, dtype):
             return
@@ -206,7 +205,7 @@ class StreamBridge:
         self._ring = PixelRing.create(self.name, shape, dtype, slots=self._slots)
 
     def _look_after(self) -> None:
-        """Nothing came: see whether the stream is still there, and say so when it has stalled."""
+        """Check whether a silent stream still exists, and report when it has stalled."""
         follower, source = self._follower, self._follower.source
         assert source is not None
         happened = follower.lost()
@@ -215,7 +214,7 @@ class StreamBridge:
             self.counters.restarts += 1
             self._silent = True
         elif not self._silent and time.monotonic() - self._arrived > STALL_S:
-            lives = {True: ", which made it, lives", False: ", which made it, is gone", None: ""}
+            lives = {True: ", which made it, is alive", False: ", which made it, has ended", None: ""}
             follower.say(f"no frame for {STALL_S:g} s; {source.maker}{lives[source.maker_lives()]}")
             self.counters.stalls += 1
             self._silent = True
@@ -227,5 +226,5 @@ class StreamBridge:
 
 
 def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """Return what is expected where these are no frames."""
+    """Return the expected shape and type, or "" if these are frames."""
     return "" if len(shape) == 2 and dtype.kind in "iuf" else "frames (rows, columns) of real numbers"

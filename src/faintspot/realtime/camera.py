@@ -1,4 +1,4 @@
-"""Frames read out row by row at the pace of a camera, and a simulated one: frames of moving spots."""
+"""Read-out of frames row by row at a camera's pace, and a simulated camera with moving spots."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, sensor_frames
 
-_SPIN_NS = 150_000  # a sleep wakes up later than asked for by up to this; the rest is spun
+_SPIN_NS = 150_000  # a sleep may overrun by this much; the last part is a busy wait
 _BETWEEN_REPORTS_NS = 100_000_000
 LATE = 0.1
-"""A frame that starts later than its moment by this part of the frame time counts as late."""
+"""Delay, as a fraction of the frame time, beyond which a frame counts as late."""
 
 
 class StopEvent(Protocol):
-    """What says that the camera is to stop: threading.Event, multiprocessing.Event."""
+    """Event that stops a camera: threading.Event or multiprocessing.Event."""
 
     def is_set(self) -> bool:
-        """Whether to stop."""
+        """Return whether to stop."""
         ...
 
 
 @dataclass(frozen=True)
 class SpotMotion:
-    """How spots move from frame to frame, each on its own and each axis on its own.
+    """Motion of the spots from frame to frame, independent for each spot and axis.
 
-    A first-order autoregressive process (AR(1)): Gaussian positions around the sub-aperture's centre, whose
-    correlation falls by a factor e within the correlation time.
+    A first-order autoregressive process (AR(1)): Gaussian positions around the sub-aperture's centre, with a
+    correlation that falls by a factor e within the correlation time.
 
     Parameters
     ----------
     standard_deviation_px : float
-        Of the position on each axis.
+        Standard deviation of the position along each axis.
     correlation_time_s : float
-        0: every frame's positions are new.
+        Correlation time; 0 gives independent positions in every frame.
 
     Raises
     ------
     InputError
-        When one is negative or not finite.
+        When a value is negative or not finite.
     """
 
     standard_deviation_px: float = 0.3
@@ -68,7 +68,7 @@ class SpotMotion:
         time_s = self.correlation_time_s
         kept = math.exp(-1 / (frame_rate_hz * time_s)) if time_s else 0.0
         steps = rng.standard_normal((n_frames, n_spots, 2))
-        # The first position already has the spread that all later ones have.
+        # The first position has the same spread as all later ones.
         steps[1:] *= math.sqrt(1 - kept**2)
         for frame in range(1, n_frames):
             steps[frame] += kept * steps[frame - 1]
@@ -78,18 +78,18 @@ class SpotMotion:
 
 @dataclass(frozen=True)
 class CameraReport:
-    """What a run of the camera did.
+    """Result of a camera run.
 
     Attributes
     ----------
     frames : int
         Frames published.
     overruns : int
-        Frame times of the schedule that went by without a frame, because the one before came too late.
+        Frame times without a frame, because the frame before came too late.
     seconds : float
-        From the start of the first frame to the end of the last one's frame time.
+        Time from the start of the first frame to the end of the last frame time.
     late : int
-        Frames that started later than their moment by more than `LATE` of the frame time.
+        Frames that started more than `LATE` of the frame time after their scheduled time.
     """
 
     frames: int
@@ -99,39 +99,40 @@ class CameraReport:
 
     @property
     def frame_rate_hz(self) -> float:
-        """Frames published a second."""
+        """Frames published per second."""
         return self.frames / self.seconds if self.seconds else 0.0
 
 
 class Readout(ABC):
-    """Publishes frames in a ring on a fixed schedule, row by row, at the pace of a camera.
+    """Source that publishes frames in a ring on a fixed schedule, row by row, at a camera's pace.
 
     Parameters
     ----------
     ring : PixelRing
-        Created by this process.
+        Ring created by this process.
     shape, dtype
-        Of the frames.
+        Shape and type of the frames.
     frame_rate_hz : float
-        Frames a second, up to 100,000.
+        Frames per second, up to 100,000.
     readout_fraction : float
-        Part of the frame time in which the rows arrive, one after the other, 0 to 1. 0: all at once.
+        Part of the frame time in which the rows arrive one after another, 0 to 1. 0: all at once.
     rows_per_block : int
         Rows that are published together.
     first_number : int
         Number of the first frame.
     spins : bool
-        Whether to keep the processor for the last 0.15 ms before each moment; a sleep may wake up that late.
+        Whether to busy-wait for the last 0.15 ms before each scheduled time, because a sleep may overrun by
+        that.
 
     Attributes
     ----------
     late, overruns : int
-        Of the run under way; as `CameraReport`.
+        Counts of the current run; as in `CameraReport`.
 
     Raises
     ------
     InputError
-        When a value is out of its range, or the ring is not for such frames.
+        When a value is out of its range, or the ring does not fit the frames.
     """
 
     def __init__(
@@ -157,7 +158,7 @@ class Readout(ABC):
         self._ring, self._period_ns, self._next = ring, 1e9 / rate, first_number
         self._spins, self.late, self.overruns = spins, 0, 0
         ends = [*range(block, rows, block), rows]
-        # First row, last row and, from the start of the frame, the moment of each block.
+        # First row, last row and time after the start of the frame, for each block.
         self._blocks = [
             (first, last, round(fraction * self._period_ns * last / rows))
             for first, last in zip([0, *ends[:-1]], ends, strict=True)
@@ -165,7 +166,7 @@ class Readout(ABC):
 
     @abstractmethod
     def _frame(self) -> NDArray[Any] | None:
-        """Return frame number `_next`, None when there are no more."""
+        """Return frame number `_next`, or None at the end."""
 
     def run(
         self,
@@ -173,11 +174,11 @@ class Readout(ABC):
         stop: StopEvent | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
-        """Publish frames until there are `n_frames`, none are left or `stop` is set; a later run goes on.
+        """Publish frames until `n_frames` are out, the source ends or `stop` is set; a later call continues.
 
-        Frames start on a fixed schedule, which does not drift. A frame that is late is published as fast as
-        possible; when it leaves no time for the next one, that frame time is left out and counted as an
-        overrun. Frame numbers have no gaps then. `progress` is told the number of frames, ten times a second.
+        Frames start on a fixed schedule, which does not drift. A late frame is published as fast as possible;
+        if no time is left for the next one, that frame time is skipped and counted as an overrun. Frame
+        numbers then have no gaps. `progress` is called ten times a second with the number of frames.
 
         Raises
         ------
@@ -188,7 +189,7 @@ class Readout(ABC):
         start, tick, published, told = time.monotonic_ns(), 0, 0, 0
         self.late = self.overruns = 0
         while (limit is None or published < limit) and not (stop is not None and stop.is_set()):
-            frame = self._frame()  # before its moment: it may have to be fetched
+            frame = self._frame()  # before its scheduled time, because it may have to be fetched
             if frame is None:
                 break
             moment = start + round(tick * self._period_ns)
@@ -203,14 +204,14 @@ class Readout(ABC):
                 progress(published)
                 told = now
         if published:
-            # The last frame has its frame time, too, so that rates come out right.
+            # The last frame takes its full frame time too, so that rates are right.
             self._wait_until(start + round(tick * self._period_ns))
         if progress is not None:
             progress(published)
         return CameraReport(published, self.overruns, (time.monotonic_ns() - start) / 1e9, self.late)
 
     def _publish(self, moment: int, frame: NDArray[Any]) -> None:
-        """Read out one frame that starts at that moment."""
+        """Read out one frame that starts at `moment`."""
         ring = self._ring
         slot = ring.begin(self._next)
         for first, last, delay in self._blocks:
@@ -227,41 +228,41 @@ class Readout(ABC):
 
 
 class Camera(Readout):
-    """Publishes simulated frames of a Shack-Hartmann sensor, row by row.
+    """Camera that publishes simulated frames of a Shack-Hartmann sensor, row by row.
 
-    The frames are simulated beforehand and shown in turn, for ever: frame number n is
-    ``frames[n % n_distinct]``. At the end of a turn the spots jump.
+    The frames are simulated in advance and shown cyclically: frame number n is ``frames[n % n_distinct]``.
+    The spots jump when the cycle restarts.
 
     Parameters
     ----------
     layout : Layout
-        Where the sub-apertures are.
+        Positions of the sub-apertures.
     ring : PixelRing
-        Created by this process, of the layout's frame shape and the type that `readout_type` names.
+        Ring created by this process, with the layout's frame shape and the type given by `readout_type`.
     frame_rate_hz : float
-        Frames a second, up to 100,000.
+        Frames per second, up to 100,000.
     flux_e : float or array_like, shape (n,)
         Electrons per sub-aperture and frame, as for `faintspot.simulate.sensor_frames`.
     detector : Detector, optional
         Default: 1 e- read noise and nothing else.
-    profile, size
+    Spot shape and width, as for `faintspot.spots.shapes`.
         The spots, as for `faintspot.spots.shapes`.
     motion : SpotMotion, optional
     readout_fraction : float
-        Part of the frame time in which the rows arrive, one after the other, 0 to 1. 0: all at once.
+        Part of the frame time in which the rows arrive one after another, 0 to 1. 0: all at once.
     rows_per_block : int
         Rows that are published together.
     n_distinct : int
-        How many frames are simulated.
+        Number of frames that are simulated.
     rng : numpy.random.Generator, optional
-        Where positions and noise come from.
+        Generator of positions and noise.
 
     Attributes
     ----------
     frames : ndarray, shape (n_distinct, rows, columns)
         ADU, read-only.
     truth : ndarray, float64, shape (n_distinct, n, 2)
-        True x and y of each spot from the middle of its window, px, read-only.
+        True x and y of each spot from the centre of its window, px, read-only.
 
     Raises
     ------
@@ -319,14 +320,14 @@ class Camera(Readout):
 
 
 def readout_type(detector: Detector) -> np.dtype[np.generic]:
-    """Return the type of a detector's frames: float32, or with `bits` uint16 or uint32."""
+    """Return the type of a detector's frames: float32, or uint16 or uint32 if it has `bits`."""
     if detector.bits is None:
         return np.dtype(np.float32)
     return np.dtype(np.uint16 if detector.bits <= 16 else np.uint32)
 
 
 def _wait_until(moment: int) -> None:
-    """Return at that time of CLOCK_MONOTONIC, ns, or at once when it is past."""
+    """Wait until a time of CLOCK_MONOTONIC, ns; return at once if it is past."""
     left = moment - time.monotonic_ns()
     if left > _SPIN_NS:
         time.sleep((left - _SPIN_NS) / 1e9)

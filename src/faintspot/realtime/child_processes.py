@@ -1,4 +1,4 @@
-"""Other commands of faintspot as processes that end with this one, whatever happens to it (Linux)."""
+"""Other faintspot commands as processes that end with this one, even if it is killed (Linux)."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors
 
-_PATIENCE_S = 10.0  # for a process to end as it is asked to
+_PATIENCE_S = 10.0  # for a process to end on request
 _LOOK_S = 0.02
 _DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _ERROR = "faintspot: error: "
 
 
 class ChildProcesses(Closing):
-    """Commands that run beside this process. As a context manager it ends them, the last one first.
+    """Commands that run beside this process; a context manager that ends them, the last one first.
 
-    Ctrl-C in the terminal does not reach them, so that they end in order; the kernel ends them where this
-    process is killed.
+    Ctrl-C in the terminal does not reach them, so that they end in order. If this process is killed, the
+    kernel ends them.
 
     Parameters
     ----------
     folder : path
-        Where NAME.log gets what each of them says; for this user's eyes only.
+        Folder of the log files NAME.log, readable by this user only.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -38,12 +38,12 @@ class ChildProcesses(Closing):
         self._started: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
-        """Start `faintspot ARGUMENTS`; the thread that does so must live as long as they are needed.
+        """Start `faintspot ARGUMENTS`; the calling thread must live as long as the process is needed.
 
         Raises
         ------
         InputError
-            When its log cannot be written.
+            When the log cannot be written.
         """
         library = ctypes.CDLL(None)
         with output_errors(self._log(name)):
@@ -66,35 +66,35 @@ class ChildProcesses(Closing):
         return self._log(name).read_text(encoding="utf-8", errors="replace").splitlines()
 
     def check(self) -> None:
-        """Make sure that all of them run.
+        """Check that all processes run.
 
         Raises
         ------
         InputError
-            With the last line of one that has ended.
+            When one has ended; the message holds its last line.
         """
         for name, process in self._started.items():
             if process.poll() is not None:
                 words = (self.said(name) or [f"exit code {process.returncode}"])[-1]
-                raise InputError(f"{name}: it has ended: {words.removeprefix(_ERROR)}")
+                raise InputError(f"{name}: the process has ended: {words.removeprefix(_ERROR)}")
 
     def wait_until(self, condition: Callable[[], bool], what: str, timeout_s: float) -> None:
-        """Wait for something that needs all of them.
+        """Wait for a condition that needs all processes.
 
         Raises
         ------
         InputError
-            When one of them ends, or the time is over; `what` says what was waited for.
+            When a process ends or the time is over; `what` names the condition in the message.
         """
         end = time.monotonic() + timeout_s
         while not condition():
             self.check()
             if time.monotonic() > end:
-                raise InputError(f"{what}: waited for it for {timeout_s:g} s in vain")
+                raise InputError(f"{what}: not ready after {timeout_s:g} s")
             time.sleep(_LOOK_S)
 
     def close(self) -> None:
-        """End all of them; those that do not end as they are asked to are killed."""
+        """End all processes; kill those that do not end on request."""
         while self._started:
             _, process = self._started.popitem()
             process.terminate()

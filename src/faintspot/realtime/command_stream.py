@@ -1,4 +1,4 @@
-"""A mirror's commands from a stream, which may be missing, wrong, or made anew."""
+"""A mirror's commands read from a stream that may be missing, wrong or recreated."""
 
 from __future__ import annotations
 
@@ -14,53 +14,53 @@ from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.stream import Follower
 
 LARGEST_NM = 1e6
-"""Of a command: a mirror that is asked for more keeps what it has."""
-_LOOK_S = 0.1  # between two looks for a stream that is not there, or whether it is still the same
-_READ_S = 1e-3  # for a writer that is writing at this moment
+"""Largest accepted command [nm]; the mirror keeps its commands if any is larger."""
+_LOOK_S = 0.1  # between two checks whether the stream exists and is the same
+_READ_S = 1e-3  # to wait for a writer in the middle of a publication
 
 
 @dataclass(slots=True)
 class CommandCounters:
-    """What has come; plain numbers, changed in place."""
+    """Counters of received commands, changed in place."""
 
     taken: int = 0
     """Commands that the mirror has taken."""
     overtaken: int = 0
-    """Commands that a newer one replaced before the mirror looked."""
+    """Commands replaced by newer ones before the mirror read them."""
     refused: int = 0
-    """Commands that were not finite, or beyond `LARGEST_NM`."""
+    """Commands that were not finite or exceeded `LARGEST_NM`."""
     incomplete: int = 0
-    """Commands whose writer died, or paused, in the middle."""
+    """Commands whose writer died or paused before they were complete."""
     restarts: int = 0
-    """How often the stream was removed or made anew."""
+    """Number of times that the stream was removed or recreated."""
 
 
 class CommandStream:
-    """What a mirror holds: the newest whole commands of a stream, zeros before the first.
+    """Commands of a mirror: the newest complete ones of a stream, zeros before the first.
 
-    While the stream is missing, or holds something else, the mirror keeps what it has.
+    While the stream is missing or unusable, the mirror keeps its commands.
 
     Parameters
     ----------
     stream : str
         Name of the stream; it need not exist yet.
     commands : int
-        Its length.
+        Number of commands.
     say : function
-        Told in one line what happens to the stream.
+        Called with a one-line message when the stream changes.
 
     Attributes
     ----------
     commands_nm : ndarray, float64, shape (commands,)
-        What the mirror holds; a new array each time.
+        Commands of the mirror; a new array each time.
     frame : int
-        Their publication's `frame_id`; -1 before the first.
+        `frame_id` of their publication; -1 before the first.
     counters : CommandCounters
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     """
 
     def __init__(self, stream: str, commands: int, say: Callable[[str], None]) -> None:
@@ -73,11 +73,11 @@ class CommandStream:
 
     @property
     def state(self) -> str:
-        """What is wrong with the stream, "" for nothing."""
+        """Reason why the stream cannot be read; "" if it can."""
         return self._follower.obstacle
 
     def take(self) -> None:
-        """Let the mirror have the newest commands."""
+        """Apply the newest commands."""
         now = time.monotonic()
         if not self._read() and now >= self._next_look_s:
             self._next_look_s = now + _LOOK_S
@@ -85,11 +85,11 @@ class CommandStream:
             self._read()
 
     def close(self) -> None:
-        """Let go of the stream."""
+        """Close the stream."""
         self._follower.close()
 
     def _read(self) -> bool:
-        """Take commands that are new; return whether whole ones had come."""
+        """Read new commands; return whether complete ones had come."""
         counters, source = self.counters, self._follower.source
         if source is None or source.count == self._seen:
             return False
@@ -103,7 +103,7 @@ class CommandStream:
         if not np.all(np.abs(values) <= LARGEST_NM):
             counters.refused += 1
             if not self._refuses:
-                self._follower.say(f"not finite, or beyond {LARGEST_NM:g} nm; {self._keeps}")
+                self._follower.say(f"commands that are not finite or exceed {LARGEST_NM:g} nm; {self._keeps}")
             self._refuses = True
             return True
         counters.taken += 1
@@ -117,7 +117,7 @@ class CommandStream:
         return f"the mirror {'keeps its last commands' if taken else 'stays flat'}"
 
     def _look_after(self) -> None:
-        """Nothing whole has come: see whether the stream is the same, look for one where there is none."""
+        """Check whether the stream is still the same, and try to open a missing one."""
         follower = self._follower
         if follower.source is not None:
             if not follower.lost():
@@ -129,6 +129,6 @@ class CommandStream:
             follower.say(f"{source.shape[0]} commands ({source.dtype}), {source.maker}")
 
     def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-        """Return what is expected where these are no commands of the mirror."""
+        """Return the expected shape and type, or "" if these are the mirror's commands."""
         expected = self.commands_nm.shape
         return "" if shape == expected and dtype.kind in "iuf" else f"{expected} real numbers, nm"

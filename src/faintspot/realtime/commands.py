@@ -1,4 +1,4 @@
-"""What a running engine answers on its control channel."""
+"""Commands of a running engine's control channel."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from faintspot.realtime.control import Handler
 from faintspot.realtime.engine import Engine
 
 LENGTHY = ("set", "interleave", "load", "swap", "unload")
-"""Commands that make something anew, which may compile: other commands are answered meanwhile."""
+"""Commands that prepare something new and may compile; other commands are answered meanwhile."""
 _USUAL_TURN = 50  # frames
-_EFFECT_TIMEOUT_S = 0.5  # for a change to take effect, before the reply says that no frame has come yet
+_EFFECT_TIMEOUT_S = 0.5  # to wait for a change to take effect; then the reply says that no frame came
 
 
 _MOST_LINES, _LONGEST_LINE = 40, 400  # of advice
@@ -83,18 +83,19 @@ def _text(fields: dict[str, Any], name: str) -> str:
 
 
 def loop_command(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
-    """Open or close the loop, change its gain, have the mirror flat; return its part of the status.
+    """Open or close the loop, change its gain or flatten the mirror; return the loop's part of the status.
 
     Raises
     ------
     InputError
-        For another action, without a loop, a gain out of range, and for a flat mirror in a closed loop.
+        When the action is unknown, there is no loop, the gain is out of range, or the loop is closed for
+        "flat".
     """
     action, loop = one_of("action", fields.get("action"), LOOP_ACTIONS), engine.loop
     if action == "status":
         return {"loop": engine.loop_status()}
     if loop is None:
-        raise InputError("loop: this engine makes no commands; its configuration has no [control]")
+        raise InputError("loop: this engine makes no commands; add [control] to its configuration")
     if action == "open":
         loop.open()
     elif action == "close":

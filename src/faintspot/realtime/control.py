@@ -1,7 +1,7 @@
-"""The control channel of a running engine: requests of the same user, over a Unix socket.
+"""The control channel of a running engine: requests of the same user over a Unix socket.
 
-A request is one line of JSON, {"command": NAME, ...}; the reply is one line as well: {"ok": true, ...} or
-{"ok": false, "error": "one line"}. A connection may carry several requests, one after the other.
+A request is one line of JSON, {"command": NAME, ...}. The reply is one line too: {"ok": true, ...} or
+{"ok": false, "error": "one line"}. A connection may carry several requests in sequence.
 """
 
 from __future__ import annotations
@@ -33,36 +33,36 @@ from faintspot.realtime.private_socket import (
 )
 
 Handler = Callable[[dict[str, Any]], Mapping[str, Any]]
-"""What a command does: takes the request without its command, returns what the reply says."""
+"""Function of a command: takes the fields of the request, returns the fields of the reply."""
 
 Result = TypeVar("Result")
 
 LARGEST_REQUEST = 64 * 1024
 LENGTHY_TIMEOUT_S = 180.0
-"""For a client to wait for a command that makes something anew, which may compile."""
+"""Time that a client waits for a command that prepares something new and may compile [s]."""
 _LARGEST_REPLY = 16 * 1024 * 1024
 _MOST_CONNECTIONS = 64
-_IDLE_S = 30.0  # a connection without a request, or that does not read its reply, for so long is closed
-_PAUSE_S = 0.1  # where the system has no file descriptor left
+_IDLE_S = 30.0  # idle time after which a connection is closed
+_PAUSE_S = 0.1  # when the system has no file descriptor left
 
 
 def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fields: Any) -> dict[str, Any]:
-    """Send a request to a running engine and return what it replies.
+    """Send a request to a running engine and return its reply.
 
     Parameters
     ----------
     path : str or Path
-        Its socket; see `socket_path`.
+        Socket of the engine; see `socket_path`.
     command : str
     timeout_s : float
-        How long to wait for the whole reply.
+        Time to wait for the whole reply.
     **fields
-        What else the request says: anything that JSON can hold.
+        Other fields of the request, as JSON values.
 
     Raises
     ------
     InputError
-        When no engine listens there, when it says no, and when it does not answer in time.
+        When no engine listens there, the engine refuses, or it does not answer in time.
     """
     kind, name = server_of(Path(path))
     starts = "run" if kind == ENGINE else f"{kind} run"
@@ -78,7 +78,7 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
             _connect(connection, Path(path), end)
             if peer_uid(connection) != os.geteuid():
                 raise InputError(f"the {kind} {name} belongs to another user")
-            with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # it may say why
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its reply may hold the reason
                 connection.sendall(line)
             reply = _received_line(connection, end)
         except TimeoutError:
@@ -95,26 +95,25 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
 
 
 class ControlServer(Closing):
-    """Answers requests in a thread of its own, until it is closed.
+    """Server that answers requests in a separate thread until closed.
 
-    Clients that hang, send garbage or go away neither stop it nor hold up others. Commands named in `lengthy`
-    are carried out one after the other in a second thread; all others are answered meanwhile. Every process
-    but those of the same user is told no.
+    Clients that hang, send garbage or disconnect neither stop the server nor delay others. Commands named in
+    `lengthy` run one after another in a second thread; all others are answered meanwhile. Processes of other
+    users are refused.
 
     Parameters
     ----------
     path : str or Path
-        Its socket; see `socket_path`. Beside it lies a lock file, which tells a living server from the
-        remains of a dead one.
+        Socket; see `socket_path`. A lock file beside it shows whether a server is alive or has died.
     handlers : mapping of str to function
-        What each command does. An exception becomes the reply's error.
+        Function of each command. An exception becomes the reply's error.
     lengthy : collection of str
         Commands that may take long.
 
     Raises
     ------
     InputError
-        When another server lives there, or the place is not private.
+        When another server is alive there, or the folder is not private.
     """
 
     def __init__(
@@ -122,7 +121,7 @@ class ControlServer(Closing):
     ) -> None:
         self.path = Path(path)
         self._handlers, self._lengthy = dict(handlers), frozenset(lengthy)
-        self._connections: dict[asyncio.Task[None], None] = {}  # the one that was idle longest comes first
+        self._connections: dict[asyncio.Task[None], None] = {}  # ordered by idle time, longest first
         self._lock_file = locked_beside(self.path)
         try:
             self._listener = bound_listener(self.path)
@@ -137,19 +136,19 @@ class ControlServer(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop answering and remove the socket; closing again does nothing."""
-        with contextlib.suppress(RuntimeError):  # closed already
+        """Stop answering and remove the socket; repeated calls do nothing."""
+        with contextlib.suppress(RuntimeError):  # already closed
             self._loop.call_soon_threadsafe(self._closing.set)
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
     def _run(self) -> None:
-        """The thread: until it is told to close."""
+        """Run the server thread until it is closed."""
         try:
             with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
                 runner.run(self._serve())
         finally:
-            with contextlib.suppress(OSError):  # the socket file only where it is still this server's
+            with contextlib.suppress(OSError):  # remove the socket file only if it is still this server's
                 if os.stat(self.path).st_ino == self._inode:
                     os.unlink(self.path)
                     os.unlink(lock_path(self.path))
@@ -168,7 +167,7 @@ class ControlServer(Closing):
             connection, _ = self._listener.accept()
         except BlockingIOError:
             return
-        except OSError:  # no file descriptor left, mostly
+        except OSError:  # usually: no file descriptor left
             self._make_room()
             self._loop.remove_reader(self._listener)
             self._loop.call_later(_PAUSE_S, self._listen)
@@ -181,7 +180,7 @@ class ControlServer(Closing):
         task.add_done_callback(partial(self._end, connection))
 
     def _make_room(self) -> None:
-        """End the connection that was idle longest."""
+        """Close the connection that was idle longest."""
         if self._connections:
             task = next(iter(self._connections))
             del self._connections[task]
@@ -192,9 +191,9 @@ class ControlServer(Closing):
         connection.close()
 
     async def _converse(self, connection: socket.socket) -> None:
-        """Answer the requests of one connection until it ends, or is idle for too long."""
-        # Not with asyncio's streams: each leaves a cycle of references behind, and nobody collects those
-        # while frames come.
+        """Answer the requests of one connection until it ends or is idle for too long."""
+        # Not with asyncio's streams: each leaves a reference cycle, and collection is off while frames
+        # come.
         task, inbox = asyncio.current_task(), bytearray()
         with contextlib.suppress(OSError, TimeoutError):
             try:
@@ -203,14 +202,14 @@ class ControlServer(Closing):
                     raise InputError(f"this {kind} answers only the user that runs it")
                 while line := await _next_line(connection, inbox):
                     await _send(connection, await self._reply(line))
-                    if task in self._connections:  # it becomes the one that was idle last
+                    if task in self._connections:  # move it to the end: least idle
                         self._connections[task] = self._connections.pop(task)
-                    await asyncio.sleep(0)  # who sends many requests at once does not hold up the others
+                    await asyncio.sleep(0)  # many requests of one client must not delay others
             except InputError as error:
                 await _send(connection, _encoded(_refusal(str(error))))
 
     async def _reply(self, line: bytes) -> bytes:
-        """Carry out one request; whatever happens, there is a reply."""
+        """Carry out one request; always return a reply."""
         try:
             fields = _parsed_request(line)
             command = fields.pop("command", None)
@@ -227,7 +226,7 @@ class ControlServer(Closing):
 
 
 async def _next_line(connection: socket.socket, inbox: bytearray) -> bytes:
-    """Wait for the end of a line; empty where the connection ends before. InputError when it is too long."""
+    """Wait for a complete line; return b"" when the connection ends, raise InputError when it is too long."""
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(_IDLE_S):
         while not (size := inbox.find(b"\n") + 1) and len(inbox) < LARGEST_REQUEST:
@@ -248,17 +247,17 @@ async def _send(connection: socket.socket, reply: bytes) -> None:
 
 
 async def in_thread(work: Callable[[], Result]) -> Result:
-    """Wait for what a function returns in a thread of its own; the end of the process waits for neither."""
+    """Run a function in a daemon thread and wait for its result."""
     loop = asyncio.get_running_loop()
     done: asyncio.Future[Result] = loop.create_future()
 
     def finish(reply: Result) -> None:
-        if not done.done():  # else nobody waits any more
+        if not done.done():  # else the caller was cancelled
             done.set_result(reply)
 
     def run() -> None:
         reply = work()
-        with contextlib.suppress(RuntimeError):  # the server was closed meanwhile
+        with contextlib.suppress(RuntimeError):  # the server may have closed
             loop.call_soon_threadsafe(finish, reply)
 
     threading.Thread(target=run, name="faintspot-command", daemon=True).start()
@@ -269,7 +268,7 @@ async def in_thread(work: Callable[[], Result]) -> Result:
 
 
 def _answer(handler: Handler, fields: dict[str, Any]) -> bytes:
-    """Carry out a command; whatever happens, there is a reply."""
+    """Carry out a command; always return a reply."""
     try:
         reply = _encoded({"ok": True, **handler(fields)})
         if len(reply) > _LARGEST_REPLY:
@@ -277,7 +276,7 @@ def _answer(handler: Handler, fields: dict[str, Any]) -> bytes:
         return reply
     except InputError as error:
         return _encoded(_refusal(str(error)))
-    except BaseException as error:  # a fault of a command must not end the channel, nor an exit in one
+    except BaseException as error:  # a command's fault or exit must not end the channel
         return _encoded(_refusal(f"{type(error).__name__}: {error}"))
 
 
@@ -286,7 +285,7 @@ def _encoded(message: Mapping[str, Any]) -> bytes:
 
 
 def _jsonable(value: Any) -> Any:
-    """What JSON does not know: NumPy's numbers and arrays, paths."""
+    """Convert values that JSON lacks: NumPy's numbers and arrays, paths."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Path):
@@ -316,12 +315,12 @@ def _connect(connection: socket.socket, path: Path, end: float) -> None:
         _set_timeout(connection, end)
         try:
             return connection.connect(os.fspath(path))
-        except BlockingIOError:  # many others connect at this moment
+        except BlockingIOError:  # many others are connecting
             time.sleep(0.01)
 
 
 def _received_line(connection: socket.socket, end: float) -> bytes:
-    """What comes until a line's end, or until the other end closes."""
+    """Receive up to the end of a line, or until the connection closes."""
     received = bytearray()
     while len(received) <= _LARGEST_REPLY:
         _set_timeout(connection, end)
@@ -341,13 +340,13 @@ def _set_timeout(connection: socket.socket, end: float) -> None:
 
 def _checked_reply(server: str, line: bytes) -> dict[str, Any]:
     if not line.endswith(b"\n"):
-        raise InputError(f"the {server} went away before it had answered")
+        raise InputError(f"the {server} ended before it answered")
     try:
         reply = parse_json(line)
     except ValueError:
         reply = None
     if not isinstance(reply, dict) or not isinstance(reply.get("ok"), bool):
-        raise InputError(f"the {server} replied what is not understood: {line[:40]!r}")
+        raise InputError(f"the {server} sent a reply that is not valid: {line[:40]!r}")
     if not reply.pop("ok"):
         raise InputError(str(reply.get("error", "refused without a reason")))
     return reply

@@ -1,4 +1,4 @@
-"""The loop in the engine: from a frame's slopes to the mirror's commands, and a guard that opens it."""
+"""The loop in the engine: commands from slopes, and a guard that opens the loop."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from faintspot.sensor.layout import Layout
 
 NONE, OPEN, CLOSED = "none", "open", "closed"
 STATES = (NONE, OPEN, CLOSED)
-"""Of a loop; telemetry has their places."""
+"""States of a loop; telemetry stores their index."""
 _AT_START = "not closed since the engine began"
 BY_REQUEST = "asked to"
-"""Why a loop is open that somebody has opened."""
-_BEYOND_OPEN = 1.25  # times the open loop's slopes: a loop that leaves more than that does harm
-_LARGEST_RESIDUAL = 0.25  # of a window's side, where the open loop's are not known
+"""Reason given when a user has opened the loop."""
+_BEYOND_OPEN = 1.25  # times the open loop's slopes; a loop that leaves more makes things worse
+_LARGEST_RESIDUAL = 0.25  # of a window's side, used if the open loop's slopes are not known
 
 
 class _Ready(NamedTuple):
-    """A controller that can take its turn."""
+    """A controller that has been prepared."""
 
     kind: str
     controller: Any
     predicts: bool
-    """Whether estimators are told what it expects."""
+    """Whether its prediction goes to the estimators as a prior."""
     takes_prior: bool
-    """Whether it asks how wide the prior is that slopes are drawn to."""
+    """Whether it uses the width of the prior of the slopes."""
 
     @classmethod
     def of(cls, control: Control, line: CommandDelayLine) -> Self:
@@ -54,25 +54,26 @@ class _Ready(NamedTuple):
 
 
 class ControlLoop:
-    """What the engine does after a frame's slopes are out: commands of them, while the loop is closed.
+    """Control loop of an engine: computes the mirror's commands from published slopes while it is closed.
 
-    While it is open, the mirror is asked to keep what it has. `follow` and `look_after` are for the engine's
-    thread, all others for any thread: they set a flag, which counts from the next frame on.
+    While the loop is open, the mirror keeps its commands. `follow` and `look_after` are for the engine's
+    thread. All other methods are for any thread: they set a flag that takes effect with the next frame.
 
     Parameters
     ----------
     control : Control
     layout : Layout
-        Of as many sub-apertures as the control is for.
+        Layout with as many sub-apertures as the control.
     held : (commands,) array, optional
-        What the mirror holds at the start. Default: it is flat.
+        The mirror's commands at the start. Default: flat.
     prior : Prior, optional
-        Told what a controller that predicts expects of the next frame; nothing while the loop is open.
+        Receives the prediction of the next frame's slopes from a predictive controller while the loop is
+        closed.
 
     Attributes
     ----------
     latencies : Latencies
-        From a frame's last row to its commands.
+        Latency from a frame's last row to its commands.
     """
 
     def __init__(
@@ -104,15 +105,15 @@ class ControlLoop:
     def follow(
         self, slopes: Slopes, number: int, prior_std_px: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the commands that follow from a frame's slopes; good until the next frame.
+        """Return the commands that follow from a frame's slopes; valid until the next frame.
 
         Parameters
         ----------
         slopes : Slopes
         number : int
-            Of the frame. While others were lost, what was on its way has come nearer to the mirror.
-        prior_std_px : (2 n,) array, optional
-            How wide the prior around the expected slopes was that these are drawn to. Default: they are not.
+            Frame number. Commands in the delay line advance by the number of lost frames, too.
+            prior_std_px : (2 n,) array, optional
+                Width of the prior around the predicted slopes that was used for these. Default: no prior.
         """
         line = self._line
         if number != self._number + 1 and self._number >= 0:
@@ -143,7 +144,7 @@ class ControlLoop:
         return line.latest
 
     def look_after(self) -> None:
-        """Open the loop where the frame that was followed last shows harm, and expect the next one."""
+        """Open the loop if the last frame shows a fault, and predict the next frame."""
         if not self.closed:
             self.guard.watch(self._said)
         elif reason := self.guard.objection(self._said, self._line.latest):
@@ -152,9 +153,9 @@ class ControlLoop:
         self._expect()
 
     def take_turn(self, kind: str | None) -> None:
-        """Let a controller have the coming frames, None: the one that is set.
+        """Hand the coming frames to a controller; None: the configured one.
 
-        It goes on from what the mirror holds, where another one had the frames before.
+        It starts from the mirror's present commands if another controller had the frames before.
         """
         new = self._ready[self.control.options.controller if kind is None else kind]
         if new is self._on:
@@ -163,7 +164,7 @@ class ControlLoop:
         self._expect(begins=self.closed and not self._begins)
 
     def _expect(self, *, begins: bool = False) -> None:
-        """Tell estimators what the controller, which may begin now, expects of the next frame."""
+        """Give the estimators the prediction of the next frame by the controller, which may begin now."""
         prior, on = self._prior, self._on
         try:
             if begins:
@@ -171,19 +172,19 @@ class ControlLoop:
             if prior is not None and on.predicts and self.closed and not self._begins:
                 prior.expect(*on.controller.expected())
                 return
-        except Exception as error:  # in the frame path nothing raises
+        except Exception as error:  # nothing raises in the frame path
             self._fail(error)
         if prior is not None:
             prior.forget()
 
     def _update(self, on: _Ready) -> None:
-        """Let a controller send its command."""
+        """Let a controller compute its command from the slopes."""
         try:
             if self._begins:
                 self._begins = False
                 on.controller.begin()
             on.controller.update(self._slopes, self._errors)
-        except Exception as error:  # in the frame path nothing raises
+        except Exception as error:  # nothing raises in the frame path
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
@@ -195,12 +196,12 @@ class ControlLoop:
     # Any thread -------------------------------------------------------------------------------------
 
     def make_ready(self, kind: str) -> None:
-        """Make a controller, for it to take its turn; one at a time.
+        """Prepare a controller, one at a time, so that it can be used.
 
         Raises
         ------
         InputError
-            When the model of the control is not what it has learnt, or its commands are not finite.
+            When the control model is not the learnt one, or its commands are not finite.
         """
         if kind in self._ready:
             return
@@ -210,12 +211,12 @@ class ControlLoop:
 
     @property
     def controller(self) -> Controller:
-        """That of the frame that came last."""
+        """Controller of the last frame."""
         controller: Controller = self._on.controller
         return controller
 
     def close(self) -> None:
-        """Close the loop, from what the mirror holds on; of one that is closed already nothing changes."""
+        """Close the loop, starting from the mirror's present commands; no effect if it is closed."""
         if self.closed:
             return
         self.guard.begin()
@@ -223,42 +224,42 @@ class ControlLoop:
         self.closed = True
 
     def open(self) -> None:
-        """Open the loop: the mirror keeps what it has."""
+        """Open the loop; the mirror keeps its commands."""
         if self.closed:
             self.opened_because = BY_REQUEST
             self.guard.end()
         self.closed = False
 
     def flatten(self) -> None:
-        """Have the mirror flat, while the loop is open.
+        """Flatten the mirror while the loop is open.
 
         Raises
         ------
         InputError
-            While it is closed.
+            When the loop is closed.
         """
         if self.closed:
-            raise InputError("loop: expected an open loop to make the mirror flat; open it first")
+            raise InputError("loop: is closed, expected it open to flatten the mirror; open it first")
         self._flattened = True
 
     @property
     def gain(self) -> float | None:
-        """The loop gain of the controller that is set, or else of another one; None where none has one."""
+        """Loop gain of the configured controller, or of another one if it has none; None if none has one."""
         integrator = self._integrator
         return None if integrator is None else integrator.gain
 
     @gain.setter
     def gain(self, gain: float) -> None:
-        """Change it.
+        """Change the loop gain.
 
         Raises
         ------
         InputError
-            For a value out of range, and where no controller has one.
+            When the value is out of range, or no controller has a gain.
         """
         integrator = self._integrator
         if integrator is None:
-            raise InputError(f"gain: the controller {self.control.options.controller!r} has none")
+            raise InputError(f"gain: the controller {self.control.options.controller!r} has no gain")
         integrator.gain = number_between("gain", gain, 0, 2)
 
     @property
@@ -272,7 +273,7 @@ class ControlLoop:
         return CLOSED if self.closed else OPEN
 
     def status(self) -> dict[str, Any]:
-        """Return what there is to say, as plain values."""
+        """Return the loop's state and figures as plain values."""
         return {
             "state": self.state,
             "gain": self.gain,
@@ -284,7 +285,7 @@ class ControlLoop:
         }
 
     def _warm_up(self, n: int) -> None:
-        """Have everything compiled; the mirror's commands stay."""
+        """Compile all controllers; the mirror's commands stay."""
         held = self._line.latest.copy()
         self.closed = True
         self.follow(Slopes(*(np.zeros(n, kind) for kind in RESULT_TYPES)), -1)
@@ -293,9 +294,9 @@ class ControlLoop:
 
 
 class Guard:
-    """Says when a loop has to be opened: it diverges, or sees too little.
+    """Monitor that detects when a loop must be opened: it diverges, or the flux is too low.
 
-    Means run over frames, in which older ones count less and less; while the loop is open, of its slopes.
+    Means are exponentially weighted over frames. While the loop is open, they measure its slopes.
 
     Parameters
     ----------
@@ -308,12 +309,12 @@ class Guard:
         self._share = 1 / options.guard_frames
         self._usual_px = _LARGEST_RESIDUAL * max(layout.window)
         self.flattens = False
-        """Whether the mirror's commands are what is wrong."""
+        """Whether the mirror should be flattened, because its commands are at fault."""
         self._forget()
         self.begin()
 
     def begin(self) -> None:
-        """Take the loop as closed from now on: what was seen of the open one says what is too much."""
+        """Treat the loop as closed from now on; the open loop's slopes set the limit."""
         limit = self._options.largest_residual_px
         if limit is None and self._frames >= self._options.guard_frames:
             limit = _BEYOND_OPEN * self.residual_px
@@ -321,15 +322,15 @@ class Guard:
         self._forget()
 
     def watch(self, said: NDArray[np.float64]) -> None:
-        """Take a frame, of which `true_slopes` has said what it says."""
+        """Take the summary that `true_slopes` gives of a frame."""
         self._frames += 1
         self._invalid += self._share * (said.item(INVALID_PART) - self._invalid)
         self._square += self._share * (said.item(MEAN_SQUARE) - self._square)
 
     def objection(self, said: NDArray[np.float64], commands: NDArray[np.float64]) -> str:
-        """Take a frame of a closed loop and its commands; return why it has to be opened, "" for nothing.
+        """Take a frame of a closed loop and its commands; return why the loop must be opened, or "".
 
-        A mean counts from the first frame on as if all before had been 0, so that no single one decides.
+        A mean starts as if all earlier values had been 0, so that no single frame decides.
         """
         self.watch(said)
         options = self._options
@@ -351,11 +352,11 @@ class Guard:
 
     @property
     def residual_px(self) -> float:
-        """Rms of the slopes along one axis of late."""
+        """Recent rms of the slopes along one axis."""
         return math.sqrt(self._square / self._weight)
 
     def status(self) -> dict[str, Any]:
-        """Return what it sees, as plain values."""
+        """Return the guard's figures as plain values."""
         return {
             "residual_px": self.residual_px,
             "invalid_part": self._invalid / self._weight,
@@ -364,11 +365,11 @@ class Guard:
 
     @property
     def _weight(self) -> float:
-        """Of all frames that were seen."""
+        """Total weight of the frames so far."""
         return 1 - (1 - self._share) ** max(self._frames, 1) if self._share < 1 else 1.0
 
     def end(self, reason: str = "") -> str:
-        """Take the loop as open from now on, for a reason, which is returned."""
+        """Treat the loop as open from now on; return the reason."""
         self._forget()
         return reason
 

@@ -1,4 +1,4 @@
-"""The engine: frames come in by rows, slopes go out, settings change in between."""
+"""The engine: read frames row by row, publish slopes, and change settings between frames."""
 
 from __future__ import annotations
 
@@ -30,53 +30,53 @@ from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.timing import Counters, Latencies
 from faintspot.realtime.workers import Workers
 
-_WATCH_S = 0.02  # between two looks of the watcher
-_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source lives takes longer
+_WATCH_S = 0.02  # between two checks of the watcher
+_LOOKS_BETWEEN_STALE = 10  # asking the operating system whether the source is alive takes longer
 DEADLINE_S = 1e-3
 IMAGES_EVERY = 100
 
 
 class FrameSource(Protocol):
-    """What brings frames into the ring in the engine's own thread."""
+    """Source that brings frames into the ring in the engine's own thread."""
 
     def step(self) -> bool:
         """Wait a moment for a frame; return whether one has come."""
         ...
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
         ...
 
 
 class Engine:
-    """Measures the frames of a pixel ring and publishes slopes, and commands, until it is told to stop.
+    """Real-time engine: measures the frames of a pixel ring and publishes slopes and commands until stopped.
 
     Parameters
     ----------
     name : str
-        Of the pixel ring, and of the streams of slopes.
+        Name of the pixel ring and of the streams of slopes.
     make_pipeline : function
-        Makes a pipeline from settings.
+        Function that makes a pipeline from settings.
     settings : Settings
-        To begin with.
+        Initial settings.
     threads : int
-        That measure.
+        Number of threads that measure.
     cpus : sequence of int, optional
-        Processors to pin threads to, the first one for the thread that calls `run`.
+        Processors to pin threads to; the first one is for the thread that calls `run`.
     interleaving : Interleaving, optional
-        Several states of the settings, in turn, and controllers.
+        Configurations that take turns: changes of the settings, and controllers.
     deadline_s : float
-        From a frame's last row; slopes that come later count as late.
+        Latency from a frame's last row beyond which slopes count as late.
     source : FrameSource, optional
-        Brings frames into the ring when it is asked to, by the thread that measures them: a `StreamBridge`.
-        Default: another process writes into the ring.
+        Brings frames into the ring in the thread that measures them, e.g. a `StreamBridge`. Default: another
+        process writes into the ring.
     images_every : int
-        Of so many frames of an arm, telemetry keeps one's images; 0: of none.
+        Interval, in frames of one configuration, at which telemetry keeps images; 0: no images.
     control : Control, optional
-        Makes commands of slopes; the loop is open at first. Default: there are none. The reference slopes
-        are for the pipelines.
+        Computes commands from slopes; the loop starts open. Default: no commands. The reference slopes are
+        for the pipelines.
     mean_flux : float, optional
-        Frames over which the flux of every sub-aperture is averaged, which estimators that use it are told.
+        Number of frames over which the flux of each sub-aperture is averaged, for estimators that use it.
         Default: they keep `flux_e`.
 
     Attributes
@@ -86,7 +86,7 @@ class Engine:
     Raises
     ------
     InputError
-        When the settings do not fit, or somebody else publishes under that name.
+        When the settings do not fit, or another process publishes under that name.
     """
 
     def __init__(
@@ -108,14 +108,14 @@ class Engine:
         interleaving = Interleaving() if interleaving is None else interleaving
         self.counters, self.latencies = Counters(), Latencies()
         self.refused: list[str] = []
-        """What of the real-time scheduling was not permitted."""
+        """Parts of the real-time scheduling that were not permitted."""
         self.advice: list[str] = []
-        """What was last said to be better, for whoever asks for the status."""
+        """Latest advice, shown in the status."""
         self._source, self._incompatible = source, ""
         self._path: FramePath | None = None
         self._waiting = False
-        self._arrival, self._number = 0, -1  # of the frame that was measured last
-        self._measured: dict[int, int] = {}  # by an arm's number
+        self._arrival, self._number = 0, -1  # of the last measured frame
+        self._measured: dict[int, int] = {}  # frames, by configuration
         self._stopping = threading.Event()
         self._workers = Workers(threads - 1, cpus) if threads > 1 else None
         prior = None if control is None else Prior(len(control.interaction) // 2)
@@ -157,7 +157,7 @@ class Engine:
     # Any thread -------------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """End the run after the frame that is being measured; from any thread."""
+        """End the run after the present frame; callable from any thread."""
         self._stopping.set()
 
     def status(self) -> dict[str, Any]:
@@ -183,18 +183,18 @@ class Engine:
         }
 
     def loop_status(self) -> dict[str, Any]:
-        """Return what there is to say of the loop, as plain values."""
+        """Return the state of the loop as plain values."""
         if self.loop is None:
             return {"state": NONE}
         return {**self.loop.status(), "obstacle": self._streams.commands_obstacle()}
 
     def interleave(self, text: str, every: int) -> Change:
-        """Have other arms take turns; see `Interleaving.parse`. By one thread at a time.
+        """Replace the configurations that take turns; see `Interleaving.parse`. For one thread at a time.
 
         Raises
         ------
         InputError
-            When it is refused; then nothing changes.
+            When the text is refused; nothing changes then.
         """
         before = self.preparer.interleaving
         new = Interleaving.parse(text, every, before.first + len(before.arms))
@@ -207,13 +207,13 @@ class Engine:
             raise
 
     def _make_ready(self, interleaving: Interleaving) -> None:
-        """Make the controllers of arms, or refuse them."""
+        """Prepare the controllers of all configurations, or refuse them."""
         for arm in interleaving.arms:
             if arm.control is None:
                 continue
             try:
                 if self.loop is None:
-                    raise InputError("this engine makes no commands; its configuration has no [control]")
+                    raise InputError("this engine makes no commands; add [control] to its configuration")
                 self.loop.control.check_errors(self.live.running.pipelines[0].calibration, arm.control)
                 self.loop.make_ready(arm.control)
             except InputError as error:
@@ -222,20 +222,20 @@ class Engine:
     # The engine's thread ----------------------------------------------------------------------------
 
     def run(self, n_frames: int | None = None) -> None:
-        """Measure frames until `stop`, or so many; wait for the source where there is none."""
+        """Measure frames until `stop` or for `n_frames`; wait while there is no source."""
         watcher = threading.Thread(target=self._watch, name="faintspot-watcher", daemon=True)
         watcher.start()
         if self._flux is not None:
             self._flux.start()
         waited = False
         try:
-            with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time, and nobody reads it
+            with self._streams.held(), np.errstate(all="ignore"):  # a warning takes time and is not shown
                 while not self._done(n_frames):
                     ring = self._attached()
                     if ring is None:
                         self._await_ring()
                     else:
-                        # All frames of a ring that was waited for count; else those from now on.
+                        # All frames of a ring that was waited for count; else only those from now on.
                         self._arrival, self._number = (
                             (0, -1) if waited else (ring.arrivals, ring.progress()[0])
                         )
@@ -264,14 +264,14 @@ class Engine:
         return self._stopping.is_set() or (n_frames is not None and self.counters.processed >= n_frames)
 
     def _await_ring(self) -> None:
-        """Give the source time to make one."""
+        """Wait a moment for the source to make a ring."""
         if self._source is None:
             self._stopping.wait(_WATCH_S)
         else:
             self._source.step()
 
     def _attached(self) -> PixelRing | None:
-        """Return the source's ring, None where there is none that lives and fits."""
+        """Return the source's ring; None if there is none that is alive and fits."""
         try:
             ring = PixelRing.attach(self.name, follows=True)
         except InputError:
@@ -291,13 +291,13 @@ class Engine:
 
     def _follow(self, ring: PixelRing, n_frames: int | None) -> None:
         """Measure the frames of a ring until it ends."""
-        self._take(ring)  # made before the first frame is waited for
+        self._take(ring)  # prepared before waiting for the first frame
         lost_before = self.counters.dropped
         ring.follow(self._arrival)
         if self._workers is not None:
             self._workers.wake()
         while not self._done(n_frames):
-            # What is in the ring already comes first: else every later frame would wait for its successor.
+            # Frames in the ring come first: otherwise every later frame would wait for its successor.
             behind = ring.arrivals > self._arrival
             if self._source is not None and not behind and not self._source.step():
                 if ring.closed:
@@ -314,7 +314,7 @@ class Engine:
             self._workers.park()
 
     def _measure_next(self, ring: PixelRing) -> bool:
-        """Measure and publish the next frame; return False when waiting for it was ended."""
+        """Measure and publish the next frame; return False when the wait for it was ended."""
         path, arm = self._take(ring)
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
@@ -324,7 +324,7 @@ class Engine:
             self._prediction.fill(self._number + 1)
         whole = path.measure(arrival, (self._number + 1) % ring.slots, explain=explain)
         number = ring.number_of(arrival)
-        if whole and number >= 0 and number != self._number + 1:  # it lies in another slot than expected
+        if whole and number >= 0 and number != self._number + 1:  # the frame is in another slot than expected
             whole = path.measure(arrival, number % ring.slots, explain=explain)
         self._waiting = False
         if not whole and path.stopped:
@@ -333,7 +333,7 @@ class Engine:
         return True
 
     def _take(self, ring: PixelRing) -> tuple[FramePath, int]:
-        """Return the path of the next frame, and whose turn it is; changes of settings take effect here."""
+        """Return the next frame's path and configuration; changes of settings take effect here."""
         prepared = self.live.take(self._number + 1)
         place = prepared.interleaving.arm_of(self.counters.processed)
         path = prepared.paths(ring)[place]
@@ -347,7 +347,7 @@ class Engine:
     def _end_frame(
         self, ring: PixelRing, path: FramePath, arm: int, arrival: int, number: int, explained: bool
     ) -> None:
-        """Publish what was measured, unless it was not that frame; first of all the slopes."""
+        """Publish the slopes first, then the details, unless the frame was overwritten meanwhile."""
         counters, slopes = self.counters, path.slopes
         moment = ring.last_row_time_ns(number, arrival) if number >= 0 else 0
         if not moment:
@@ -394,19 +394,19 @@ class Engine:
         self._arrival, self._number = arrival, number
 
     def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:
-        """Count a frame that cannot be published, and where to go on."""
+        """Count a frame that cannot be published, and find the next one."""
         counters = self.counters
         counters.frames_in += 1
         counters.dropped += 1
         self._arrival = arrival
-        if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row was there
+        if number >= 0 and ring.intact(number, arrival):  # the next one began before its last row arrived
             counters.short += 1
             self._number = number
             return
-        if ring.number_of(arrival) >= 0:  # it is there, but a worker died: its share is missing
+        if ring.number_of(arrival) >= 0:  # complete, but a worker died and its share is missing
             self._number = ring.number_of(arrival)
             return
-        counters.torn += 1  # overtaken: go on with the newest that is arriving
+        counters.torn += 1  # overwritten: continue with the newest frame
         newest = ring.arrivals
         counters.dropped += max(newest - 1 - arrival, 0)
         counters.frames_in += max(newest - 1 - arrival, 0)
@@ -416,9 +416,9 @@ class Engine:
     # The watcher's thread ---------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """End the engine's waiting when it is to stop, or when what it waits for will not come.
+        """End the engine's waiting when it is to stop or its source has gone.
 
-        And do all that takes time: tell telemetry what was changed, replace workers.
+        Also do all that takes time: write changes to telemetry, replace dead workers, check streams.
         """
         looks = told = 0
         loop_assumed: dict[str, Any] = {}
@@ -446,7 +446,7 @@ class Engine:
                 return
 
     def _tell_of_loop(self, told: dict[str, Any]) -> dict[str, Any]:
-        """Write into telemetry when the loop was opened, and why, or closed, or its gain changed."""
+        """Write to telemetry when the loop was opened, and why, or closed, or its gain changed."""
         if self.loop is None:
             return told
         now = {"loop": self.loop.state, "gain": self.loop.gain, "opened_because": self.loop.opened_because}

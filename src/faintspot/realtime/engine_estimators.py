@@ -1,4 +1,4 @@
-"""Estimators of others in a running engine: loaded from files, unloaded, and given up when they fail."""
+"""User-defined estimators in a running engine: loading, unloading, and falling back when one fails."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EFFECT_TIMEOUT_S = 0.5
 
 
 class EngineEstimators:
-    """Makes estimators of files known to a running engine; settings that name them take them into use.
+    """User-defined estimators of a running engine, loaded from files; settings select them by name.
 
     Parameters
     ----------
@@ -32,24 +32,24 @@ class EngineEstimators:
         self._live, self._preparer = live, preparer
         self._lock = threading.Lock()
         self.loaded: dict[str, EstimatorFile] = {}
-        """Files of estimators by the estimators' names."""
+        """Files of loaded estimators, by the estimators' names."""
         self.fault: str | None = None
-        """Why an estimator was given up last."""
+        """Reason why the last estimator was disabled."""
 
     def load(self, source: str, *, swap: bool = False) -> dict[str, Any]:
-        """Try a file's estimators in a process of their own, and make them known when they have passed.
+        """Try a file's estimators in a separate process, and load them if they pass.
 
-        With `swap` they replace those of the same names, also where these are in use.
+        With `swap` they replace those of the same names, even if these are in use.
 
         Returns
         -------
         dict
-            "estimators", their names; "frame", the first one measured with a swapped estimator, else None.
+            "estimators": their names; "frame": the first one measured with a swapped estimator, or None.
 
         Raises
         ------
         InputError
-            When the file is refused; then nothing changes.
+            When the file is refused; nothing changes then.
         """
         path = Path(source)
         settings = self._preparer.built_in(self._live.settings)
@@ -57,27 +57,27 @@ class EngineEstimators:
         with self._lock:
             for name in tried["estimators"]:
                 if name in self.loaded and not swap:
-                    raise InputError(f"estimator {name!r}: loaded already; swap reads its file again")
+                    raise InputError(f"estimator {name!r}: already loaded; use swap to load its file again")
             before = registry.estimators()
             file = load_estimators(path)
             try:
                 if file.digest != tried["digest"]:
-                    raise InputError(f"{path}: was changed while it was tried; load it again")
+                    raise InputError(f"{path}: changed during its trial, expected no change; load it again")
                 frame = self._renewed(set(file.kinds))
             except BaseException:
                 registry.restore(before)
                 raise
             self.loaded |= dict.fromkeys(file.kinds, file)
-        gc.collect()  # former versions are cycles, and a running engine does not collect any
+        gc.collect()  # old versions are reference cycles, and the engine runs without collection
         return {"estimators": list(file.kinds), "frame": frame}
 
     def unload(self, name: str) -> dict[str, Any]:
-        """Forget an estimator; where it is in use, the built-in one before takes over.
+        """Unload an estimator; if it is in use, the last built-in one takes over.
 
         Returns
         -------
         dict
-            "frame", the first one measured without it; None where it was not in use.
+            "frame": the first one measured without it; None if it was not in use.
 
         Raises
         ------
@@ -87,7 +87,7 @@ class EngineEstimators:
         with self._lock:
             if name not in self.loaded:
                 known = ", ".join(self.loaded) or "none"
-                raise InputError(f"estimator {name!r}: expected one that is loaded ({known})")
+                raise InputError(f"estimator {name!r}: not loaded, expected one of: {known}")
             newest, frame = self._live.newest, None
             if name in newest.estimator_names and newest.fallback is not None:
                 frame = self._live.wait(self._fallen_back(newest.fallback), _EFFECT_TIMEOUT_S)
@@ -99,7 +99,7 @@ class EngineEstimators:
         return {"frame": frame}
 
     def fall_back(self, fallback: EnginePlan, fault: str) -> None:
-        """Let what was prepared for that take over, from the next frame on; for the engine's thread."""
+        """Use the prepared fallback from the next frame on; for the engine's thread."""
         self.fault = fault
         self._fallen_back(fallback, estimator_fault=fault)
 
@@ -111,7 +111,7 @@ class EngineEstimators:
         )
 
     def _renewed(self, names: set[str]) -> int | None:
-        """Prepare settings anew that use one of these estimators; return the first frame measured so."""
+        """Prepare settings with these estimators again; return the first frame measured with them."""
         newest = self._live.newest
         if not names & newest.estimator_names:
             return None

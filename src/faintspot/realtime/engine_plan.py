@@ -1,4 +1,4 @@
-"""Settings made ready for their first frame: pipelines, and the paths of frames through them."""
+"""Settings prepared for their first frame: pipelines, and frame paths through them."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from faintspot.realtime.python_path import PythonPath, tried
 from faintspot.realtime.time_limit import call_within
 from faintspot.realtime.workers import Workers
 
-TRIAL_LIMIT_S = 60.0  # an estimator may compile
+TRIAL_LIMIT_S = 60.0  # long enough for an estimator that compiles
 
 
 class EnginePlan:
-    """Settings with all that is made from them: for every arm a pipeline, and a path for a ring's frames.
+    """Settings and all that is prepared from them: a pipeline and a frame path for every configuration.
 
     Parameters
     ----------
     pipelines : sequence of SlopePipeline
-        One for every arm.
+        One for each configuration that takes turns.
     settings : Settings
-        Those that the arms' own changes are added to.
+        Settings that the configurations' changes are added to.
     interleaving : Interleaving
-        Whose arms they are.
+        The configurations that take turns.
     workers : Workers, optional
     budget_s : float
-        For estimators in NumPy, of one frame.
+        Time limit for one frame of an estimator in NumPy.
     prior : Prior, optional
-        Of all frames, see `FramePath`.
+        Prior of all frames; see `FramePath`.
     fallback : PreparedSettings, optional
-        Takes over when an estimator of somebody else fails.
+        Replacement when a user-defined estimator fails.
     """
 
     def __init__(
@@ -62,24 +62,24 @@ class EnginePlan:
 
     @property
     def estimator_names(self) -> set[str]:
-        """Names of the estimators of all arms."""
+        """Names of the estimators of all configurations."""
         return {pipeline.settings.estimator.name for pipeline in self.pipelines}
 
     def paths(self, ring: PixelRing) -> tuple[FramePath, ...]:
-        """Return the paths of a ring's frames, one for every arm, complete and warm."""
+        """Return the paths of a ring's frames, one for each configuration, compiled and warmed up."""
         if ring is not self._ring:
             if self.fallback is not None:
                 self.fallback.paths(ring)
             cells, pixels = writable_view(ring.cells), writable_view(ring.pixels)
             columns = ring.cells.shape[1]
-            # Frames are known by their arrival, which counts up whatever a camera does to its frame numbers.
+            # Frames are identified by their arrival, which counts up even if frame numbers repeat.
             progress = Progress(cells, ARRIVALS * columns, ROWS * columns)
             self._paths = tuple(self._new_path(pipeline, pixels, progress) for pipeline in self.pipelines)
             self._ring = ring
         return self._paths
 
     def warm_up(self) -> None:
-        """Compile all that measures frames, while it is not known yet of which type they will be."""
+        """Compile all that measures frames while their type is not yet known."""
         if self.fallback is not None:
             self.fallback.warm_up()
         progress = Progress(np.zeros((2, 1), np.int64), 0, 1)
@@ -99,18 +99,18 @@ class EnginePlan:
 
 
 class SettingsPreparer:
-    """Prepares settings beside the running system.
+    """Preparation of settings while the engine runs.
 
     Parameters
     ----------
     make_pipeline : function
-        Makes a pipeline from settings.
+        Function that makes a pipeline from settings.
     interleaving : Interleaving
     workers : Workers, optional
     budget_s : float
-        For estimators in NumPy, of one frame.
+        Time limit for one frame of an estimator in NumPy.
     prior : Prior, optional
-        Predicted slopes, see `FramePath`.
+        Predicted slopes; see `FramePath`.
     """
 
     def __init__(
@@ -123,19 +123,19 @@ class SettingsPreparer:
     ) -> None:
         self.make_pipeline = make_pipeline
         self.interleaving = interleaving
-        """In all that is prepared from now on."""
+        """Interleaving of all settings that are prepared from now on."""
         self._workers, self._budget_s, self._prior = workers, budget_s, prior
         self.ring: PixelRing | None = None
-        """Whose frames are being measured, if any."""
+        """Ring whose frames are being measured, if any."""
         self._built_in: Estimator = estimator_named("brightest")()
 
     def prepare(self, settings: Settings) -> EnginePlan:
-        """Prepare settings: for a ring's frames or, where there is no ring yet, for frames of any type.
+        """Prepare settings for a ring's frames or, without a ring, for frames of any type.
 
         Raises
         ------
         InputError
-            When the settings do not fit, or what an arm makes of them, or an estimator fails in its trial.
+            When the settings or those of a configuration do not fit, or an estimator fails its trial.
         """
         arms = [arm.of(settings) for arm in self.interleaving.arms]
         pipelines = [self._pipeline(each) for each in arms]
@@ -154,12 +154,12 @@ class SettingsPreparer:
         return prepared
 
     def built_in(self, settings: Settings) -> Settings:
-        """Return settings with the built-in estimator that was set last, where theirs is somebody else's."""
+        """Return settings in which the last built-in estimator replaces a user-defined one."""
         own = is_built_in(settings.estimator)
         return settings if own else settings.replace(estimator=self._built_in)
 
     def _fallback(self, settings: Settings) -> EnginePlan:
-        """Prepare the same settings with a built-in estimator, and no arms that take turns."""
+        """Prepare the same settings with a built-in estimator and no interleaving."""
         settings, arms = self.built_in(settings), self.interleaving
         alone = arms if len(arms.arms) == 1 else Interleaving(first=arms.first + len(arms.arms))
         return self._prepared([self.make_pipeline(settings)], settings, alone, None)
@@ -182,12 +182,12 @@ class SettingsPreparer:
 
 
 def is_built_in(estimator: Estimator) -> bool:
-    """Return whether an estimator is one of this package."""
+    """Return whether an estimator is part of this package."""
     return type(estimator).__module__.startswith(f"{__package__.partition('.')[0]}.")
 
 
 class _WritableMemory:
-    """An array's memory, said to be writable. Not a class for each array: classes need the collector."""
+    """Memory of an array, declared writable; one class for all, because classes need garbage collection."""
 
     def __init__(self, array: NDArray[Any]) -> None:
         self._array = array
@@ -196,8 +196,8 @@ class _WritableMemory:
 
 
 def writable_view(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the same memory as an array of the kind that kernels are compiled for, which may be written to.
+    """Return a writable array of the same memory, of the type that kernels are compiled for.
 
-    Nobody writes: it spares compiling every kernel once more for memory that is read-only.
+    The kernels do not write to it; this avoids compiling each of them again for read-only memory.
     """
     return np.asarray(_WritableMemory(array))

@@ -1,4 +1,4 @@
-"""Estimators in a Python file, which a running engine reads."""
+"""Estimators in a Python file that a running engine loads."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _IMPORTED = "faintspot_file_"
 
 @dataclass(frozen=True)
 class EstimatorFile:
-    """A file that was read, and the estimators that it has registered."""
+    """A loaded file and the estimators that it has registered."""
 
     path: Path
     digest: str
-    """SHA-256 of the text, which tells one version from another."""
+    """SHA-256 of the text, which identifies the version."""
     kinds: dict[str, type[Estimator]]
 
 
@@ -36,7 +36,8 @@ def load_estimators(path: Path) -> EstimatorFile:
     Raises
     ------
     InputError
-        When it cannot be read, is not Python, fails, does not return, or registers none; then nothing stays.
+        When the file cannot be read, is not Python, fails, does not return, or registers none; nothing stays
+        registered then.
     """
     try:
         text = path.read_bytes()
@@ -50,13 +51,13 @@ def load_estimators(path: Path) -> EstimatorFile:
     module = types.ModuleType(f"{_IMPORTED}{path.stem}")
     module.__file__ = str(path)
     before, kinds_before = sys.modules.get(module.__name__), registry.estimators()
-    sys.modules[module.__name__] = module  # dataclasses and pickle look there
+    sys.modules[module.__name__] = module  # dataclasses and pickle look modules up there
     try:
         call_within(LOAD_LIMIT_S, str(path), _run, code, module, path)
         now = registry.estimators().items()
         kinds = {name: kind for name, kind in now if kinds_before.get(name) is not kind}
         if not kinds:
-            raise InputError(f"{path}: expected a class with @register, found none")
+            raise InputError(f"{path}: expected a class decorated with @register, found none; add one")
     except BaseException:
         registry.restore(kinds_before)
         sys.modules.pop(module.__name__)

@@ -1,4 +1,4 @@
-"""The flux of every sub-aperture as a running mean over an engine's frames, for estimators that use it."""
+"""Running mean of the flux of every sub-aperture over an engine's frames, for estimators that use it."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _BETWEEN_S = 0.1
 
 @partial(compiled_with, source=__file__)
 def add_flux(flux: NDArray[np.float32], mean: NDArray[np.float64], frames: float) -> None:
-    """Take one frame's flux (n,) into the mean over so many frames; what is not finite counts nothing."""
+    """Add one frame's flux (n,) to a running mean over `frames` frames; ignore values that are not finite."""
     for s in range(flux.shape[0]):
         if np.isfinite(flux[s]):
             mean[s] += (flux[s] - mean[s]) / frames
 
 
 class FluxFollower:
-    """Measures the mean flux, as `MeanFlux` does, and sets `flux_e` when it has changed.
+    """Follower of the mean flux, measured as `MeanFlux` does, that sets `flux_e` when it has changed.
 
-    New tables are made in a thread of its own, as for any change of settings. Where the estimator that runs
-    does not use the flux, nothing is changed.
+    A separate thread prepares the new settings, as for any change. Nothing changes if the running estimator
+    does not use the flux.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class FluxFollower:
     Raises
     ------
     InputError
-        For a time constant below 1.
+        When the time constant is below 1.
     """
 
     def __init__(
@@ -55,26 +55,26 @@ class FluxFollower:
         self._add = Direct(add_flux)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="faintspot-flux", daemon=True)
-        self.take(np.zeros(len(self._mean), np.float32))  # compiled now
+        self.take(np.zeros(len(self._mean), np.float32))  # compile now
         self._frames = 0.0
 
     def start(self) -> None:
-        """Follow the flux from now on."""
+        """Start following the flux."""
         self._thread.start()
 
     def close(self) -> None:
-        """End."""
+        """Stop following the flux."""
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def take(self, flux_e: NDArray[np.float32]) -> None:
-        """Take one frame's flux; by the engine's thread."""
+        """Add one frame's flux; for the engine's thread."""
         self._frames = min(self._frames + 1.0, self._longest)
         self._add(flux_e, self._mean, self._frames)
 
     def step(self) -> bool:
-        """Set the flux where it has changed by more than tables distinguish; return whether it has."""
+        """Set the flux if it has changed by more than the settings distinguish; return whether it has."""
         if self._frames < min(_FEWEST_FRAMES, self._longest):
             return False
         pipeline = self._live.running.pipelines[0]
@@ -90,5 +90,5 @@ class FluxFollower:
         while not self._stopping.wait(_BETWEEN_S):
             try:
                 self.step()
-            except InputError:  # settings that somebody changes at this moment: again
+            except InputError:  # another change came at the same time: try again
                 continue

@@ -1,7 +1,7 @@
-"""The way of one frame through the engine: everything made beforehand, no memory taken while frames come.
+"""Measurement of one frame in the engine, with everything allocated in advance.
 
-A frame path belongs to one pipeline, that is to one state of the settings; when they change, the engine makes
-another one beside the running system and takes it between two frames.
+A frame path belongs to one pipeline, i.e. to one state of the settings. When settings change, another one is
+prepared while the engine runs, and taken between two frames.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ STOP_CELL = 0
 
 @dataclass(frozen=True, eq=False)
 class Progress:
-    """Where a frame path looks how far a frame has arrived.
+    """Cells that show how much of a frame has arrived.
 
     Parameters
     ----------
     cells : int64 array
-        In shared memory.
+        Progress cells, in shared memory.
     frame_cell, rows_cell : int
-        Where in it the number of the arriving frame, and its rows so far, are.
+        Indices of the arriving frame's number and of its number of complete rows.
     """
 
     cells: NDArray[np.int64]
@@ -45,7 +45,7 @@ class Progress:
 
 
 class _Groups:
-    """A range of a frame's groups, and all that the kernel takes to measure them.
+    """A range of a frame's groups of sub-apertures, with the arguments of their kernel.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class _Groups:
     groups : (int, int)
         First group, and the one after the last.
     shares : int
-        Into how many they are shared.
+        Number of shares into which the groups are divided.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class _Groups:
         task = pipeline.plan.task(np.zeros(1, np.int64), None if prior is None else prior.mean_px)
         task = task._replace(settings=task.settings.copy())
         self.settings: NDArray[np.float32] = task.settings[0]
-        """What the kernel reads of every sub-aperture: rows as in `faintspot.kernels.groups`."""
+        """Settings of every sub-aperture for the kernel: rows as in `faintspot.kernels.groups`."""
         self._work = [(pipeline.source(slot[None], slot.dtype), task) for slot in slots]
         self._kernel = Direct(streamed(pipeline.plan.prepared.kernel))
         lanes, window = lanes_for(np.float32, pipeline.width), pipeline.layout.window
@@ -85,7 +85,7 @@ class _Groups:
         control: NDArray[np.int64],
         after: tuple[Any, ...],
     ) -> bool:
-        """Measure one share of a frame (number, slot); return whether it was measured to its end."""
+        """Measure one share of a frame (number, slot); return whether it was completed."""
         number, slot = frame
         first, last = self._groups
         start = first + (last - first) * share // self._shares
@@ -99,24 +99,24 @@ class _Groups:
 
 
 class FramePath:
-    """Measures frames while they arrive, with one state of the settings.
+    """Measurement of frames while they arrive, with one state of the settings.
 
     Parameters
     ----------
     pipeline : SlopePipeline
     slots : sequence of (h, w) arrays
-        Where frames arrive: frame k in slot k % len(slots). uint16 or float32, contiguous.
+        Memory in which frames arrive: frame k in slot k % len(slots). uint16 or float32, contiguous.
     progress : Progress
     workers : Workers, optional
-        Who else measures. Default: the caller's thread alone.
+        Threads that measure together with the caller. Default: the caller's thread alone.
     prior : Prior, optional
-        Predicted slopes, which the caller changes between frames. Default 0.
+        Predicted slopes, which the caller changes between frames. Default: 0.
 
     Raises
     ------
     InputError
-        When the slots do not fit the pipeline, or settings follow the flux of the frame itself, which is not
-        known before its last row.
+        When the slots do not fit the pipeline, or the settings need the frame's own flux, which is not known
+        before its last row.
     """
 
     def __init__(
@@ -135,16 +135,16 @@ class FramePath:
         n, pixels = len(pipeline.layout), pipeline.layout.pixels
         self._results = results = SlopeArrays(*(np.zeros((1, n), dtype) for dtype in RESULT_TYPES))
         self.slopes = Slopes(*(result[0] for result in results))
-        """Of the frame measured last; overwritten by the next one."""
+        """Slopes of the last frame; overwritten by the next one."""
         self._stages = np.zeros((STAGE_ROWS, 1, n, pixels), np.float32)
         self.fault: str | None = None
-        """Why the estimator is given up; of compiled ones never, see `PythonPath`."""
+        """Reason why the estimator is disabled; always None for compiled ones, see `PythonPath`."""
         self.failed = False
-        """Whether the estimator has failed in the frame measured last."""
+        """Whether the estimator failed in the last frame."""
         self._control = np.zeros(1, np.int64)
         wide, rest = pipeline.width, n % pipeline.width
         full = n // wide
-        # What is left over is measured in a narrower group where that is faster: its rows come last.
+        # The remainder is measured in a narrower group if that is faster; it has the last rows.
         faster = rest > 0 and pipeline.plan.prepared.fewer_lanes_are_faster
         narrow = [width for width in WIDTHS if rest <= width < wide] if faster else []
         self._wide = _Groups(pipeline, slots, (0, full if narrow else full + (rest > 0)), self._shares, prior)
@@ -156,25 +156,25 @@ class FramePath:
         self._prior, self._prior_changes = prior, 0
         self._usual_std_px = prior_std_px(pipeline.settings, pipeline.layout)
         self.prior_std_px = None if prior is None else self._usual_std_px
-        """How wide the prior is that slopes are drawn to, (2 n,); None: they are not."""
+        """Standard deviation of the slopes' prior, (2 n,); None: no prior."""
         self._plain = results, self._stages[:0]
         self._explaining = results, self._stages
 
     @property
     def denoised(self) -> NDArray[np.float32]:
-        """Denoised images of the frame that was measured last with its stages, (n, ny, nx)."""
+        """Denoised images of the last frame that was measured with them, (n, ny, nx)."""
         images: NDArray[np.float32] = self._stages[DENOISED, 0]
         return images.reshape(-1, *self.pipeline.layout.window)
 
     @property
     def stopped(self) -> bool:
-        """Whether waiting for rows has been ended."""
+        """Whether `stop` has ended the wait for rows."""
         return bool(self._control[STOP_CELL])
 
     def warm_up(self) -> None:
-        """Measure whatever the first slot holds, so that everything is compiled and in the caches."""
+        """Measure the present content of the first slot, to compile everything and fill the caches."""
         progress = self._progress
-        cells = np.zeros_like(progress.cells)  # of the same kind, so that nothing is compiled for it alone
+        cells = np.zeros_like(progress.cells)  # of the same type, to avoid an extra compilation
         cells.flat[progress.frame_cell] = 1
         there = Progress(cells, progress.frame_cell, progress.rows_cell)
         if self._prior is not None:
@@ -184,18 +184,18 @@ class FramePath:
         self.flag_doubtful()
 
     def measure(self, number: int, slot: int | None = None, *, explain: bool = False) -> bool:
-        """Measure a frame, waiting for its rows; return whether it was measured to its end.
+        """Measure a frame, waiting for its rows; return whether it was completed.
 
-        Where not, `stop` was called meanwhile, or a worker died.
+        It is not completed if `stop` was called meanwhile or a worker died.
 
         Parameters
         ----------
         number : int
-            Of the frame, as the progress counts.
+            Frame number, as the progress counts.
         slot : int, optional
-            Where it arrives. Default: number % slots.
+            Slot of the frame. Default: number % slots.
         explain : bool
-            Whether to keep its images.
+            Whether to keep its denoised images.
         """
         if self._prior is not None and self._prior.changes != self._prior_changes:
             self._widen(self._prior)
@@ -208,7 +208,7 @@ class FramePath:
         return self._workers.wait() and whole
 
     def flag_doubtful(self) -> None:
-        """Add to the flags of the frame measured last what needs all its slopes; see `SlopePipeline`."""
+        """Set the flags of the last frame that depend on all its slopes; see `SlopePipeline`."""
         self.pipeline.flag_doubtful(self._results)
 
     def await_start(self, number: int) -> None:
@@ -218,22 +218,22 @@ class FramePath:
         wait_for_rows(*cells, number, 1, self._control, STOP_CELL)
 
     def stop(self) -> None:
-        """End all waiting for rows, now and in future; from any thread."""
+        """End all waiting for rows, now and in future; callable from any thread."""
         self._control[STOP_CELL] = 1
 
     def go_on(self) -> None:
-        """Wait for rows again."""
+        """Allow waiting for rows again."""
         self._control[STOP_CELL] = 0
 
     def _work(self, share: int, frame: tuple[int, int], progress: Progress, after: tuple[Any, ...]) -> bool:
-        """Measure one share of a frame's groups; the last one has those that come last."""
+        """Measure one share of a frame's groups; the last share includes the narrow group."""
         whole = self._wide.measure(share, frame, progress, self._control, after)
         if self._narrow is None or share < self._shares - 1:
             return whole
         return whole and self._narrow.measure(0, frame, progress, self._control, after)
 
     def _widen(self, prior: Prior) -> None:
-        """Have the estimator's prior as wide as the predicted slopes are unsure, where that is known."""
+        """Set the width of the estimator's prior to the uncertainty of the prediction, where known."""
         self._prior_changes = prior.changes
         row = self.pipeline.plan.prepared.prior_weight_row
         if row is None:
@@ -245,7 +245,7 @@ class FramePath:
         self.prior_std_px = np.tile(std, 2) if np.isfinite(std).all() else None
 
     def _check(self, slots: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
-        """Refuse slots that the kernels cannot read, and settings that are not known in time."""
+        """Refuse slots that the kernels cannot read, and settings that need the frame's own flux."""
         shape = self.pipeline.layout.frame_shape
         for slot in slots:
             readable = slot.dtype in (np.uint16, np.float32) and slot.flags.c_contiguous
@@ -258,7 +258,7 @@ class FramePath:
 
 
 def check_real_time(pipeline: SlopePipeline) -> None:
-    """Refuse a GPU, and settings that follow the flux of a frame, which is not known before its last row."""
+    """Refuse a GPU, and settings that need the frame's own flux, which is not known before its last row."""
     if pipeline.on_device is not None:
         raise InputError(
             f"pipeline: device = {pipeline.device!r}, but the real-time engine measures on the CPU; leave "

@@ -1,8 +1,8 @@
-"""Where things are in the shared memory of ImageStreamIO (milk, cacao) and dao, checked at the door.
+"""Memory layout of the streams of ImageStreamIO (milk, cacao) and dao, with checks of their metadata.
 
-These are offsets and sizes on 64-bit Linux, as the public headers of both give them: version 2.00 of
-ImageStreamIO (ImageStruct.h), and dao's daoImageStruct.h, which has no version. A file is a block of
-metadata, the values, keywords and, in ImageStreamIO, what readers and writers tell each other.
+Offsets and sizes hold for 64-bit Linux and follow the public headers: version 2.00 of ImageStreamIO
+(ImageStruct.h), and dao's daoImageStruct.h, which has no version. A file consists of metadata, values,
+keywords and, in ImageStreamIO, the signals between readers and writers.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
 
 ISIO, DAO = "isio", "dao"
 VERSION = b"2.00"
-"""Of ImageStreamIO."""
+"""Version of ImageStreamIO."""
 SEMAPHORES, TRACES = 10, 10
-"""As both make them; entries of ImageStreamIO's table of who triggered whom."""
+"""Default numbers of semaphores and of entries in ImageStreamIO's write-trace table."""
 MOST_POSTED = {ISIO: 10, DAO: 1}
-"""A semaphore is not posted beyond."""
+"""Semaphore value up to which a publication posts."""
 TYPES = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "u8", 8: "i8", 9: "f4", 10: "f8", 13: "f2"}
 MATH_DATA = 2
 _CIRCULAR, _KINDS_OF_IMAGE, _CIRCULAR_IN_TIME = 0x1, 0xF, (0xF000F, 0x20001)
@@ -81,7 +81,7 @@ def _record(fields: Mapping[str, tuple[str, int]], size: int) -> np.dtype[np.voi
 
 COUNTER = {ISIO: _ISIO_FIELDS["cnt0"][1], DAO: _DAO_FIELDS["cnt0"][1]}
 WRITING = {ISIO: _ISIO_FIELDS["write"][1], DAO: _DAO_FIELDS["write"][1]}
-"""Byte offsets of what is looked at again and again."""
+"""Byte offsets of the flag that a write is in progress."""
 METADATA = {ISIO: _record(_ISIO_FIELDS, 384), DAO: _record(_DAO_FIELDS, 4296)}
 KEYWORD = {
     ISIO: _record({"name": ("S16", 0), "type": ("S1", 16), "value": ("i8", 24), "cnt": ("u8", 40)}, 128),
@@ -91,24 +91,24 @@ KEYWORD = {
 
 @dataclass(frozen=True)
 class Places:
-    """Byte offsets of the parts of a file; -1 for what it has not."""
+    """Byte offsets of the parts of a file; -1 for missing parts."""
 
     values: int
     keywords: int
     semaphores: int
     log_semaphore: int
     readers: int
-    """Of process numbers, one for each semaphore, int32."""
+    """Process numbers of the readers, one for each semaphore, int32."""
     writers: int
     total: int
 
 
 class IncompatibleStreamError(Exception):
-    """What is there is no stream that can be used; the text says why, after "stream NAME: "."""
+    """A stream that cannot be used; the text gives the reason, to follow "stream NAME: "."""
 
 
 def places_of(kind: str, metadata: Any) -> Places:
-    """Return where the parts of a file with these metadata are."""
+    """Return the offsets of the parts of a file with these metadata."""
     end = METADATA[kind].itemsize
 
     def take(size: int) -> int:
@@ -143,33 +143,33 @@ def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...
     -------
     places : Places
     shape : tuple of int
-        As NumPy has it, the last axis the fastest; without the slices of a circular buffer.
+        Shape in NumPy's order, the last axis the fastest; without the slices of a circular buffer.
     dtype : dtype
     circular : bool
-        Whether the slice `cnt1` is the newest.
+        Whether the stream is a circular buffer, whose newest slice is `cnt1`.
 
     Raises
     ------
     IncompatibleStreamError
-        Where something does not fit.
+        When the metadata are not those of a supported stream.
     """
     if kind == ISIO and bytes(metadata["version"]) != VERSION:
         version = bytes(metadata["version"]).decode("ascii", "replace")
-        raise IncompatibleStreamError(f"is of version {version!r}, expected {VERSION.decode()!r}")
+        raise IncompatibleStreamError(f"has version {version!r}, expected {VERSION.decode()!r}")
     axes, code = int(metadata["naxis"]), int(metadata["datatype"])
     sizes = [int(each) for each in metadata["size"][: min(axes, 3)]]
     if not 1 <= axes <= 3 or min(sizes) < 1 or math.prod(sizes) != int(metadata["nelement"]):
         raise IncompatibleStreamError(
-            f"holds {axes} axes {sizes} of {int(metadata['nelement'])} values, which is no stream"
+            f"holds {axes} axes {sizes} of {int(metadata['nelement'])} values, expected 1 to 3 axes to match"
         )
     if code not in TYPES:
         raise IncompatibleStreamError(f"holds values of type {code}, expected real numbers")
     if kind == ISIO and int(metadata["location"]) != -1:
-        raise IncompatibleStreamError("is in the memory of a GPU, expected that of the processor")
+        raise IncompatibleStreamError("is in the memory of a GPU, expected CPU memory")
     places = places_of(kind, metadata)
     if places.total != size or size > _LARGEST_BYTES:
         raise IncompatibleStreamError(
-            f"has {size} bytes, expected {places.total} for its metadata: it is of another version"
+            f"has {size} bytes, expected {places.total} from its metadata; it may have another version"
         )
     circular = kind == ISIO and axes == 3 and int(metadata["imagetype"]) & _KINDS_OF_IMAGE == _CIRCULAR
     shape = tuple(sizes[1::-1]) if circular else tuple(sizes[::-1])
@@ -177,12 +177,12 @@ def checked(kind: str, metadata: Any, size: int) -> tuple[Places, tuple[int, ...
 
 
 def path_of(kind: str, name: str) -> Path:
-    """Return the file of a stream: NAME of ImageStreamIO in its folder, a path or NAME in /tmp of dao.
+    """Return the file of a stream: NAME in ImageStreamIO's folder, or for dao a path or NAME in /tmp.
 
     Raises
     ------
     InputError
-        For a name that neither takes.
+        When the name is not valid.
     """
     if kind == DAO and "/" in name:
         path = Path(name)
@@ -196,7 +196,7 @@ def path_of(kind: str, name: str) -> Path:
 
 
 def _folder() -> Path:
-    """Where ImageStreamIO keeps its files."""
+    """Return the folder of ImageStreamIO's files."""
     chosen = os.environ.get("MILK_SHM_DIR")
     folders = [Path(chosen)] if chosen else []
     return next((each for each in (*folders, Path("/milk/shm")) if each.is_dir()), Path("/tmp"))

@@ -43,15 +43,15 @@ from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
 from faintspot.realtime.semaphores import Semaphore
 
 _NAP_S = 5e-4
-_OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # of a pipe we want nothing
+_OPEN = os.O_NONBLOCK | os.O_CLOEXEC  # never block on a named pipe
 
 
 class _Mapped:
-    """A file in memory, with its parts as arrays."""
+    """A memory-mapped stream, with its parts as arrays."""
 
     def __init__(self, kind: str, memory: mmap.mmap, places: Places, shape: tuple[int, ...]) -> None:
         self.fields = np.ndarray((), METADATA[kind], memory)
-        """Metadata; each an array that changes as others write."""
+        """Metadata as arrays, which change when other processes write."""
         self.memory, self.places = memory, places
         self.counter = np.ndarray((1,), np.int64, memory, COUNTER[kind])
         self.writing = np.ndarray((), np.uint8, memory, WRITING[kind])
@@ -60,19 +60,19 @@ class _Mapped:
         self.address = np.frombuffer(memory, np.uint8).ctypes.data
 
     def pids(self, offset: int) -> NDArray[np.int32]:
-        """Process numbers, one for each semaphore."""
+        """Return the process numbers, one for each semaphore."""
         return np.ndarray((int(self.fields["sem"]),), np.int32, self.memory, offset)
 
     def semaphore(self, number: int) -> int:
-        """Address of one in memory."""
+        """Return the address of a semaphore in memory."""
         return self.address + self.places.semaphores + SEMAPHORE_BYTES * number
 
 
 class ImageStream:
-    """A stream that another program writes, followed as `faintspot.realtime.stream.Stream`.
+    """A stream that another program writes, with the interface of `faintspot.realtime.stream.Stream`.
 
-    While it waits, it takes a semaphore of ImageStreamIO that is nobody's; of dao, whose semaphores belong
-    to nobody, it only looks at the counter. A publication's number is the counter less one.
+    To wait, it takes a free semaphore of ImageStreamIO. dao's semaphores have no owner, so for dao it only
+    polls the counter. A publication's number is the counter minus one.
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ class ImageStream:
     Raises
     ------
     FileNotFoundError
-        When there is none.
+        When the stream does not exist.
     IncompatibleStreamError
-        When there is something else.
+        When the file is not a usable stream.
     InputError
-        For a name that cannot be one.
+        When the name is not valid.
     """
 
     def __init__(self, kind: str, name: str) -> None:
@@ -101,7 +101,7 @@ class ImageStream:
             status = os.fstat(descriptor)
             size, head = status.st_size, METADATA[kind]
             if not stat.S_ISREG(status.st_mode) or size <= head.itemsize:
-                raise IncompatibleStreamError(f"{self._path} is no stream")
+                raise IncompatibleStreamError(f"{self._path} is not a stream")
             metadata = np.frombuffer(os.pread(descriptor, head.itemsize, 0), head)[0]
             places, self.shape, self.dtype, self._circular = checked(kind, metadata, size)
             access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
@@ -117,26 +117,26 @@ class ImageStream:
 
     @property
     def count(self) -> int:
-        """How much was published."""
-        count: int = load(self._mapped.counter, 0) % 2**64  # the file has it without a sign
+        """Number of publications."""
+        count: int = load(self._mapped.counter, 0) % 2**64  # unsigned in the file
         return count
 
     @property
     def number(self) -> int:
-        """Number of the newest."""
+        """Number of the newest frame."""
         return _number(self.count)
 
     @property
     def maker(self) -> str:
-        """Who made it."""
+        """Process that made the stream, in words."""
         return f"pid {self._maker}" if self._maker else str(self._path)
 
     def maker_lives(self) -> bool | None:
-        """Whether that process is there; None where it is not known."""
+        """Return whether that process is alive; None if it is not known."""
         return process_start(self._maker) >= 0 if self._maker else None
 
     def same(self) -> bool | None:
-        """Whether the name still leads here; None where it leads nowhere."""
+        """Return whether the name still leads to this stream; None if it leads nowhere."""
         try:
             status = self._path.stat()
         except OSError:
@@ -144,9 +144,9 @@ class ImageStream:
         return identity_of(status) == self._identity and status.st_size == self._size
 
     def wait(self, after: int, limit_s: float) -> bool:
-        """Wait until more was published than `after`, at most so long; return whether there was.
+        """Wait up to `limit_s` until more than `after` publications exist; return whether they do.
 
-        The counter is looked at every half millisecond, too: not every program posts semaphores.
+        The counter is also polled every half millisecond, because not every program posts semaphores.
         """
         end = time.monotonic() + limit_s
         while self.count == after:
@@ -159,10 +159,10 @@ class ImageStream:
         return True
 
     def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
-        """Return the newest publication, or None when none is whole within the time."""
+        """Return the newest publication, or None when no complete one can be read in time."""
         mapped, end = self._mapped, time.monotonic() + limit_s
         target = np.empty(self.shape, self.dtype) if out is None else out
-        while os.fstat(self._descriptor).st_size == self._size:  # memory beyond a file's end is none
+        while os.fstat(self._descriptor).st_size == self._size:  # reading beyond a file's end is fatal
             count, writing = self.count, bool(mapped.writing)
             fence()
             if not writing:
@@ -176,7 +176,7 @@ class ImageStream:
         return None
 
     def close(self) -> None:
-        """Give the semaphore back and let go."""
+        """Release the semaphore and close the stream."""
         if self._turn is not None:
             self._mapped.pids(self._mapped.places.readers)[self._turn] = 0
             self._turn = None
@@ -185,7 +185,7 @@ class ImageStream:
             self._descriptor = -1
 
     def _claimed(self) -> int | None:
-        """Put this process down as the reader of a semaphore that nobody living has."""
+        """Register this process as the reader of a semaphore that no living process has."""
         readers = self._mapped.pids(self._mapped.places.readers)
         for number, pid in enumerate(readers.tolist()):
             if pid <= 0 or process_start(pid) < 0:
@@ -195,11 +195,11 @@ class ImageStream:
 
 
 class ImageStreamWriter:
-    """A stream of ours for programs of ImageStreamIO or dao.
+    """A stream that faintspot writes for programs of ImageStreamIO or dao.
 
-    Each publication counts `cnt0` up and posts all semaphores; the keyword FRAME is the frame's number, the
-    times are when it was published (TAI, in dao Unix time). In dao a stream that is there, of the same size
-    and type, is written into, as its programs do; ImageStreamIO's is made anew.
+    Each publication increments `cnt0` and posts all semaphores. The keyword FRAME is the frame's number;
+    times are those of publication (TAI; for dao Unix time). An existing dao stream of the same size and type
+    is reused, as dao's programs do; a stream of ImageStreamIO is always recreated.
 
     Parameters
     ----------
@@ -207,13 +207,13 @@ class ImageStreamWriter:
     name : str
         See `path_of`.
     shape : (int,) or (int, int)
-        A vector is an image of one row.
+        Shape of the values; a vector becomes an image of one row.
     dtype : dtype
 
     Raises
     ------
     InputError
-        When a living process has made one of that name, something else is there, or it cannot be made.
+        When a living process made a stream of that name, the file is something else, or it cannot be made.
     """
 
     def __init__(self, kind: str, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
@@ -235,13 +235,13 @@ class ImageStreamWriter:
                 Semaphore.made(self._mapped.address + places.log_semaphore)
                 self._mapped.pids(places.readers)[:] = -1
                 self._mapped.pids(places.writers)[:] = os.getpid()
-            os.replace(hidden, self.path)  # complete before it gets its name
+            os.replace(hidden, self.path)  # never visible under its name before it is complete
         self._identity = identity_of(self.path.stat())
         self._keyword = self._keywords()
         self._semaphores = self._posted()
 
     def publish(self, values: NDArray[Any], number: int) -> None:
-        """Publish values of a frame."""
+        """Publish the values of a frame."""
         mapped, fields = self._mapped, self._mapped.fields
         mapped.writing[...] = 1
         fence()
@@ -260,7 +260,7 @@ class ImageStreamWriter:
             semaphore.post(MOST_POSTED[self.kind])
 
     def close(self) -> None:
-        """Remove the stream, unless it is somebody else's by now."""
+        """Remove the stream, unless another process has replaced it."""
         with contextlib.suppress(OSError):
             if identity_of(self.path.stat()) == self._identity:
                 self.path.unlink()
@@ -269,7 +269,7 @@ class ImageStreamWriter:
                         Semaphore.unlink(name)
 
     def _head(self, dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Metadata of a new stream."""
+        """Return the metadata of a new stream."""
         head = np.zeros((), METADATA[self.kind])
         code = next(code for code, each in TYPES.items() if np.dtype(each) == dtype)
         head["naxis"], head["size"] = 2, (*self.shape[::-1], 0)
@@ -286,7 +286,7 @@ class ImageStreamWriter:
         return head
 
     def _joined(self, wanted: NDArray[Any], there: NDArray[Any], memory: mmap.mmap) -> mmap.mmap:
-        """Return the memory of a stream that is there, where it is what is wanted."""
+        """Return the memory of an existing stream if it has the size and type that are needed."""
         sizes = [each["size"][: int(each["naxis"])].tolist() for each in (wanted, there)]
         if sizes[0] != sizes[1] or wanted["datatype"] != there["datatype"]:
             raise InputError(
@@ -296,7 +296,7 @@ class ImageStreamWriter:
         return memory
 
     def _keywords(self) -> Any:
-        """The keyword FRAME; None where somebody else's stream has no room for it."""
+        """The keyword FRAME; None if another program's stream has no keywords."""
         mapped = self._mapped
         if not mapped.fields["NBkw"]:
             return None
@@ -305,7 +305,7 @@ class ImageStreamWriter:
         return keyword
 
     def _posted(self) -> list[Semaphore]:
-        """All semaphores that a publication posts."""
+        """Semaphores that a publication posts."""
         if self.kind == DAO:
             found = [Semaphore.named(name) for name in self._names()]
             return [each for each in found if each is not None]
@@ -322,17 +322,17 @@ class ImageStreamWriter:
 
 
 def _number(count: int) -> int:
-    """Number of the frame that was published last."""
+    """Return the number of the last published frame."""
     return max(count - 1, 0) & LARGEST_NUMBER
 
 
 def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
-    """Return metadata and memory of a stream of that name, which may be replaced or joined; None without one.
+    """Return metadata and memory of a stream that may be replaced or reused; None without one.
 
     Raises
     ------
     InputError
-        When it is something else, or its maker lives.
+        When the file is something else, or its maker is alive.
     """
     try:
         descriptor = os.open(path, os.O_RDWR | _OPEN)
@@ -343,7 +343,7 @@ def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
     try:
         status, layout = os.fstat(descriptor), METADATA[kind]
         if not stat.S_ISREG(status.st_mode) or status.st_size <= layout.itemsize:
-            raise IncompatibleStreamError("is no stream")
+            raise IncompatibleStreamError("is not a stream")
         head = np.frombuffer(os.pread(descriptor, layout.itemsize, 0), layout)[0]
         checked(kind, head, status.st_size)
         memory = mmap.mmap(descriptor, status.st_size)
@@ -360,7 +360,7 @@ def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
 
 
 def _made(path: Path, size: int, head: NDArray[Any]) -> tuple[mmap.mmap, Path]:
-    """Make the file of a stream under a hidden name, with its metadata; return its memory and that name."""
+    """Make a stream's file under a hidden name, with its metadata; return its memory and that name."""
     hidden = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
         descriptor = os.open(hidden, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
@@ -381,5 +381,5 @@ def _made(path: Path, size: int, head: NDArray[Any]) -> tuple[mmap.mmap, Path]:
 
 
 def _clock() -> tuple[int, int]:
-    """Seconds and nanoseconds by the clock of ImageStreamIO."""
+    """Return seconds and nanoseconds of the clock that ImageStreamIO uses."""
     return divmod(time.clock_gettime_ns(time.CLOCK_TAI), 10**9)

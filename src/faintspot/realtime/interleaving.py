@@ -1,4 +1,4 @@
-"""Several states of the settings, in turn: comparisons on sky, where nothing stays the same for long."""
+"""Interleaved configurations: comparisons on sky, where conditions change quickly."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from faintspot.realtime.live import check_names
 
 _SET, _NONE = "set", "none"
 ARMS, FIRST_ARM, EVERY = "arms", "first_arm", "every"
-"""What a change of the interleaving is in telemetry: names, number of the first, frames of a turn."""
+"""Keys of a change of the interleaving in telemetry: names, number of the first, frames per turn."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """What differs from the settings that are set, and its name."""
+    """A configuration that takes turns: its changes of the settings, and its name."""
 
     label: str
     changes: dict[str, Any]
     denoises: bool = True
-    """False: the estimator's denoising is left out."""
+    """Whether the estimator's denoising is used."""
     control: str | None = None
-    """Its controller; None: that which is set."""
+    """Controller; None: the configured one."""
 
     def of(self, settings: Settings) -> Settings:
-        """Return what this arm makes of the settings that are set.
+        """Return the settings with this configuration's changes.
 
         Raises
         ------
         InputError
-            For changes that do not fit, and where denoising is to be left out that there is not.
+            When the changes do not fit, or the estimator has no denoising to leave out.
         """
         if self.changes:
             settings = settings.replace(**self.changes)
@@ -45,15 +45,15 @@ class Arm:
 
 @dataclass(frozen=True)
 class Interleaving:
-    """Arms that take turns.
+    """Configurations that take turns.
 
     Parameters
     ----------
     arms : tuple of Arm
     every : int
-        Frames until the next one's turn.
+        Number of frames per turn.
     first : int
-        Number of the first arm in telemetry: those of an engine's earlier interleaving keep theirs.
+        Number of the first configuration in telemetry; those of earlier interleavings keep theirs.
     """
 
     arms: tuple[Arm, ...] = (Arm("set", {}),)
@@ -63,29 +63,29 @@ class Interleaving:
     def __post_init__(self) -> None:
         number_between("every", self.every, 1, integer=True)
         if not self.arms:
-            raise InputError("interleave: expected at least one arm, got none")
+            raise InputError("interleave: expected at least one method, got none")
 
     def arm_of(self, count: int) -> int:
-        """Return whose turn it is, by its place, when so many frames have been measured."""
+        """Return the index of the configuration whose turn it is after `count` frames."""
         return count // self.every % len(self.arms)
 
     @property
     def labels(self) -> list[str]:
-        """The arms' names."""
+        """Names of the configurations."""
         return [arm.label for arm in self.arms]
 
     @classmethod
     def parse(cls, text: str, every: int = 1, first: int = 0) -> Interleaving:
-        """Return what a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml" says.
+        """Parse a text such as "none,tv" or "noise_std=1,noise_std=2+keep_brightest=20,ml".
 
-        Each arm is "set" (the settings as they are set), "none" (the same without denoising), the name of an
-        estimator, or new values of settings, NAME=VALUE, with "+" between them; after another "+" its
-        controller may follow, as in "map+kalman".
+        Each configuration is "set" (the present settings), "none" (the same without denoising), the name of
+        an estimator, or new values of settings, NAME=VALUE, joined with "+". A controller may follow after
+        another "+", as in "map+kalman".
 
         Raises
         ------
         InputError
-            For anything else.
+            When the text is anything else.
         """
         return cls(tuple(_parsed_arm(part.strip()) for part in text.split(",")), every, first)
 
@@ -93,16 +93,16 @@ class Interleaving:
 def arms_after(
     arms: Sequence[str], changes: Iterable[Mapping[str, Any]], first: int = 0
 ) -> tuple[list[str], int]:
-    """Return the names of all arms by their number in telemetry, and the number of the first that runs.
+    """Return the names of all configurations by number in telemetry, and the first active number.
 
     Parameters
     ----------
     arms : sequence of str
-        At the start.
+        Names at the start.
     changes : iterable of mapping
-        Changes as telemetry has them; those of something else count for nothing.
+        Changes from telemetry; those of other settings are ignored.
     first : int
-        Number of the first that ran before the changes.
+        Number of the first active configuration before the changes.
     """
     names = list(arms)
     for change in changes:
@@ -132,6 +132,6 @@ def _parsed_settings(text: str) -> Arm:
         return Arm(text, changes)
     known = ", ".join([_SET, _NONE, *estimators()])
     raise InputError(
-        f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, then perhaps + and "
-        f"one of {', '.join(CONTROLS)}"
+        f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, perhaps "
+        f"followed by + and one of {', '.join(CONTROLS)}"
     )

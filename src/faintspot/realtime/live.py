@@ -1,4 +1,4 @@
-"""Settings that change while the engine runs: checked and built beside it, taken between two frames."""
+"""Settings that change while the engine runs: checked and prepared meanwhile, applied between two frames."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _POLL_S = 0.001
 
 
 class HasSettings(Protocol):
-    """What is made from settings: a `SlopePipeline`, or an engine's `EnginePlan`."""
+    """Object made from settings: a `SlopePipeline` or an engine's `EnginePlan`."""
 
     @property
     def settings(self) -> Settings:
-        """From which it was made."""
+        """Settings from which it was made."""
         ...
 
     @property
     def layout(self) -> Layout:
-        """Of the sensor that it is for."""
+        """Layout of its sensor."""
         ...
 
 
@@ -48,44 +48,44 @@ class Change:
     """A change of settings that was accepted."""
 
     number: int
-    """Counts from 1."""
+    """Number of the change, from 1."""
     changes: dict[str, Any]
     """New values by name."""
     where: list[int] | None
-    """Sub-apertures that it is for; None: all."""
+    """Sub-apertures that it applies to; None: all."""
     frame_number: int | None = None
-    """First frame measured with it; None while it waits, and where a later change overtook it."""
+    """First frame measured with it; None while it waits, or if a later change replaced it before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Version(Generic[Prepared]):
-    """What was prepared from settings, and the last change that is in it."""
+    """Prepared settings, and the last change that they include."""
 
     prepared: Prepared
     change: Change
 
 
 class LiveSettings(Generic[Prepared]):
-    """The settings that an engine runs, and the changes that wait for the next frame.
+    """The running settings of an engine, and the changes that wait for the next frame.
 
-    Any thread proposes changes; they are checked and prepared there. The engine's thread takes what was
-    prepared last between two frames: it reads one attribute and waits for nobody. No change is lost: each
-    builds on all before it, whether they are running already or not.
+    Any thread may propose changes; they are checked and prepared there. Between two frames the engine's
+    thread takes the latest prepared settings: it reads one attribute and never blocks. No change is lost:
+    each one builds on all earlier ones, whether they are running already or not.
 
     Parameters
     ----------
     prepare : function
-        Makes from settings all that measures frames, ready for the first one; raises InputError for
-        settings that do not fit. Called by one thread at a time.
+        Prepares settings for the first frame; raises InputError for settings that do not fit. Called by one
+        thread at a time.
     settings : Settings
-        To begin with.
+        Initial settings.
     history_length : int
         Number of changes to remember.
 
     Raises
     ------
     InputError
-        When the first settings do not fit.
+        When the initial settings do not fit.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class LiveSettings(Generic[Prepared]):
         history_length: int = HISTORY_LENGTH,
     ) -> None:
         self._prepare = prepare
-        # Neither is ever taken by `take`.
+        # `take` takes neither of them.
         self._proposing = threading.Lock()  # held while settings are prepared, which may take seconds
-        self._lock = threading.Lock()  # of the history, and of what is newest
+        self._lock = threading.Lock()  # for the history and the newest settings
         self._under_way: tuple[dict[str, Any], float] | None = None
         first = _Version(prepare(settings), Change(0, {}, None, frame_number=-1))
         # Written with `_lock` held; read by the engine.
@@ -112,14 +112,15 @@ class LiveSettings(Generic[Prepared]):
     # The engine's thread ----------------------------------------------------------------------------
 
     def take(self, frame_number: int) -> Prepared:
-        """Return what was prepared last, with which frame `frame_number` is to be measured.
+        """Return the latest prepared settings, with which frame `frame_number` is to be measured.
 
-        To be called by one thread, between two frames. Changes that it takes are stamped with that number.
+        Call it from one thread, between two frames. The changes that it includes are stamped with that
+        number.
         """
-        newest = self._newest  # read once: a later one waits for the next frame
+        newest = self._newest  # read once: later changes wait for the next frame
         if newest is not self._running:
             newest.change.frame_number = frame_number
-            self._replaced.append(self._running)  # whose memory others give back
+            self._replaced.append(self._running)  # another thread frees its memory
             self._running = newest
         return newest.prepared
 
@@ -127,21 +128,21 @@ class LiveSettings(Generic[Prepared]):
 
     @property
     def running(self) -> Prepared:
-        """What measures frames now."""
+        """The settings that measure frames now, prepared."""
         return self._running.prepared
 
     @property
     def newest(self) -> Prepared:
-        """What was prepared last, whether the engine has taken it or not."""
+        """The latest prepared settings, whether the engine has taken them or not."""
         return self._newest.prepared
 
     @property
     def settings(self) -> Settings:
-        """The settings that run."""
+        """The running settings."""
         return self._running.prepared.settings
 
     def let_go(self) -> None:
-        """Give back the memory of what was replaced, which takes time; by any thread but the engine's."""
+        """Free replaced settings, which takes time; for any thread but the engine's."""
         self._replaced.clear()
 
     def propose(self, changes: Mapping[str, Any], where: Sequence[int] | None = None) -> Change:
@@ -152,17 +153,17 @@ class LiveSettings(Generic[Prepared]):
         changes : mapping
             New values by name.
         where : sequence of int, optional
-            Sub-apertures to change, counted from 0. Default: all.
+            Indices of the sub-apertures to change, from 0. Default: all.
 
         Returns
         -------
         Change
-            `frame_of` and `wait` tell when it took effect.
+            `frame_of` and `wait` return when it took effect.
 
         Raises
         ------
         InputError
-            When something does not fit; then nothing changes at all.
+            When something does not fit; nothing changes then.
         """
         if not isinstance(changes, Mapping) or not changes:
             raise InputError(
@@ -174,24 +175,24 @@ class LiveSettings(Generic[Prepared]):
             layout = newest.layout
             places = None if where is None else _checked_places(where, len(layout))
             settings = newest.settings.replace(where=places, **changes)
-            for name in settings.declared():  # also what the estimator does not use as it is set
+            for name in settings.declared():  # including options that the estimator does not use at present
                 settings.values(name, len(layout), layout.pixels)
             return self._offered(settings, copy.deepcopy(dict(changes)), places)
 
     def renew(self, changes: Mapping[str, Any]) -> Change:
-        """Prepare the same settings anew, because something else has changed, which is named.
+        """Prepare the same settings again because something else has changed, named in `changes`.
 
         Raises
         ------
         InputError
-            When they cannot be prepared; then nothing changes.
+            When they cannot be prepared; nothing changes then.
         """
         with self._proposing:
             return self._offered(self._newest.prepared.settings, dict(changes), None)
 
     @property
     def preparing(self) -> dict[str, Any] | None:
-        """What is being prepared, as plain values: new values by name, and for how many seconds."""
+        """Settings being prepared: new values by name, and seconds so far; None if there are none."""
         under_way = self._under_way
         if under_way is None:
             return None
@@ -199,7 +200,7 @@ class LiveSettings(Generic[Prepared]):
         return {"changes": copy.deepcopy(changes), "seconds": time.monotonic() - begin}
 
     def _offered(self, settings: Settings, changes: dict[str, Any], places: list[int] | None) -> Change:
-        """Prepare settings and let the engine take them; by the one thread that proposes."""
+        """Prepare settings and offer them to the engine; for the thread that proposes."""
         self._under_way = changes, time.monotonic()
         try:
             prepared = self._prepare(settings)
@@ -210,7 +211,7 @@ class LiveSettings(Generic[Prepared]):
         return change
 
     def offer(self, prepared: Prepared, changes: dict[str, Any], where: list[int] | None = None) -> Change:
-        """Let the engine take what is prepared already before its next frame; `changes` names what is new."""
+        """Offer prepared settings to the engine for its next frame; `changes` names the new values."""
         with self._lock:
             change = Change(self._newest.change.number + 1, changes, where)
             self._record.append(change)
@@ -218,7 +219,7 @@ class LiveSettings(Generic[Prepared]):
         return change
 
     def frame_of(self, change: Change) -> int | None:
-        """Return the first frame that a change is in; None while it waits, or when it is forgotten."""
+        """Return the first frame with a change; None while it waits, or if it is no longer in the history."""
         with self._lock:
             if self._record and change.number < self._record[0].number:
                 return change.frame_number
@@ -227,7 +228,7 @@ class LiveSettings(Generic[Prepared]):
         return frames[-1] if frames else None
 
     def wait(self, change: Change, timeout_s: float = 1.0) -> int | None:
-        """Wait until the engine has taken a change; return its frame, or None when the time is over."""
+        """Wait until the engine has taken a change; return its frame, or None on timeout."""
         end = time.monotonic() + timeout_s
         while (frame_number := self.frame_of(change)) is None and time.monotonic() < end:
             time.sleep(_POLL_S)
@@ -236,14 +237,14 @@ class LiveSettings(Generic[Prepared]):
     def history(self) -> list[tuple[int, dict[str, Any], list[int] | None]]:
         """Return the changes that took effect, oldest first: frame number, new values, sub-apertures.
 
-        Changes that came between the same two frames have the same frame number.
+        Changes between the same two frames have the same frame number.
         """
         return [(frame_number, values, where) for frame_number, _, values, where in self.taken()]
 
     def taken(self, after: int = 0) -> list[tuple[int, int, dict[str, Any], list[int] | None]]:
         """Return the changes that took effect: frame number, number, new values, sub-apertures.
 
-        Oldest first, those whose number is larger than `after`.
+        Oldest first; only changes with a number above `after`.
         """
         if after == self.change_number:
             return []
@@ -251,7 +252,7 @@ class LiveSettings(Generic[Prepared]):
         with self._lock:
             frame_number = None
             for change in takewhile(lambda each: each.number > after, reversed(self._record)):
-                # One that was overtaken took effect with the next that was taken.
+                # A replaced change took effect with the next one that was taken.
                 frame_number = frame_number if change.frame_number is None else change.frame_number
                 if frame_number is not None:
                     values, where = copy.deepcopy(change.changes), copy.copy(change.where)
@@ -260,7 +261,7 @@ class LiveSettings(Generic[Prepared]):
 
     @property
     def change_number(self) -> int:
-        """Number of the last change that is running; 0 before the first."""
+        """Number of the last running change; 0 before the first."""
         return self._running.change.number
 
     def waiting(self) -> int:
@@ -268,16 +269,16 @@ class LiveSettings(Generic[Prepared]):
         return self._newest.change.number - self._running.change.number
 
     def get(self, names: Sequence[str] | None = None) -> dict[str, Any]:
-        """Return values that run, by name (default: all), as plain numbers, texts and lists.
+        """Return running values by name (default: all) as plain numbers, texts and lists.
 
         Defaults are filled in. A setting that differs between sub-apertures is a list with one value for
-        each; None is what is not used, or not a number: found from the PSF or each frame's flux, or without
-        a limit.
+        each. None means not used, not limited, or not a fixed number: found from the PSF or from each frame's
+        flux.
 
         Raises
         ------
         InputError
-            For an unknown name.
+            When a name is unknown.
         """
         running = self.running
         n, pixels = len(running.layout), running.layout.pixels
@@ -291,12 +292,12 @@ class LiveSettings(Generic[Prepared]):
 
 
 def check_names(names: Sequence[str] | None) -> None:
-    """Refuse what is no list of names of options, of whatever estimator.
+    """Check that the names are a list of options of any estimator.
 
     Raises
     ------
     InputError
-        For an unknown name.
+        When a name is unknown.
     """
     if names is not None and (isinstance(names, str) or not isinstance(names, Sequence)):
         raise InputError(f"names = {names!r}: expected a list of settings' names")
@@ -305,19 +306,19 @@ def check_names(names: Sequence[str] | None) -> None:
 
 
 def check_shared_or_own(name: str, settings: Settings) -> None:
-    """Refuse an option that the estimator that is set does not have.
+    """Check that the configured estimator has an option.
 
     Raises
     ------
     InputError
-        It says whose it is.
+        When it has not; the message names the estimator that has it.
     """
     if name not in Settings.SHARED:
         check_option(name, type(settings.estimator))
 
 
 def _checked_places(where: Sequence[int], n: int) -> list[int]:
-    """Sub-apertures' numbers as plain ints, all of them among the n that exist."""
+    """Return the indices of sub-apertures as plain ints, after checking that they exist."""
     array = numbers_between("where", where, 0, integer=True)
     if array.ndim != 1:
         raise InputError(f"where: expected a list of sub-apertures, got shape {array.shape}")
@@ -327,7 +328,7 @@ def _checked_places(where: Sequence[int], n: int) -> list[int]:
 
 
 def _plain(settings: Settings, name: str, n: int, pixels: int) -> Any:
-    """A setting as plain values, with its default filled in."""
+    """Return a setting as plain values, with its default filled in."""
     value = settings.estimator.name if name == "estimator" else getattr(settings, name)
     if name == "steps" and isinstance(settings.estimator, Stepping):
         return settings.estimator.step_count

@@ -1,21 +1,21 @@
-"""Pixels from a camera to the engine, row by row, through a ring of frames in shared memory.
+"""Transfer of pixels from a camera to the engine, row by row, through a ring of frames in shared memory.
 
-One process writes, any number of processes of the same user read. A camera never waits for a reader;
-a reader asks afterwards (`PixelRing.intact`) whether what it used was overwritten meanwhile. One reader, the
-engine, says how far it is (`PixelRing.follow`), so that a writer that can wait loses no frame.
+One process writes; any number of processes of the same user read. A camera never waits for a reader. After
+using pixels, a reader checks with `PixelRing.intact` whether they were overwritten meanwhile. One reader, the
+engine, publishes its position (`PixelRing.follow`), so that a writer that can wait loses no frame.
 
-Memory, in bytes from the segment's start::
+Memory layout, in bytes from the start of the segment::
 
     0      header, written once, with a checksum: magic, version, creator, generation, shape, type, slots
-    128    written by the engine: arrivals it is done with, frames it lost, its process and when that started
-    256    cells, 128 bytes apart, so that no two share a cache line or the pair that is fetched with it:
-           frame that is arriving, rows of it that are complete, closed, arrivals (frames begun so far),
-           then one cell a slot: frame number (-1 while it changes hands), arrival, time of its last row
+        128    written by the engine: number of arrivals done, frames lost, its process id and start time
+        256    progress cells, 128 bytes apart to avoid sharing a cache line or a prefetched pair of lines:
+               arriving frame, its complete rows, closed, arrivals (frames begun so far),
+               then one cell per slot: frame number (-1 while it is replaced), arrival, time of its last row
     then   the slots, each of (rows, columns) pixels; frame n lies in slot n % slots
 
-Nothing is locked. The writer stores pixels first and progress afterwards, each cell as one aligned store of
-8 bytes; the reader loads progress first, and looks at the slot's cell again after its use of the pixels.
-`faintspot.kernels.ordered` keeps this order on processors that do not keep it by themselves, too.
+Nothing is locked. The writer stores pixels first and progress afterwards, each cell as one aligned 8-byte
+store. The reader loads progress first, and checks the slot's cell again after using the pixels.
+`faintspot.kernels.ordered` enforces this order on processors with weaker memory ordering.
 """
 
 from __future__ import annotations
@@ -88,16 +88,16 @@ class PixelRing:
     slots : int
         Frames in the ring.
     generation : int
-        Another number each time the ring is created.
+        Number that differs each time the ring is created.
     creator_pid : int
         Process that created it.
     cells : ndarray, int64, shape (4 + slots, 16)
-        The progress itself, for compiled readers: see `FRAME`, `SLOT_FRAME` and their
+        Progress cells for compiled readers; see `FRAME`, `SLOT_FRAME` and their
         neighbours.
     pixels : ndarray, shape (slots, rows, columns)
         All slots, read-only for a reader.
     follower : ndarray, int64, shape (4,)
-        How far the engine is.
+        Progress of the engine.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class PixelRing:
         identity: tuple[int, int],
         follower: NDArray[np.int64] | None = None,
     ) -> None:
-        """For `create` and `attach` only."""
+        """Use `create` or `attach` instead."""
         self.name, self.slots = name, header.slots
         self.shape, self.dtype = (header.rows, header.columns), np.dtype(header.dtype)
         self.generation, self.creator_pid = header.generation, header.pid
@@ -129,7 +129,7 @@ class PixelRing:
 
     @classmethod
     def create(cls, name: str, shape: tuple[int, int], dtype: DTypeLike, *, slots: int = 4) -> PixelRing:
-        """Make a ring to write into.
+        """Create a ring to write into.
 
         A ring of that name whose creator has died is replaced.
 
@@ -147,8 +147,8 @@ class PixelRing:
         Raises
         ------
         InputError
-            When a living process owns the name, or something that is not a pixel ring has it, when shared
-            memory is short, or a value is out of range.
+            When a living process owns the name, something else has it, shared memory is short, or a value is
+            out of range.
         """
         path = segment_path(name)
         header = new_header(shape, dtype, slots)
@@ -157,25 +157,25 @@ class PixelRing:
 
     @classmethod
     def attach(cls, name: str, *, follows: bool = False) -> PixelRing:
-        """Open a ring to read from; with `follows`, for the one reader that calls `follow`.
+        """Open a ring for reading; with `follows`, for the one reader that calls `follow`.
 
         Raises
         ------
         InputError
-            When there is none of that name, or it is not a whole pixel ring of this version and this user.
+            When there is no such ring, or it is not a complete pixel ring of this version and user.
         """
         return cls(name, *open_segment(segment_path(name), follows))
 
     # ---- writer
 
     def begin(self, frame_number: int | None = None) -> NDArray[Any]:
-        """Begin a frame and return its slot, (rows, columns), to fill from row 0 on.
+        """Begin a frame and return its slot, (rows, columns), to be filled from row 0 on.
 
-        `frame_number` may repeat or skip; by default it is one more than the last, from 0. A frame that
-        was begun and never ended stays incomplete.
+        `frame_number` may repeat or skip; by default it is one more than the last, from 0. A frame that is
+        not ended stays incomplete.
         """
         if not (self._writes and self._open):
-            raise InputError(f"pixel ring {self.name}: only its open creator writes into it")
+            raise InputError(f"pixel ring {self.name}: writable by its creator only, until closed")
         flat = self._flat
         number = self._look(FRAME) + 1 if frame_number is None else int(frame_number)
         if number < 0:
@@ -183,7 +183,7 @@ class PixelRing:
         slot = number % self.slots
         held = (FIRST_SLOT + slot) * _LINE
         arrival = self._look(ARRIVALS) + 1
-        # The order is the protocol: the old frame is disowned first, and the new one named last.
+        # The order is the protocol: the slot's old frame number is cleared first, the new one is set last.
         store(flat, held + SLOT_FRAME, -1)
         store(flat, held + SLOT_TIME, 0)
         store(flat, held + SLOT_ARRIVAL, arrival)
@@ -196,27 +196,29 @@ class PixelRing:
         return view
 
     def rows_ready(self, rows: int) -> None:
-        """Say that the first `rows` rows of the frame that was begun are complete."""
+        """Mark the first `rows` rows of the frame as complete."""
         number, before = self._look(FRAME), self._look(ROWS)
         if number < 0 or not before <= rows <= self.shape[0]:
-            raise InputError(f"rows = {rows}: expected {before} to {self.shape[0]} rows of a frame begun")
+            raise InputError(
+                f"rows = {rows}: expected {before} to {self.shape[0]} rows of a frame that was begun"
+            )
         if rows == self.shape[0]:
             held = FIRST_SLOT + number % self.slots
             store(self._flat, held * _LINE + SLOT_TIME, time.monotonic_ns())
         store(self._flat, ROWS * _LINE, rows)
 
     def end(self) -> None:
-        """Say that the frame that was begun is complete."""
+        """Mark the frame as complete."""
         if self._look(ROWS) < self.shape[0]:
             self.rows_ready(self.shape[0])
 
     def publish(self, frame: ArrayLike, frame_number: int | None = None) -> None:
-        """Write a whole frame, for sources that do not have it by rows.
+        """Write a whole frame, for sources that do not deliver rows.
 
         Raises
         ------
         InputError
-            When its shape is not the ring's; the ring is untouched then.
+            When its shape is not the ring's; the ring does not change then.
         """
         array = np.asarray(frame)
         if array.shape != self.shape:
@@ -226,9 +228,9 @@ class PixelRing:
 
     @property
     def followed(self) -> tuple[int, int] | None:
-        """Arrivals that the engine is done with and how many of them it lost; None where there is no engine.
+        """Arrivals that the engine has finished, and how many of them it lost; None without an engine.
 
-        It asks the operating system, as `stale` does.
+        This asks the operating system, as `stale` does.
         """
         arrivals, lost, pid, start = (load(self.follower, place) for place in range(len(self.follower)))
         return (arrivals, lost) if pid and process_lives(pid, start) else None
@@ -236,7 +238,7 @@ class PixelRing:
     # ---- reader
 
     def follow(self, arrival: int, lost: int = 0) -> None:
-        """Say that this process is done with all frames up to this arrival, and lost so many of them."""
+        """Publish that this process has finished all frames up to an arrival and has lost `lost` of them."""
         store(self.follower, LOST, lost)
         store(self.follower, FOLLOWED, arrival)
         if not self._follows:
@@ -245,25 +247,25 @@ class PixelRing:
             store(self.follower, FOLLOWER, os.getpid())
 
     def unfollow(self) -> None:
-        """Say that this process measures no more frames of this ring."""
+        """Publish that this process measures no more frames of this ring."""
         self._follows = False
         store(self.follower, FOLLOWER, 0)
 
     @property
     def arrivals(self) -> int:
-        """Frames begun since the ring was created: goes up when a frame number repeats, too."""
+        """Frames begun since the ring was created; counts up even when a frame number repeats."""
         return self._look(ARRIVALS)
 
     @property
     def closed(self) -> bool:
-        """Whether the writer has ended in order."""
+        """Whether the writer has closed the ring."""
         return bool(self._look(CLOSED))
 
     @property
     def stale(self) -> bool:
-        """Whether no more frames come: the creator is dead, or the name leads to another ring or to none.
+        """Whether no more frames come: the creator has died, or the name leads to another ring or to none.
 
-        It asks the operating system (tens of microseconds): not for every frame.
+        This asks the operating system (tens of microseconds): do not use it for every frame.
         """
         try:
             named = identity_of(os.stat(FOLDER / self.name))
@@ -272,10 +274,10 @@ class PixelRing:
         return named != self._identity or not process_lives(self.creator_pid, self._creator_start)
 
     def progress(self) -> tuple[int, int]:
-        """Return the number of the frame that is arriving, -1 before the first, and its complete rows.
+        """Return the number of the arriving frame, -1 before the first, and the number of its complete rows.
 
-        For an instant between two frames it is the last number with 0 rows: whether a frame that is no longer
-        arriving is complete, `last_row_time_ns` says.
+        Between two frames it is briefly the last number with 0 rows; use `last_row_time_ns` to see whether a
+        frame that is no longer arriving is complete.
         """
         while True:
             arrivals, frame, rows = self._look(ARRIVALS), self._look(FRAME), self._look(ROWS)
@@ -283,26 +285,26 @@ class PixelRing:
                 return frame, rows
 
     def slot(self, frame: int) -> NDArray[Any]:
-        """Return the slot in which that frame lies, or did: (rows, columns). Ask `intact` after its use."""
+        """Return the slot (rows, columns) of a frame; check with `intact` after use that it still held it."""
         view: NDArray[Any] = self.pixels[frame % self.slots]
         return view
 
     def intact(self, frame: int, arrival: int | None = None) -> bool:
-        """Whether the slot still holds that frame, complete or arriving.
+        """Return whether the slot still holds that frame, complete or arriving.
 
-        Where frame numbers may repeat, give the value that `arrival(frame)` had before the use.
+        If frame numbers may repeat, pass the value of `arrival(frame)` from before the use.
         """
         fence()  # after the last pixel was read
         return self._holds(frame, arrival)
 
     def arrival(self, frame: int) -> int:
-        """Return which arrival, from 1, put that frame into its slot; -1 when the slot does not hold it."""
+        """Return the arrival, from 1, that put a frame into its slot; -1 when the slot does not hold it."""
         slot = FIRST_SLOT + frame % self.slots
         arrival = self._look(slot, SLOT_ARRIVAL)
         return arrival if self._look(slot, SLOT_FRAME) == frame else -1
 
     def number_of(self, arrival: int) -> int:
-        """Return the number of the frame that arrived as this one, from 1; -1 when no slot holds it."""
+        """Return the frame number of an arrival, counted from 1; -1 when no slot holds it."""
         for slot in range(FIRST_SLOT, FIRST_SLOT + self.slots):
             if self._look(slot, SLOT_ARRIVAL) == arrival:
                 number = self._look(slot, SLOT_FRAME)
@@ -310,18 +312,18 @@ class PixelRing:
         return -1
 
     def last_row_time_ns(self, frame: int, arrival: int | None = None) -> int:
-        """Return when its last row was complete (CLOCK_MONOTONIC), 0 for incomplete or not held.
+        """Return when a frame's last row was complete (CLOCK_MONOTONIC), 0 if it is incomplete or not held.
 
-        Where frame numbers may repeat, `arrival` says which one is meant.
+        If frame numbers may repeat, `arrival` selects one.
         """
         moment = self._look(FIRST_SLOT + frame % self.slots, SLOT_TIME)
         return moment if self._holds(frame, arrival) else 0
 
     def wait(self, frame: int, rows: int, timeout_s: float) -> bool:
-        """Wait until the first `rows` rows of a frame are there; False when they do not come.
+        """Wait until the first `rows` rows of a frame have arrived; return False if they do not.
 
-        Spins for a moment, then sleeps in short naps. False before the time is up when the ring is closed or
-        a later frame is arriving and this one is not held, or was left incomplete.
+        Polls for a moment, then sleeps briefly between polls. Returns False early when the ring is closed, or
+        when a later frame is arriving and this one is not held or was left incomplete.
         """
         start = time.perf_counter()
         while True:
@@ -330,7 +332,7 @@ class PixelRing:
                 return True
             elapsed = time.perf_counter() - start
             if elapsed >= timeout_s or arriving > frame or self.closed:
-                # Complete just now, between the two looks above?
+                # Completed between the two checks above?
                 return bool(self.last_row_time_ns(frame))
             if elapsed > _SPIN_S:
                 time.sleep(_NAP_S)
@@ -343,12 +345,12 @@ class PixelRing:
     # ---- both
 
     def _look(self, row: int, column: int = 0) -> int:
-        """Return a cell; what its writer had written before is seen from here on."""
+        """Return a cell; everything that its writer wrote before is visible from here on."""
         value: int = load(self._flat, row * _LINE + column)
         return value
 
     def close(self) -> None:
-        """Let go of the ring; its creator also removes its name, and tells readers. Harmless when repeated.
+        """Close the ring; its creator also removes its name and notifies readers. Repeated calls do nothing.
 
         Views that are still in use keep their memory.
         """

@@ -1,4 +1,4 @@
-"""The shared-memory segment of a pixel ring: its header, who made it, making and opening it."""
+"""Shared-memory segment of a pixel ring: header, creation, opening and ownership."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from faintspot.base.errors import InputError
 from faintspot.realtime.processes import process_lives, process_start
 
 FOLDER = Path("/dev/shm")
-"""Where Linux keeps named shared memory."""
+"""Folder of named shared memory on Linux."""
 
 FRAME, ROWS, CLOSED, ARRIVALS, FIRST_SLOT = range(5)
 """Rows of `PixelRing.cells`; the value is in column 0."""
 SLOT_FRAME, SLOT_ARRIVAL, SLOT_TIME = range(3)
 """Columns of `PixelRing.cells` from row FIRST_SLOT on."""
 FOLLOWED, LOST, FOLLOWER, FOLLOWER_START = range(4)
-"""Places in `PixelRing.follower`: arrivals done with, frames lost, the engine's process (or 0), its start."""
+"""Places in `PixelRing.follower`: arrivals finished, frames lost, the engine's process (or 0), its start."""
 
 _MAGIC, _VERSION = b"fspixels", 1
 _HEADER = struct.Struct("<8sIqqQqqq8s")
 _CRC = struct.Struct("<I")
 FIRST_CELL, CELL_BYTES, _ALIGNMENT = 256, 128, 4096
 _FOLLOWER_BYTE = 128
-_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW  # of a pipe or a link we want nothing
+_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW  # neither block on a pipe nor follow a link
 _DTYPES = ("u1", "u2", "u4", "i2", "i4", "f4", "f8")
 _LARGEST_SIDE, _LARGEST_RING = 1 << 16, 1 << 36
 
 
 @dataclass(frozen=True)
 class Header:
-    """What is written once: whose segment it is and what lies where.
+    """Header of a segment, written once: its creator and its contents.
 
-    `pid` and `start` are the creator's, see `process_start`; `generation` is another number each time.
+    `pid` and `start` identify the creator, see `process_start`; `generation` differs each time.
     """
 
     pid: int
@@ -57,19 +57,21 @@ class Header:
     dtype: str
 
     def pack(self) -> bytes:
-        """Return it as bytes, with its checksum."""
+        """Return the header as bytes, with its checksum."""
         values = (self.pid, self.start, self.generation, self.rows, self.columns, self.slots)
         body = _HEADER.pack(_MAGIC, _VERSION, *values, self.dtype.encode("ascii"))
         return body + _CRC.pack(zlib.crc32(body))
 
     @classmethod
     def unpack(cls, raw: bytes, where: str) -> Header:
-        """Read a header; InputError for what is not one."""
+        """Read a header; raise InputError if it is not valid."""
         if len(raw) < _HEADER.size + _CRC.size or raw[:8] != _MAGIC:
-            raise InputError(f"{where}: is not a pixel ring; take another name")
+            raise InputError(f"{where}: is not a pixel ring; choose another name")
         _magic, version, pid, start, generation, rows, columns, slots, dtype = _HEADER.unpack_from(raw)
         if version != _VERSION:
-            raise InputError(f"{where}: is a pixel ring of version {version}, expected version {_VERSION}")
+            raise InputError(
+                f"{where}: pixel ring has version {version}, expected {_VERSION}; restart its writer"
+            )
         if _CRC.unpack_from(raw, _HEADER.size)[0] != zlib.crc32(raw[: _HEADER.size]):
             raise InputError(f"{where}: the header of this pixel ring is damaged")
         pixel = dtype.rstrip(b"\0").decode("ascii")
@@ -96,24 +98,24 @@ def _up_to(size: int, multiple: int) -> int:
 
 
 def identity_of(status: os.stat_result) -> tuple[int, int]:
-    """Return what tells two segments apart; not used again as long as somebody maps the first."""
+    """Return a segment's identity, which is not reused while a process maps the segment."""
     return status.st_dev, status.st_ino
 
 
 def segment_path(name: str) -> Path:
-    """Check machine and name; return where the segment is."""
+    """Check the system and the name; return the path of a segment."""
     if not FOLDER.is_dir():
-        raise InputError(f"pixel ring: expected shared memory at {FOLDER}, which Linux has")
+        raise InputError(f"pixel ring: expected shared memory at {FOLDER} (Linux)")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,199}", name):
         raise InputError(f"name = {name!r}: expected up to 200 letters, digits, '_', '-' and '.'")
     return FOLDER / name
 
 
 def new_header(shape: tuple[int, int], dtype: DTypeLike, slots: int) -> Header:
-    """Check what a ring is to be; return the header of one that this process creates."""
+    """Check the parameters of a ring; return the header for one that this process creates."""
     sides = numbers_between("shape", shape, 1, _LARGEST_SIDE, integer=True)
     if sides.shape != (2,):
-        raise InputError(f"shape: expected rows and columns, got shape {sides.shape}")
+        raise InputError(f"shape: expected (rows, columns), got shape {sides.shape}")
     pixel = np.dtype(dtype)
     if pixel.str[1:] not in _DTYPES or not pixel.isnative:
         raise InputError(f"dtype = {pixel.str}: expected one of {', '.join(_DTYPES)}, native byte order")
@@ -123,20 +125,20 @@ def new_header(shape: tuple[int, int], dtype: DTypeLike, slots: int) -> Header:
         pid, process_start(pid), secrets.randbits(64), int(sides[0]), int(sides[1]), count, pixel.str
     )
     if header.total_bytes > _LARGEST_RING:
-        raise InputError(f"shape = {tuple(sides.tolist())}, slots = {count}: larger than 64 GiB")
+        raise InputError(f"shape = {tuple(sides.tolist())}, slots = {count}: expected at most 64 GiB")
     return header
 
 
 def create_segment(path: Path, header: Header) -> tuple[mmap.mmap, tuple[int, int]]:
-    """Make a segment with its header and no frame in it; return its memory and identity.
+    """Create a segment with its header and no frames; return its memory and identity.
 
     Raises
     ------
     InputError
-        When a living process has one of that name, or something else has, or shared memory is short.
+        When a living process or another object has the name, or shared memory is short.
     """
     _remove_dead(path)
-    # Complete before it gets its name: nobody ever sees half of one.
+    # Never visible under its name before it is complete.
     unnamed = FOLDER / f".{path.name}.{secrets.token_hex(8)}"
     try:
         descriptor = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
@@ -154,26 +156,26 @@ def create_segment(path: Path, header: Header) -> tuple[mmap.mmap, tuple[int, in
             os.unlink(unnamed)
             os.close(descriptor)
     except FileExistsError:
-        raise InputError(f"{path}: another process made this pixel ring at the same moment") from None
+        raise InputError(f"{path}: another process is creating this pixel ring at the same time") from None
     except OSError as error:
         size = f"{header.total_bytes / 2**20:.1f} MiB"
-        raise InputError(f"{path}: cannot be made, {size} ({error.strerror or error})") from None
+        raise InputError(f"{path}: cannot be created, {size} ({error.strerror or error})") from None
 
 
 def open_segment(path: Path, follows: bool) -> tuple[mmap.mmap, Header, tuple[int, int], NDArray[np.int64]]:
     """Open a segment read-only; return its memory, header, identity and the follower's cells.
 
-    With `follows` the follower's cells can be written.
+    With `follows`, the follower's cells are writable.
 
     Raises
     ------
     InputError
-        When there is none of that name, or it is not a whole pixel ring of this version and this user.
+        When there is no such segment, or it is not a complete pixel ring of this version and user.
     """
     try:
         descriptor = os.open(path, _READ | os.O_RDWR if follows else _READ)
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no pixel ring of that name; is the camera running?") from None
+        raise InputError(f"{path}: no such pixel ring; start the camera first") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror or error})") from None
     try:
@@ -189,7 +191,7 @@ def open_segment(path: Path, follows: bool) -> tuple[mmap.mmap, Header, tuple[in
 
 
 def follower_of(memory: mmap.mmap) -> NDArray[np.int64]:
-    """Return the cells in which the engine that follows says how far it is."""
+    """Return the cells in which the engine publishes its progress."""
     return np.ndarray(4, np.int64, memory, offset=_FOLLOWER_BYTE)
 
 
@@ -203,7 +205,7 @@ def _checked_header(path: Path, descriptor: int) -> Header:
     """Read the header of an open segment and check that it is private."""
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path}: is not a pixel ring; take another name")
+        raise InputError(f"{path}: is not a pixel ring; choose another name")
     if status.st_uid != os.geteuid() or status.st_mode & 0o077:
         raise InputError(f"{path}: expected a segment that only you can open")
     header = Header.unpack(os.pread(descriptor, FIRST_CELL, 0), str(path))
@@ -211,7 +213,7 @@ def _checked_header(path: Path, descriptor: int) -> Header:
 
 
 def _remove_dead(path: Path) -> None:
-    """Remove the ring of a dead creator; refuse a living one's, and what is not a pixel ring."""
+    """Remove the ring of a dead creator; refuse a living one's, and anything else."""
     try:
         descriptor = os.open(path, _READ)
     except FileNotFoundError:
@@ -219,11 +221,11 @@ def _remove_dead(path: Path) -> None:
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror or error})") from None
     try:
-        header = _checked_header(path, descriptor)  # first: another user's could be locked for good
-        # Of several that find it dead, one removes it; the others then see that the name leads elsewhere.
+        header = _checked_header(path, descriptor)  # another user's file could stay locked
+        # If several processes find it dead, one removes it; the others see that the name leads elsewhere.
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         if process_lives(header.pid, header.start):
-            raise InputError(f"{path}: process {header.pid} writes into this pixel ring already")
+            raise InputError(f"{path}: process {header.pid} already writes into this pixel ring")
         with suppress(FileNotFoundError):
             if identity_of(path.stat()) == identity_of(os.fstat(descriptor)):
                 path.unlink()

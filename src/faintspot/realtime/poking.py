@@ -1,4 +1,4 @@
-"""Poking a mirror through its command stream while an engine measures."""
+"""Poke a mirror through its command stream while an engine measures."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ Floats = NDArray[np.float64]
 
 _POLL_S = 5e-4
 _NO_FRAMES_S = 5.0
-_NOTICED_S = 0.5  # after which whoever drives the mirror has found a stream that is new
+_NOTICED_S = 0.5  # time for the mirror's driver to find a new stream
 
 
 class StreamedMirror(Closing):
-    """A mirror that follows NAME_commands, and an engine NAME without control that sees it.
+    """A mirror that reads NAME_commands, and an engine NAME without control that measures its effect.
 
-    As a context manager it leaves the mirror flat and the stream removed. It is a `PokedMirror`.
+    As a context manager it flattens the mirror at the end and removes the stream. It is a `PokedMirror`.
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     commands : int
-        Of the mirror.
+        Number of the mirror's commands.
     settle_frames : int
-        Frames after a command is sent that are not looked at: it acts later, and from then on.
+        Frames to skip after a command is sent, until it takes effect.
     frames : int
-        That are averaged then.
+        Frames to average then.
 
     Raises
     ------
     InputError
-        When no engine of that name runs, it makes commands itself, or another process sends commands.
+        When no such engine runs, it makes commands itself, or another process sends commands.
     """
 
     def __init__(self, name: str, commands: int, *, settle_frames: int = 3, frames: int = 2) -> None:
@@ -48,20 +48,20 @@ class StreamedMirror(Closing):
         self._frames = int(number_between("frames", frames, 2, 100_000, integer=True))
         self._name, self._reader = name, TelemetryReader.attach(name)
         if self._reader.stale:
-            raise InputError(f"the engine {name} has ended; faintspot realtime run starts one")
+            raise InputError(f"the engine {name} has ended; start one with faintspot realtime run")
         if self._reader.description.get("commands"):
             raise InputError(
                 f"the engine {name} makes commands itself; start it with faintspot realtime run --no-control"
             )
         reference = self._reader.description.get("reference")
         self.reference: Floats = np.zeros(2 * len(self._reader.layout)) if reference is None else reference
-        """What the engine subtracts already, (2 n,), px."""
+        """Reference slopes that the engine subtracts, (2 n,), px."""
         self._stream = create_stream(f"{name}_commands", (self.commands,))
         self._send(np.zeros(self.commands))
         time.sleep(_NOTICED_S)
 
     def close(self) -> None:
-        """Leave the mirror flat, and remove the stream when it has had time to see that."""
+        """Flatten the mirror, and remove the stream after the mirror has had time to read it."""
         self._send(np.zeros(self.commands))
         newest = self._reader.newest
         end = time.monotonic() + 1.0
@@ -71,7 +71,7 @@ class StreamedMirror(Closing):
         self._reader.close()
 
     def slopes(self, command: Floats) -> tuple[Floats, NDArray[np.uint8]]:
-        """See `PokedMirror`.
+        """Measure the slopes of a command; see `PokedMirror`.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Predicted slopes from another program, by a pyshmem stream: the prior of estimators that take one."""
+"""Slopes predicted by another program and read from a pyshmem stream, as the prior of estimators."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ import numpy as np
 from faintspot.realtime.prior import Prior
 from faintspot.realtime.shared_streams import lock_file, pyshmem_module
 
-_READ_S = 2e-4  # for a writer that is writing at this moment
+_READ_S = 2e-4  # to wait for a writer in the middle of a publication
 
 
 @dataclass(slots=True)
 class PredictionCounters:
-    """What has come; plain numbers, changed in place."""
+    """Counters of received predictions, changed in place."""
 
     taken: int = 0
-    """Frames that were measured around what was predicted for them."""
+    """Frames that were measured with their prediction."""
     late: int = 0
-    """Frames whose prediction was not there when their first row came: their prior was 0."""
+    """Frames whose prediction had not come when their first row arrived; their prior was 0."""
     refused: int = 0
-    """Predictions with a mean that was not finite, or larger than any frame; the prior was 0."""
+    """Predictions whose mean was not finite or too large; the prior was 0."""
     restarts: int = 0
-    """How often the stream was removed or made anew."""
+    """Number of times that the stream was removed or recreated."""
 
 
 class PredictionStream:
-    """The stream NAME_prediction, floats: 2 n slopes, px, their 2 n variances, the number of the frame.
+    """The stream NAME_prediction of floats: 2 n slopes [px], their 2 n variances, the frame number.
 
-    Slopes are all x, then all y, as the engine publishes them. A variance that is not a positive number says
-    nothing: there the estimator's prior is as wide as its settings say (`prior_std_px`).
+    Slopes are all x, then all y, as the engine publishes them. A variance that is not a positive number means
+    unknown: the estimator's prior then has the width from its settings (`prior_std_px`).
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     prior : Prior
-        Where to put them.
+        Prior that receives the predictions.
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     """
 
     def __init__(self, name: str, prior: Prior) -> None:
@@ -57,7 +57,7 @@ class PredictionStream:
         self.look_after()
 
     def fill(self, number: int) -> None:
-        """Put in the prediction for a frame, nothing where there is none; by the engine's thread."""
+        """Set the prior to the prediction for a frame, or to none; for the engine's thread."""
         self._prior.forget()
         source, counters = self._source, self.counters
         if source is None or not source.count:
@@ -65,7 +65,7 @@ class PredictionStream:
             return
         try:
             values = source.read(timeout=_READ_S)
-        except Exception:  # a writer that died in the middle, a stream that was closed meanwhile
+        except Exception:  # the writer died, or the stream was closed meanwhile
             counters.late += 1
             return
         if values[-1] != number:
@@ -79,7 +79,7 @@ class PredictionStream:
         self._prior.expect(mean, np.sqrt(np.maximum(variance, 0.0)))
 
     def look_after(self) -> None:
-        """See whether the stream is the same, and look for one where there is none; by any other thread."""
+        """Check whether the stream is the same, and try to open a missing one; for any other thread."""
         source = self._source
         try:
             there = self._pyshmem.stat(self.stream)["instance_id"]
@@ -96,18 +96,18 @@ class PredictionStream:
             self._open()
 
     def status(self) -> dict[str, Any]:
-        """Return what there is to say, as plain values."""
+        """Return the stream's state as plain values."""
         return {"stream": self.stream, "obstacle": self.obstacle, **asdict(self.counters)}
 
     def close(self) -> None:
-        """Let go of the stream."""
+        """Close the stream."""
         source, self._source = self._source, None
         if source is not None:
             with contextlib.suppress(Exception):
                 source.close()
 
     def _open(self) -> None:
-        lock_file(self.stream)  # refuses a place that is not private
+        lock_file(self.stream)  # refuse a folder that is not private
         try:
             source = self._pyshmem.open(self.stream, gpu_device=False)
         except (OSError, ValueError) as error:

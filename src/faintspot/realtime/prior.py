@@ -1,4 +1,4 @@
-"""What estimators with a prior are told of the coming frame's slopes."""
+"""Prior of the coming frame's slopes for estimators that use one."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 SMALLEST_STD_PX, LARGEST_STD_PX = 1e-6, 1e4
-"""Of a prior."""
+"""Smallest and largest standard deviation of a prior [px]."""
 
 
 class Prior:
-    """Predicted slopes and how sure they are, for one frame after the other, in memory that stays.
+    """Predicted slopes and their uncertainty for each frame in turn, in fixed memory.
 
     Parameters
     ----------
     n : int
         Number of sub-apertures.
     largest_px : float
-        Beyond which no slope is.
+        Largest possible slope.
 
     Attributes
     ----------
     mean_px : (1, 2, n) float32
-        0 where nothing is expected.
+        Predicted slopes; 0 where there is no prediction.
     std_px : (n,) float64
-        Along each axis; NaN: not known, so that the settings' `prior_std_px` counts.
+        Standard deviation along each axis; NaN: unknown, so that the settings' `prior_std_px` applies.
     changes : int
-        How often `std_px` has changed.
+        Number of changes of `std_px`.
     """
 
     def __init__(self, n: int, largest_px: float = math.inf) -> None:
@@ -42,20 +42,20 @@ class Prior:
         self._given: Floats | None = None
 
     def forget(self) -> None:
-        """Expect nothing."""
+        """Remove the prediction."""
         self._mean[:] = 0.0
         self._take_std(None)
 
     def expect(self, mean_px: Floats, std_px: Floats | None = None) -> None:
-        """Expect slopes; single ones that no frame can hold count as not expected.
+        """Set predicted slopes; values that no frame can have count as no prediction.
 
         Parameters
         ----------
         mean_px : (2 n,) array
         std_px : (2 n,) array, optional
-            How sure they are; an array that is given again still holds the same. Estimators have one width
-            along both axes: the rms of both. Where one is not between `SMALLEST_STD_PX` and
-            `LARGEST_STD_PX`, it is not known.
+            Standard deviations; the same array given again must hold the same values. Estimators have one
+            width for both axes: the rms of both. A width outside `SMALLEST_STD_PX` to `LARGEST_STD_PX` counts
+            as unknown.
         """
         self._mean[:] = 0.0
         np.copyto(self._mean, mean_px, where=np.abs(mean_px) <= self.largest_px, casting="same_kind")

@@ -1,4 +1,4 @@
-"""A Unix socket that only one user can open, and that one living server holds."""
+"""A Unix socket that only one user can open, and that at most one living server holds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from faintspot.base.errors import InputError
 
 _BACKLOG = 64
-_LONGEST_PATH = 107  # bytes, of a Unix socket on Linux
+_LONGEST_PATH = 107  # bytes; limit for Unix sockets on Linux
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _PREFIX, _SUFFIX = "faintspot-", ".sock"
 ENGINE, TELESCOPE = "engine", "telescope"
@@ -23,15 +23,15 @@ _TELESCOPE_SUFFIX = f"+{TELESCOPE}"  # no name has a "+"
 
 
 def socket_path(name: str, kind: str = ENGINE) -> Path:
-    """Return where the engine, or telescope, of that name listens: in a folder that only this user can open.
+    """Return the socket path of an engine or telescope, in a folder that only this user can open.
 
-    $XDG_RUNTIME_DIR/faintspot-NAME.sock, or, where that is not a folder of the user's, in a private one in
-    the temporary directory, which the server makes.
+    $XDG_RUNTIME_DIR/faintspot-NAME.sock if that folder belongs to the user, else a path in a private folder
+    that the server makes in the temporary directory.
 
     Raises
     ------
     InputError
-        For a name that is not made of letters, digits, "_", "." and "-".
+        When the name contains anything but letters, digits, "_", "." and "-".
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InputError(
@@ -40,7 +40,7 @@ def socket_path(name: str, kind: str = ENGINE) -> Path:
         )
     folder = Path(tempfile.gettempdir()) / f"faintspot-{os.geteuid()}"
     runtime = os.environ.get("XDG_RUNTIME_DIR")
-    # After a change of user the variable may still name the other one's folder.
+    # After a change of user the variable may still name the other user's folder.
     if runtime and os.path.isdir(runtime) and os.stat(runtime).st_uid == os.geteuid():
         folder = Path(runtime)
     kind_suffix = _TELESCOPE_SUFFIX if kind == TELESCOPE else ""
@@ -48,7 +48,7 @@ def socket_path(name: str, kind: str = ENGINE) -> Path:
 
 
 def server_of(path: Path) -> tuple[str, str]:
-    """Return what listens there, an engine or a telescope, and its name; any other path is its own name."""
+    """Return the kind (engine or telescope) and name of a socket's server; other paths are their own name."""
     name = path.name
     if not (name.startswith(_PREFIX) and name.endswith(_SUFFIX)):
         return ENGINE, str(path)
@@ -59,17 +59,17 @@ def server_of(path: Path) -> tuple[str, str]:
 
 
 def locked_beside(path: Path) -> int:
-    """Make the folder, and lock the file beside the socket that says that a server lives here.
+    """Make the folder, and lock the file beside the socket that marks a living server.
 
     Returns
     -------
     int
-        The lock file's descriptor; closing it, or the end of the process, gives the lock back.
+        Descriptor of the lock file; closing it, or the end of the process, releases the lock.
 
     Raises
     ------
     InputError
-        When another server holds it, or the folder is not private.
+        When another server holds the lock, or the folder is not private.
     """
     if len(os.fsencode(path)) > _LONGEST_PATH:
         raise InputError(f"{path}: expected a socket's path of at most {_LONGEST_PATH} bytes")
@@ -82,18 +82,18 @@ def locked_beside(path: Path) -> int:
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(lock_file), os.stat(lock_path(path))):
                     return lock_file
-            os.close(lock_file)  # a server that closed removed it between opening and locking
+            os.close(lock_file)  # a closing server removed it between opening and locking
     except OSError as error:
         raise InputError(f"{path}: cannot listen there: {error.strerror}") from None
 
 
 def lock_path(path: Path) -> Path:
-    """Return the lock file of a socket; only who holds the lock may remove it."""
+    """Return the lock file of a socket; only the holder of the lock may remove it."""
     return path.with_name(f"{path.name}.lock")
 
 
 def _locked(path: Path) -> int:
-    """Open and lock the lock file; the system gives the lock back however the process ends."""
+    """Open and lock the lock file; the system releases the lock however the process ends."""
     lock_file = os.open(lock_path(path), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -101,24 +101,24 @@ def _locked(path: Path) -> int:
         os.close(lock_file)
         kind, name = server_of(path)
         article = "an" if kind == ENGINE else "a"
-        raise InputError(f"{article} {kind} runs under the name {name} already") from None
+        raise InputError(f"{article} {kind} is already running under the name {name}") from None
     return lock_file
 
 
 def _check_private(folder: Path) -> None:
-    """Refuse a folder in which others could put a socket in this one's place."""
+    """Refuse a folder in which another user could replace the socket."""
     status = os.lstat(folder)
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o022:
         raise InputError(f"{folder}: expected a folder of your own that nobody else may write to")
 
 
 def bound_listener(path: Path) -> socket.socket:
-    """Return the listening socket; what a dead server left is replaced. To be called with the lock held.
+    """Return the listening socket, replacing one that a dead server left. Call it with the lock held.
 
     Raises
     ------
     InputError
-        When something else than a socket lies there, or none can be made.
+        When the path is not a socket, or none can be made.
     """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -140,6 +140,6 @@ def bound_listener(path: Path) -> socket.socket:
 
 
 def peer_uid(connection: socket.socket) -> int:
-    """Return the user at the other end, as the kernel says."""
+    """Return the user at the other end, as the kernel reports."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("iII"))
     return int(struct.unpack("iII", credentials)[1])

@@ -15,6 +15,6 @@ class Publication(NamedTuple):
 
     values: NDArray[Any]
     number: int
-    """Frame number that the producer gave."""
+    """Frame number given by the producer."""
     total: int
     """Number of publications up to this one."""

@@ -1,4 +1,4 @@
-"""The way of one frame through the engine with an estimator in NumPy, which cannot hold up the engine."""
+"""Frame path for an estimator in NumPy, which runs in its own thread and cannot stall the engine."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ from faintspot.realtime.time_limit import call_is_under_way, end_thread
 from faintspot.realtime.trial_frames import trial_frames, typical_frame
 
 BUDGET_S = 1e-3
-MOST_FAILURES = 3  # frames in a row that fail, or take longer than the budget
-LONGEST_BUDGETS = 10  # after so many, a frame is not waited for any more;
-_PATIENT_BUDGETS = 100  # unless it is not the estimator that holds it up
+MOST_FAILURES = 3  # consecutive frames that fail or exceed the budget
+LONGEST_BUDGETS = 10  # longest wait for a frame, in budgets
+_PATIENT_BUDGETS = 100  # the same while a trial delays all threads
 _TIMED_CALLS = 10
 
 Found = Positions | str
-"""Positions, or the error of a frame in which the estimator failed."""
+"""Positions, or the error message of a frame in which the estimator failed."""
 
 
 class PythonPath(FramePath):
-    """Measures frames with an estimator in NumPy, which runs in a thread of its own.
+    """Measurement of frames with an estimator in NumPy, which runs in its own thread.
 
-    A frame in which the estimator fails is flagged: all its slopes are invalid. `fault` is set, and all later
-    frames are flagged, when three frames in a row fail or take longer than the budget, or when the estimator
-    does not return within ten budgets. Its thread is then asked to end.
+    A frame in which the estimator fails is flagged: all its slopes are invalid. If three consecutive frames
+    fail or exceed the budget, or the estimator does not return within ten budgets, `fault` is set and all
+    later frames are flagged. Its thread is then asked to end.
 
     Parameters
     ----------
     pipeline : SlopePipeline
-        With an estimator that has `locate`.
+        Pipeline with an estimator that has `locate`.
     *arguments, **options
         As for `FramePath`.
     budget_s : float
-        Longest time of the estimator in a frame.
+        Time limit of the estimator for one frame.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PythonPath(FramePath):
         return True
 
     def _find_positions(self) -> Found:
-        """Have the estimator's thread find the positions; set `fault` when it is given up."""
+        """Get the positions from the estimator's thread; set `fault` when the estimator is disabled."""
         zero, prior = self._prepared.sensor.zero, self._prior
         self._requests.put(zero.copy() if prior is None else zero + prior.mean_px[0].T)
         begin = time.perf_counter()
@@ -105,7 +105,7 @@ class PythonPath(FramePath):
         return fault
 
     def _reply(self, begin: float) -> tuple[Found, float]:
-        """Wait for what the estimator's thread finds; longer while a trial holds up all threads."""
+        """Wait for the result of the estimator's thread; wait longer while a trial delays all threads."""
         timeout_s, end = LONGEST_BUDGETS * self._budget_s, begin + _PATIENT_BUDGETS * self._budget_s
         while True:
             try:
@@ -119,13 +119,13 @@ class PythonPath(FramePath):
 def tried(
     make_pipeline: Callable[[Settings], SlopePipeline], settings: Settings, budget_s: float = math.inf
 ) -> SlopePipeline:
-    """Return a pipeline that has measured frames without flux, with spots, of noise and of saturated pixels.
+    """Return a pipeline after measuring trial frames: without flux, with spots, of noise, and saturated.
 
     Raises
     ------
     InputError
-        When the settings do not fit, when the estimator fails, or when each of ten typical frames takes it
-        longer than the budget.
+        When the settings do not fit, the estimator fails, or each of ten typical frames takes it longer than
+        the budget.
     """
     pipeline = make_pipeline(settings)
     check_real_time(pipeline)
@@ -161,11 +161,11 @@ def _serve(
     requests: SimpleQueue[NDArray[np.float64] | None],
     replies: SimpleQueue[tuple[Found, float]],
 ) -> None:
-    """Find positions in the images for every request, the predicted positions; None ends the thread.
+    """Find the positions in the images for each request (the predicted positions); None ends the thread.
 
-    It has no real-time priority, with which an estimator that does not return would keep a processor.
+    It runs without real-time priority: otherwise an estimator that does not return would block a processor.
     """
-    with contextlib.suppress(OSError, AttributeError):  # not on every system
+    with contextlib.suppress(OSError, AttributeError):  # not available on every system
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     while (prior := requests.get()) is not None:
         begin = time.perf_counter()

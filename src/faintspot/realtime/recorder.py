@@ -1,7 +1,7 @@
-"""Recording: from the engine's telemetry to a Zarr store, in a process of its own.
+"""Recording of the engine's telemetry to a Zarr store, in a separate process.
 
-The engine does not know of it: a recorder that is too slow, or whose disk is full, loses records and nobody
-waits for it.
+The engine is independent of it: a recorder that is too slow, or whose disk is full, loses records and delays
+nothing.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from faintspot.realtime.telemetry import TelemetryReader
 
 _POLL_S = 0.01
 _FLUSH_S = 1.0
-_FLUSH_BYTES = 1 << 26  # what waits in memory is written when it is so much
-_STALE_S = 0.25  # between two questions whether the engine lives
-_MOST_RECORDS, _MOST_IMAGES = 1024, 4  # in one go
+_FLUSH_BYTES = 1 << 26  # amount of buffered data that is written at once
+_STALE_S = 0.25  # between two checks whether the engine is alive
+_MOST_RECORDS, _MOST_IMAGES = 1024, 4  # read at once
 
 
 @dataclass(frozen=True)
 class RecordingReport:
-    """What a recording has come to.
+    """Result of a recording.
 
     Attributes
     ----------
     frames, images, changes : int
-        In the store.
+        Numbers in the store.
     dropped, dropped_images, dropped_changes : int
-        Overwritten in shared memory before they were read: reading or writing was too slow.
+        Numbers overwritten in shared memory before they were read: reading or writing was too slow.
     seconds : float
     longest_write_s : float
-        Of one writing to the disk, during which nothing is read.
+        Longest single write to the disk; nothing is read meanwhile.
     ended_because : str
         "frames", "seconds", "stopped" or "engine ended".
     """
@@ -60,11 +60,11 @@ class RecordingReport:
 
 @dataclass
 class _Waiting:
-    """What was read and is not in the store yet, and how far reading has come."""
+    """Data read but not yet stored, and the positions in the rings."""
 
     record_cursor: int
     image_cursor: int
-    change_cursor: int = 0  # all that there are: they tell the settings at the start
+    change_cursor: int = 0  # from the first one, to know the settings at the start
     records: list[NDArray[Any]] = field(default_factory=list)
     images: list[NDArray[Any]] = field(default_factory=list)
     changes: list[dict[str, Any]] = field(default_factory=list)
@@ -75,7 +75,7 @@ class _Waiting:
     n_bytes: int = 0
 
     def read(self, reader: TelemetryReader, limit: int) -> bool:
-        """Read what there is, up to so many frames in all; return whether there was anything."""
+        """Read what is available, up to `limit` frames in total; return whether there was anything."""
         most = min(limit - self.frames_read, _MOST_RECORDS)
         records, self.record_cursor, dropped = reader.records_since(self.record_cursor, most)
         images, self.image_cursor, dropped_images = reader.images_since(self.image_cursor, _MOST_IMAGES)
@@ -92,14 +92,14 @@ class _Waiting:
         return bool(len(records) or len(images))
 
     def taken(self, reader: TelemetryReader) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return records and images that wait, and forget them."""
+        """Return the buffered records and images, and clear the buffers."""
         records = np.concatenate([np.empty(0, reader.record_type), *self.records])
         images = np.concatenate([np.empty(0, reader.image_type), *self.images])
         self.records, self.images, self.n_bytes = [], [], 0
         return records, images
 
     def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
-        """What a store's attributes say of it."""
+        """Return the store's attributes."""
         return {
             "arms": arms_after(reader.description["arms"], self.changes)[0],
             "changes": self.changes,
@@ -110,19 +110,19 @@ class _Waiting:
 
 
 class Recorder:
-    """Records the telemetry of a running engine to a new Zarr store.
+    """Recorder of a running engine's telemetry to a new Zarr store.
 
     Parameters
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     path : path
-        Of the store, a directory that does not exist yet.
+        Path of the store, a directory that does not exist yet.
 
     Raises
     ------
     InputError
-        When no such engine gives telemetry, or the store cannot be made.
+        When no such engine publishes telemetry, or the store cannot be made.
     """
 
     def __init__(self, name: str, path: str | Path) -> None:
@@ -147,9 +147,9 @@ class Recorder:
         stop: StopEvent | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> RecordingReport:
-        """Record from now on, until one of the limits is reached, `stop` is set or the engine ends.
+        """Record until a limit is reached, `stop` is set or the engine ends.
 
-        Everything that was read is in the store then; while it runs, all but the last second.
+        At the end everything that was read is in the store; while it runs, all but the last second.
 
         Parameters
         ----------
@@ -162,8 +162,8 @@ class Recorder:
         Raises
         ------
         InputError
-            When a limit is out of its range. When the disk is full or not writable: what was written
-            before can be read.
+            When a limit is out of its range, or the disk is full or not writable. Data written before remain
+            readable.
         """
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
         duration = np.inf if seconds is None else number_between("seconds", seconds, 0, low_open=True)
@@ -177,7 +177,7 @@ class Recorder:
                 ended = "seconds"
             elif stop is not None and stop.is_set():
                 ended = "stopped"
-            elif gone and not something:  # all that it left behind has been read
+            elif gone and not something:  # all remaining data has been read
                 ended = "engine ended"
             if progress is not None:
                 progress(waiting.frames_read)
@@ -190,20 +190,20 @@ class Recorder:
         return self._report(time.monotonic() - start, ended)
 
     def _gone(self) -> bool:
-        """Whether the engine has ended; asked now and then."""
+        """Return whether the engine has ended; checks only now and then."""
         if time.monotonic() - self._asked_at < _STALE_S:
             return False
         self._asked_at = time.monotonic()
         return self._reader.stale
 
     def _write_in_turn(self) -> None:
-        """Write what waits when it is time, or when it is much."""
+        """Write the buffered data if it is time, or if there is much of it."""
         if time.monotonic() - self._written_at > _FLUSH_S or self._waiting.n_bytes > _FLUSH_BYTES:
             self._write({})
             self._written_at = time.monotonic()
 
     def _write(self, attributes: dict[str, Any]) -> None:
-        """Write what waits."""
+        """Write the buffered data."""
         start = time.monotonic()
         records, images = self._waiting.taken(self._reader)
         try:

@@ -1,4 +1,4 @@
-"""Recorded frames as a source: read ahead from files, published in a pixel ring at the pace of a camera."""
+"""Recorded frames as a source: read ahead from files and published in a pixel ring at a camera's pace."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from faintspot.realtime.camera import CameraReport, Readout, StopEvent
 from faintspot.realtime.pixel_ring import PixelRing
 
 _BLOCK_BYTES, _BLOCKS_AHEAD = 4 << 20, 8
-_LOOK_S = 0.05  # between two looks at whether to stop, while waiting for the disk or for room
-_NAP_S = 5e-4  # between two looks at how far the engine is
+_LOOK_S = 0.05  # between two checks of the stop event while waiting for the disk or the engine
+_NAP_S = 5e-4  # between two checks of the engine's progress
 
 
 def ring_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type in which frames of that type travel to the engine: uint16 stays, others become float32.
+    """Return the type in which frames are sent to the engine: uint16 stays, other types become float32.
 
     Raises
     ------
     InputError
-        For what is not a real number.
+        When the type is not a real number.
     """
     if dtype.kind not in "iuf":
         raise InputError(f"frames: expected real numbers, got dtype {dtype}")
@@ -38,43 +38,43 @@ def ring_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 class Replay(Readout):
-    """Publishes recorded frames; as a context manager it reads ahead meanwhile.
+    """Source that publishes recorded frames; a context manager that reads ahead meanwhile.
 
-    The first frame's number is its place in the sequence, and numbers have no gaps: with `repeat`, number
-    n is frame first + (n - first) % n_frames. A thread reads blocks of 4 MiB ahead, eight at most, so that
-    the size of the files does not matter.
+    The first frame's number is its index in the sequence, and numbers have no gaps: with `repeat`, number n
+    is frame first + (n - first) % n_frames. A thread reads at most eight blocks of 4 MiB ahead, so that files
+    of any size can be replayed.
 
     Parameters
     ----------
     source : FrameSource
-        Of `faintspot.io.open_frames`.
+        Frames from `faintspot.io.open_frames`.
     ring : PixelRing
-        Created by this process, of the frames' shape and `ring_type`.
+        Ring created by this process, with the frames' shape and `ring_type`.
     frame_rate_hz : float
     first : int
-        Where to begin, counted from 0.
+        Index of the first frame, from 0.
     n_frames : int, optional
-        How many frames from there on. Default: all.
+        Number of frames from there on. Default: all.
     repeat : bool
-        Begin again at the end, for ever.
+        Whether to start again at the end, without limit.
     rows_per_block : int, optional
-        Rows that are published together, at the pace of a read-out that takes 80 % of the frame time.
-        Default: whole frames.
+        Rows that are published together, with a read-out that takes 80 % of the frame time. Default: whole
+        frames.
     waits : bool
-        Wait for an engine, and never overwrite a frame that it has not measured; end when the engine ends.
-        Default: keep the schedule, whether or not the engine does.
+        Whether to wait for an engine and never overwrite a frame before it is measured; ends with the engine.
+        Default: keep the schedule, whether or not the engine keeps up.
 
     Attributes
     ----------
     n_frames : int or None
-        How many frames there are to publish; None with `repeat`.
+        Number of frames to publish; None with `repeat`.
     lost : int
-        Frames that the engine could not measure in time, once `run` has ended.
+        Frames that the engine could not measure in time; set when `run` has ended.
 
     Raises
     ------
     InputError
-        When a value is out of its range, or the ring does not fit; while it runs, when a file is damaged.
+        When a value is out of its range, or the ring does not fit; during the run, when a file is damaged.
     """
 
     def __init__(
@@ -116,10 +116,10 @@ class Replay(Readout):
         stop: StopEvent | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
-        """Publish frames as `Readout.run` does; the schedule starts when the first one has been read.
+        """Publish frames as `Readout.run` does; the schedule starts when the first frame has been read.
 
-        With `waits` it also starts no earlier than the engine. It ends when the engine, if there is one, has
-        measured the last frame.
+        With `waits` it starts no earlier than the engine. It ends when the engine, if any, has measured the
+        last frame.
         """
         self._stop, ring = self._ending if stop is None else stop, self._ring
         while self._waits and ring.followed is None and not self._stop.is_set():
@@ -144,7 +144,7 @@ class Replay(Readout):
         self._reader.join()
 
     def _frame(self) -> NDArray[Any] | None:
-        """Return the next frame; None at the end."""
+        """Return the next frame, or None at the end."""
         if self._waits and not self._await_engine(self._ring.arrivals + 1 - self._ring.slots):
             return None
         while (frame := next(self._block, None)) is None:
@@ -155,7 +155,7 @@ class Replay(Readout):
                     return None
                 continue
             if block is None or isinstance(block, InputError):
-                self._ahead.put(block)  # a later call finds it again
+                self._ahead.put(block)  # for a later call
                 if block is not None:
                     raise block
                 return None
@@ -163,7 +163,7 @@ class Replay(Readout):
         return frame
 
     def _await_engine(self, arrival: int) -> bool:
-        """Wait until the engine is done with that arrival; return False when it will not be."""
+        """Wait until the engine has finished an arrival; return False if it will not."""
         while (followed := self._ring.followed) is not None and not self._stop.is_set():
             if followed[0] >= arrival:
                 return True
@@ -171,14 +171,14 @@ class Replay(Readout):
         return False
 
     def _read(self) -> None:
-        """Read blocks ahead until the end, or until nobody wants them any more; in a thread of its own."""
+        """Read blocks ahead until the end or until the replay stops; runs in a separate thread."""
         source, dtype = self._source, self._ring.dtype
         size = max(1, _BLOCK_BYTES // (source.shape[0] * source.shape[1] * source.dtype.itemsize))
         going = True
         try:
             while going:
                 for _, block in source.blocks(*self._range, size):
-                    with np.errstate(over="ignore"):  # what float32 cannot hold is infinite: a bad pixel
+                    with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
                         going = self._handed_over(block.astype(dtype, copy=False))
                     if not going:
                         return
@@ -188,7 +188,7 @@ class Replay(Readout):
             self._handed_over(error)
 
     def _handed_over(self, block: NDArray[Any] | InputError | None) -> bool:
-        """Wait for room, and put it there; return False when it is not wanted any more."""
+        """Put a block into the queue when it is not full; return False if the replay has stopped."""
         while not self._ending.is_set():
             try:
                 self._ahead.put(block, timeout=_LOOK_S)
@@ -199,5 +199,5 @@ class Replay(Readout):
 
 
 def _nap() -> None:
-    """Give the engine time."""
+    """Sleep briefly, to give the engine time."""
     time.sleep(_NAP_S)

@@ -1,4 +1,4 @@
-"""What a process does to be left alone: processors of its own, priority, memory that stays, no collector."""
+"""Real-time scheduling of a process: reserved processors, priority, locked memory, no garbage collection."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _SWITCH_S = 20e-6
 
 @contextmanager
 def quick_switching(seconds: float = 50e-6) -> Iterator[None]:
-    """Let threads of this process take turns after so long instead of 5 ms, for as long as it lasts.
+    """Shorten the interval at which threads of this process take turns, from 5 ms, within a context.
 
-    A thread that reads, compiles or checks then holds up one that measures or publishes no longer than that.
+    A thread that reads, compiles or checks then delays one that measures or publishes by no more than that.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(seconds)
@@ -29,19 +29,19 @@ def quick_switching(seconds: float = 50e-6) -> Iterator[None]:
 
 @contextmanager
 def real_time(cpus: Sequence[int] | None = None, priority: int = 0) -> Iterator[list[str]]:
-    """Behave in real time for a while.
+    """Run with real-time scheduling within a context.
 
     Parameters
     ----------
     cpus : sequence of int, optional
         Processors to run on. Default: all that the process may use.
     priority : int
-        Of SCHED_FIFO, 1 to 99; 0 leaves the scheduler alone and memory unlocked.
+        Priority of SCHED_FIFO, 1 to 99; 0 leaves the scheduler and memory locking unchanged.
 
     Yields
     ------
     list of str
-        What was not permitted, one line each.
+        Settings that were not permitted, one line each.
     """
     refused: list[str] = []
     before = os.sched_getaffinity(0) if cpus else None

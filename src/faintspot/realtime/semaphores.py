@@ -1,4 +1,4 @@
-"""POSIX semaphores in shared memory, or with a name, which other programs post and wait for."""
+"""POSIX semaphores, in shared memory or named, that other programs post and wait for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 BYTES = 32
-"""Of one in memory (sem_t, Linux on 64 bits)."""
+"""Size of a semaphore in memory (sem_t on 64-bit Linux)."""
 _NAP_S = 5e-4
 
 
@@ -25,7 +25,7 @@ def _libc() -> Any:
 
 
 class Semaphore:
-    """A semaphore at an address, which must stay mapped as long as it is used.
+    """A semaphore at an address, which must stay mapped while it is used.
 
     Parameters
     ----------
@@ -38,40 +38,40 @@ class Semaphore:
 
     @classmethod
     def made(cls, address: int) -> Semaphore:
-        """Begin one in shared memory, with the value 0."""
+        """Initialise a semaphore in shared memory with the value 0."""
         _libc().sem_init(ctypes.c_void_p(address), 1, 0)
         return cls(address)
 
     @classmethod
     def named(cls, name: str) -> Semaphore | None:
-        """Make, or open, the one of a name; None where that is not allowed."""
+        """Open a named semaphore, creating it if necessary; return None where that is not allowed."""
         address = _libc().sem_open(f"/{name}".encode(), os.O_CREAT, 0o644, 0)
         return cls(address) if address else None
 
     @staticmethod
     def unlink(name: str) -> None:
-        """Remove the name, if there is one."""
+        """Remove a name, if it exists."""
         _libc().sem_unlink(f"/{name}".encode())
 
     @property
     def value(self) -> int:
-        """How often it was posted and not waited for."""
+        """Number of posts that were not waited for."""
         _libc().sem_getvalue(self._at, ctypes.byref(self._value))
         return self._value.value
 
     def post(self, most: int) -> None:
-        """Post, where the value is less than `most`: nobody may be waiting at all."""
+        """Post if the value is below `most`: there may be no process waiting."""
         if self.value < most:
             _libc().sem_post(self._at)
 
     def wait(self, limit_s: float) -> bool:
-        """Wait for a post, at most so long; return whether there was one."""
+        """Wait for a post for up to `limit_s`; return whether there was one."""
         library = _libc()
         if hasattr(library, "sem_clockwait"):
             end = time.monotonic() + limit_s
             until = _Time(int(end), int(end % 1.0 * 1e9))
             return bool(library.sem_clockwait(self._at, time.CLOCK_MONOTONIC, ctypes.byref(until)) == 0)
-        if library.sem_trywait(self._at) == 0:  # an older library, whose waiting follows the wall clock
+        if library.sem_trywait(self._at) == 0:  # for older libraries, which wait on the wall clock
             return True
         time.sleep(min(limit_s, _NAP_S))
         return False

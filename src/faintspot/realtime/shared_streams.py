@@ -1,9 +1,9 @@
-"""Making and opening streams of pyshmem so that nobody else can hold them up, or have files made elsewhere.
+"""Creation and opening of pyshmem streams, safe against other users.
 
-pyshmem has one lock file for every stream, in $PYSHMEM_LOCK_DIR or a folder of the user's in the temporary
-directory, and waits for a lock for ever. All programs that share a stream must use the same folder, also
-those that know nothing of faintspot; so it stays where it is, but must belong to the user and let nobody
-else in.
+pyshmem has one lock file for every stream, in $PYSHMEM_LOCK_DIR or a per-user folder in the temporary
+directory, and waits for a lock without limit. All programs that share a stream must use the same folder,
+including programs that do not use faintspot. So its place is kept, but it must belong to the user and be
+closed to others.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from faintspot.realtime.processes import process_age_s
 LOCK_LIMIT_S = 1.0
 _LOOK_S = 0.01
 _CLOCKS_AGREE_S = 0.1
-_BESIDE_BYTES = 1 << 16  # of pyshmem's own, beside a stream's data
+_BESIDE_BYTES = 1 << 16  # pyshmem's overhead per stream
 _PARTS = ("", "_meta", "_gpu")
 
 
 def pyshmem_module(purpose: str) -> Any:
-    """Return pyshmem.
+    """Import and return pyshmem.
 
     Raises
     ------
     MissingExtraError
-        Without it; `purpose` says what for.
+        When it is not installed; the message names `purpose`.
     InputError
-        Where it cannot keep its numbers in order.
+        When it cannot order its memory accesses on this machine.
     """
     try:
         import pyshmem
@@ -55,24 +55,24 @@ def pyshmem_module(purpose: str) -> Any:
         raise MissingExtraError("pyshmem", "realtime", purpose) from None
     if not _keeps_order(platform.machine().lower()):
         raise InputError(
-            f"pyshmem: expected GCC's libatomic on {platform.machine()}, found none; install it (libatomic1)"
+            f"pyshmem: expected GCC's libatomic on {platform.machine()}, found none; install libatomic1"
         )
     return pyshmem
 
 
 @cache
 def _keeps_order(machine: str) -> bool:
-    """Whether pyshmem's readers can do without locks, which publishing programs hold for good."""
+    """Return whether pyshmem's readers work without locks, which publishers hold permanently."""
     return machine in ("x86_64", "amd64") or ctypes.util.find_library("atomic") is not None
 
 
 def lock_file(name: str) -> Path:
-    """Return the lock file of a stream, in a private folder that exists, which is made where there is none.
+    """Return the lock file of a stream, in a private folder that is made if necessary.
 
     Raises
     ------
     InputError
-        When the folder is not the user's alone, or something else than a file is in the lock file's place.
+        When the folder is not private, or the path of the lock file is something else.
     """
     folder = _private_lock_folder()
     path = folder / f"{_base(name)}.lock"
@@ -84,18 +84,18 @@ def lock_file(name: str) -> Path:
 def create_stream(
     name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, patience_s: float = LOCK_LIMIT_S
 ) -> Any:
-    """Create a stream; one that is damaged, or whose maker has died, is replaced.
+    """Create a stream; replace one that is damaged or whose maker has died.
 
     Parameters
     ----------
     name, shape, dtype
     patience_s : float
-        How long to wait for somebody else who holds the name's lock.
+        Time to wait for another process that holds the name's lock.
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     InputError
         When a living process publishes under that name, another user has taken it, the lock folder is not
         private, or shared memory is short.
@@ -104,18 +104,18 @@ def create_stream(
     try:
         _check_free(name, patience_s)
         for path in _left_behind(pyshmem, name):
-            path.unlink()  # pyshmem does not remove what is damaged
+            path.unlink()  # pyshmem does not remove damaged files
         _reserve(name, math.prod(shape) * np.dtype(dtype).itemsize + _BESIDE_BYTES)
         return pyshmem.create(name, shape=shape, dtype=dtype)
     except InputError:
         raise
     except (OSError, ValueError, RuntimeError) as error:
         text = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise InputError(f"{name}: this stream cannot be made ({text})") from None
+        raise InputError(f"{name}: the stream cannot be created ({text})") from None
 
 
 def generation(name: str) -> int | None:
-    """Return a number that changes when a stream is made anew, None where there is none; it takes some us."""
+    """Return a number that changes when a stream is recreated (takes some us); None if it does not exist."""
     try:
         return os.stat(FOLDER / _base(name)).st_ino
     except OSError:
@@ -124,14 +124,14 @@ def generation(name: str) -> int | None:
 
 @contextmanager
 def held(*streams: Any) -> Iterator[None]:
-    """Keep the locks of streams, which only writers need, while publishing: readers do not wait for them.
+    """Hold the streams' write locks while publishing; readers do not wait for them.
 
-    Taking a lock for every frame would take three times as long as publishing itself.
+    Taking a lock for each frame would take three times as long as publishing.
 
     Raises
     ------
     InputError
-        When somebody else holds one.
+        When another process holds one.
     """
     with ExitStack() as stack:
         for stream in streams:
@@ -144,12 +144,12 @@ def held(*streams: Any) -> Iterator[None]:
 
 
 def _base(name: str) -> str:
-    """What pyshmem calls a stream's files."""
+    """Return pyshmem's name for a stream's files."""
     return f"ps_{hashlib.sha1(name.encode(), usedforsecurity=False).hexdigest()[:14]}"
 
 
 def _private_lock_folder() -> Path:
-    """Where pyshmem keeps its locks, checked."""
+    """Return the folder of pyshmem's locks, after checking that it is private."""
     chosen = os.environ.get("PYSHMEM_LOCK_DIR")
     folder = Path(chosen or Path(tempfile.gettempdir()) / f"pyshmem-locks-{os.getuid()}")
     advice = "set PYSHMEM_LOCK_DIR to one, the same for all programs that share streams"
@@ -163,7 +163,7 @@ def _private_lock_folder() -> Path:
     try:
         status = os.fstat(descriptor)
         if status.st_uid == os.geteuid() and status.st_mode & 0o077 and not chosen:
-            os.fchmod(descriptor, 0o700)  # pyshmem lets everybody in, who could then hold the locks
+            os.fchmod(descriptor, 0o700)  # pyshmem's mode would let any user hold the locks
             status = os.fstat(descriptor)
         if status.st_uid != os.geteuid() or status.st_mode & 0o077:
             raise InputError(
@@ -175,7 +175,7 @@ def _private_lock_folder() -> Path:
 
 
 def _check_free(name: str, patience_s: float) -> None:
-    """Refuse a name whose lock is held, which a living publisher does, or that another user has taken."""
+    """Refuse a name whose lock a living publisher holds, or that another user has taken."""
     path = lock_file(name)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
@@ -189,13 +189,11 @@ def _check_free(name: str, patience_s: float) -> None:
     for part in _PARTS:
         segment = FOLDER / f"{_base(name)}{part}"
         if os.path.lexists(segment) and os.lstat(segment).st_uid != os.geteuid():
-            raise InputError(
-                f"{name}: {segment} belongs to another user; have it removed or choose another --name"
-            )
+            raise InputError(f"{name}: {segment} belongs to another user; remove it or choose another --name")
 
 
 def _lock_within(descriptor: int, limit_s: float) -> bool:
-    """Lock an open file for this descriptor alone; return whether that went within the time."""
+    """Lock an open file for this descriptor; return whether that succeeded in time."""
     end = time.monotonic() + limit_s
     while True:
         try:
@@ -208,19 +206,18 @@ def _lock_within(descriptor: int, limit_s: float) -> bool:
 
 
 def _left_behind(pyshmem: Any, name: str) -> list[Path]:
-    """The files of a stream of that name that is nobody's; InputError when its maker lives."""
+    """Return a stream's files if no process owns them; raise InputError if its maker is alive."""
     parts = [path for part in _PARTS if os.path.lexists(path := FOLDER / f"{_base(name)}{part}")]
     if not parts:
         return []
     made = min(os.lstat(path).st_mtime for path in parts)
     try:
         stream = pyshmem.open(name)
-    except (OSError, ValueError):  # damaged, or never finished
+    except (OSError, ValueError):  # damaged or incomplete
         return parts
     pid = stream.creator_pid
     stream.close()
-    # A process that is younger than the stream has only got its maker's number, as after a container's
-    # restart.
+    # A process younger than the stream has merely reused its maker's id, e.g. after a container restart.
     if process_age_s(pid) >= time.time() - made - _CLOCKS_AGREE_S:
         raise InputError(
             f"{name}: a living process publishes under this name (pid {pid}); stop it or choose another "
@@ -230,7 +227,7 @@ def _left_behind(pyshmem: Any, name: str) -> list[Path]:
 
 
 def _reserve(name: str, size: int) -> None:
-    """Refuse what there is no room for: writing into shared memory that is full kills the process."""
+    """Refuse a size above the free shared memory: writing to full shared memory kills the process."""
     path = FOLDER / f".{_base(name)}.{secrets.token_hex(8)}"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     try:
@@ -240,7 +237,7 @@ def _reserve(name: str, size: int) -> None:
         if error.errno != errno.ENOSPC:
             raise
         raise InputError(
-            f"{name}: this stream cannot be made: {size} bytes, more than is left in {FOLDER}"
+            f"{name}: the stream cannot be created: its {size} bytes exceed the free space in {FOLDER}"
         ) from None
     finally:
         os.close(descriptor)

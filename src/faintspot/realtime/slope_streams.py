@@ -1,4 +1,4 @@
-"""Slopes and commands out: streams of pyshmem, which pyRTC and, through its bridge, ImageStreamIO read."""
+"""Slopes and commands out: pyshmem streams, read by pyRTC and, through its bridge, by ImageStreamIO."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from faintspot.realtime.shared_streams import (
 DETAILS = ("flux_e", "valid", "standard_error_x_px", "standard_error_y_px", "iterations", "flags")
 """Rows of the stream of details."""
 MARKS = ("frame", "arm", "settings_change", "last_row_ns", "published_ns")
-"""What the stream of marks holds; times are those of CLOCK_MONOTONIC."""
+"""Contents of the stream of marks; times are those of CLOCK_MONOTONIC."""
 
 
 class SlopeStreams:
     """Three streams, or four with commands, each stamped with the frame's number as `frame_id`.
 
-    NAME_slopes holds all x, then all y, float32 px (2 n,): what a reconstructor multiplies. NAME_details
-    holds (6, n) float32, rows as `DETAILS`; NAME_marks holds with what and when it was measured, int64, as
-    `MARKS`. The slopes are published first. NAME_commands holds the mirror's commands, float32 (commands,),
-    in the interaction matrix's unit.
+    NAME_slopes holds all x, then all y, float32 px (2 n,), for a reconstructor. NAME_details holds (6, n)
+    float32, rows as `DETAILS`. NAME_marks holds int64 numbers and times of the measurement, as `MARKS`. The
+    slopes are published first. NAME_commands holds the mirror's commands, float32 (commands,), in the
+    interaction matrix's unit.
 
     Parameters
     ----------
@@ -41,17 +41,17 @@ class SlopeStreams:
     n : int
         Number of sub-apertures.
     commands : int
-        Number of commands; 0: there is no such stream.
+        Number of commands; 0: no stream of commands.
 
     Attributes
     ----------
     held_commands : (commands,) array or None
-        What an engine of that name that died has asked the mirror for last.
+        Last commands of an engine of that name that has died.
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     InputError
         When a living process publishes under that name, another user has taken it, or shared memory is short.
     """
@@ -72,7 +72,7 @@ class SlopeStreams:
         self._generation = generation(stream)
         self._commands_lock = ExitStack()
         self.commands_lost = False
-        """Whether to make the stream of commands anew."""
+        """Whether the stream of commands must be recreated."""
         self._n, self._closed = n, False
         self._fill = Direct(fill_telemetry_rows)
         self._counts = np.zeros(3, np.int64)
@@ -82,32 +82,32 @@ class SlopeStreams:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep the streams' locks while publishing; see `shared_streams.held`."""
+        """Hold the streams' locks while publishing; see `shared_streams.held`."""
         with held(self._slopes, self._details, self._marks), self._commands_lock:
             if self._commands is not None:
                 self._commands_lock.enter_context(held(self._commands))
             yield
 
     def publish_slopes(self, slopes: Slopes, frame: int) -> None:
-        """Publish the vector of slopes; by the thread that holds the streams."""
+        """Publish the vector of slopes; for the thread that holds the streams."""
         with self._slopes.write_view_locked(frame_id=frame) as vector:
             vector[: self._n] = slopes.x
             vector[self._n :] = slopes.y
 
     def publish_commands(self, commands: NDArray[np.float64], frame: int) -> None:
-        """Publish the commands that follow from a frame; by the thread that holds the streams."""
+        """Publish the commands that follow from a frame; for the thread that holds the streams."""
         if self._commands is None:  # it was lost
             return
         with self._commands.write_view_locked(frame_id=frame) as vector:
             vector[:] = commands
 
     def renew_commands(self) -> bool:
-        """Make the stream of commands anew, which was removed; by the thread that holds the streams.
+        """Recreate the stream of commands after it was removed; for the thread that holds the streams.
 
         Returns
         -------
         bool
-            False: another program publishes under its name.
+            False if another program publishes under its name.
         """
         self.commands_lost = False
         if self._commands is not None:
@@ -123,18 +123,18 @@ class SlopeStreams:
         return True
 
     def look_after_commands(self) -> None:
-        """Have the stream of commands made anew where it was removed; by any thread."""
+        """Request that the stream of commands be recreated if it was removed; for any thread."""
         if self._of_commands[1][0] and generation(self._of_commands[0]) != self._generation:
             self.commands_lost = True
 
     def publish_details(self, slopes: Slopes, frame: int) -> tuple[int, int, int]:
-        """Publish what else is known of each slope; by the thread that holds the streams.
+        """Publish the details of each slope; for the thread that holds the streams.
 
         Returns
         -------
         invalid, limited, iterations : int
-            Sub-apertures without a slope, those whose denoising ended at the iteration limit, and how many
-            iterations all took together.
+            Numbers of sub-apertures without a slope and of those whose denoising ended at the iteration
+            limit, and the total number of iterations.
         """
         with self._details.write_view_locked(frame_id=frame) as table:
             self._fill_details(slopes, table)
@@ -142,17 +142,17 @@ class SlopeStreams:
         return invalid, limited, iterations
 
     def _fill_details(self, slopes: Slopes, table: NDArray[np.float32]) -> None:
-        """Write the rows of `DETAILS`, and count."""
+        """Write the rows of `DETAILS` and count invalid slopes and iterations."""
         errors = slopes.standard_error_x, slopes.standard_error_y
         self._fill(slopes.flux, slopes.flags, slopes.iterations, *errors, self._counts, table)
 
     def publish_marks(self, marks: tuple[int, ...]) -> None:
-        """Publish with what and when a frame was measured; by the thread that holds the streams."""
+        """Publish the numbers and times of a frame; for the thread that holds the streams."""
         with self._marks.write_view_locked(frame_id=marks[0]) as row:
             row[:] = marks
 
     def commands_obstacle(self) -> str | None:
-        """Return why nobody sees the commands, None where they do; by any thread."""
+        """Return why the commands cannot be read by other programs, or None; for any thread."""
         (name, (commands,)), own = self._of_commands, self._commands
         if not commands or self._closed:
             return None
@@ -161,7 +161,7 @@ class SlopeStreams:
         except (OSError, ValueError):
             return f"{name} was removed"
         same = own is not None and there == own.instance_id
-        return None if same else f"{name} was made anew by another program; end it"
+        return None if same else f"{name} was recreated by another program; end that program"
 
     def close(self) -> None:
         """Remove all streams."""
@@ -172,22 +172,22 @@ class SlopeStreams:
 
 
 def commands_left_behind(stream: str, commands: int) -> NDArray[np.float32] | None:
-    """Return the last commands of a stream whose writer has died; None where there are none that fit.
+    """Return the last commands of a stream whose writer has died; None if there are none that fit.
 
-    Where it died while it wrote, some are those of the frame before, which makes no difference to a mirror.
+    If it died while writing, some commands are those of the frame before, which is harmless to a mirror.
 
     Raises
     ------
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     InputError
-        When the folder of locks is not private.
+        When the lock folder is not private.
     """
     pyshmem = pyshmem_module("publishing commands in shared memory")
     lock_file(stream)
     try:
         left = pyshmem.open(stream, gpu_device=False)
-    except (OSError, ValueError):  # none, or damaged
+    except (OSError, ValueError):  # missing or damaged
         return None
     try:
         if not left.count or tuple(left.shape) != (commands,) or left.dtype.kind != "f":

@@ -1,4 +1,4 @@
-"""Streams that other programs publish, by name: pyshmem's NAME, ImageStreamIO's isio:NAME, dao's dao:FILE."""
+"""Streams that other programs publish: pyshmem's NAME, ImageStreamIO's isio:NAME, dao's dao:FILE."""
 
 from __future__ import annotations
 
@@ -18,62 +18,62 @@ _NAP_S = 5e-4
 
 
 class Stream(Protocol):
-    """A stream as it is followed; all its numbers change as others write."""
+    """Interface of a stream that another program writes; its properties change with each publication."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
     @property
     def count(self) -> int:
-        """How much was published."""
+        """Number of publications."""
 
     @property
     def number(self) -> int:
-        """Number of the newest."""
+        """Number of the newest frame."""
 
     @property
     def maker(self) -> str:
-        """Who made it."""
+        """Process that made the stream, in words."""
 
     def maker_lives(self) -> bool | None:
-        """Whether that process is there; None where it is not known."""
+        """Return whether that process is alive; None if it is not known."""
 
     def same(self) -> bool | None:
-        """Whether the name still leads here; None where it leads nowhere."""
+        """Return whether the name still leads to this stream; None if it leads nowhere."""
 
     def wait(self, after: int, limit_s: float) -> bool:
-        """Wait until more was published than `after`, at most so long; return whether there was."""
+        """Wait up to `limit_s` until more than `after` publications exist; return whether they do."""
 
     def read(self, out: NDArray[Any] | None = None, limit_s: float = 0.0) -> Publication | None:
-        """Return the newest publication, or None when none is whole within the time."""
+        """Return the newest publication, or None when no complete one can be read in time."""
 
     def close(self) -> None:
-        """Let go."""
+        """Close the stream."""
 
 
 class PyshmemStream:
-    """A stream of pyshmem; see `Stream`. A number that its producer does not set is the count less one.
+    """A pyshmem stream; see `Stream`. Without a `frame_id`, the frame number is the count minus one.
 
     Raises
     ------
     FileNotFoundError
-        When there is none.
+        When the stream does not exist.
     IncompatibleStreamError
         When it cannot be opened.
     InputError
-        When the folder of pyshmem's locks is not private.
+        When pyshmem's lock folder is not private.
     """
 
     def __init__(self, name: str) -> None:
         self._pyshmem: Any = pyshmem_module("reading a stream in shared memory")
-        lock_file(name)  # refuses a place that is not private, in which pyshmem makes one
+        lock_file(name)  # refuses a folder that is not private
         try:
-            # Not read-only: pyshmem leaves it to readers to mark what a writer that died has left half
-            # written, and without that its successor's frames cannot be told from torn ones.
+            # Not read-only: readers have to mark what a dead writer left incomplete; otherwise pyshmem cannot
+            # tell its successor's frames from torn ones.
             self._source = self._pyshmem.open(name, gpu_device=False)
         except FileNotFoundError:
             raise
-        except (OSError, ValueError) as error:  # half made, or not for us
+        except (OSError, ValueError) as error:  # incomplete, or not accessible
             raise IncompatibleStreamError(f"cannot be opened ({' '.join(str(error).split())})") from None
         self._name = name
         self.shape, self.dtype = tuple(self._source.shape), self._source.dtype
@@ -105,14 +105,14 @@ class PyshmemStream:
             return None
 
     def wait(self, after: int, limit_s: float) -> bool:
-        """See `Stream`; streams made with ``notify=True`` wake it, others are looked at."""
+        """See `Stream`; streams made with ``notify=True`` wake the reader, others are polled."""
         source = self._source
         try:
             source.wait_for_count(after=after, timeout=limit_s, poll_interval=_NAP_S)
         except TimeoutError:
             return False
         except self._pyshmem.InconsistentStreamError:
-            time.sleep(limit_s)  # a writer died in the middle: there may come another
+            time.sleep(limit_s)  # the writer died while writing: another may come
             return bool(source.count != after)
         return True
 
@@ -131,23 +131,23 @@ class PyshmemStream:
 
 
 def _number(frame_id: int, count: int) -> int:
-    """Return a publication's frame number; of a writer that stamps nothing, frame_id is 0."""
+    """Return a publication's frame number; `frame_id` is 0 if the writer sets none."""
     return (frame_id or max(count - 1, 0)) & LARGEST_NUMBER
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Return kind ("isio", "dao" or "" for pyshmem) and the name without it."""
+    """Return the kind ("isio", "dao" or "" for pyshmem) and the name without it."""
     kind, separator, rest = name.partition(":")
     return (kind, rest) if separator and kind in (ISIO, DAO) else ("", name)
 
 
 def check_stream(name: str) -> None:
-    """Refuse a name that no stream can have, or one of pyshmem's without pyshmem.
+    """Check that a stream can have that name, and that pyshmem is installed if it is needed.
 
     Raises
     ------
     InputError, MissingExtraError
-        One line.
+        When it cannot, or pyshmem is missing.
     """
     kind, rest = split_name(name)
     if kind:
@@ -162,9 +162,9 @@ def open_stream(name: str) -> Stream:
     Raises
     ------
     FileNotFoundError
-        When there is none of that name.
+        When no stream has that name.
     IncompatibleStreamError
-        When there is something else, with the reason.
+        When it is not a usable stream; the text gives the reason.
     """
     kind, rest = split_name(name)
     if kind:
@@ -178,23 +178,23 @@ def open_stream(name: str) -> Stream:
 
 
 class Follower:
-    """Follows a stream by its name, which may be missing, hold something else, go away and come back.
+    """Connection to a stream by its name: it may be missing, unusable, removed and recreated.
 
     Parameters
     ----------
     name : str
     say : function
-        Told in one line what happens to the stream.
+        Called with a one-line message when the stream changes.
     incompatible : function
-        Takes shape and type; returns why that is not what is wanted, "" where it is.
+        Takes shape and type; returns what was expected instead, "" if they fit.
     meanwhile : function
-        Returns what is done without a stream, for `say`.
+        Returns what is done without a stream, for messages.
 
     Attributes
     ----------
     source : Stream or None
     obstacle : str
-        Why there is none, "" where there is.
+        Why there is no stream; "" if there is one.
     """
 
     def __init__(
@@ -210,11 +210,11 @@ class Follower:
         self.obstacle = ""
 
     def say(self, text: str) -> None:
-        """Say what happens to the stream."""
+        """Report a change of the stream."""
         self._say(f"stream {self.name}: {text}")
 
     def open(self) -> Stream | None:
-        """Open the stream; None where something stands in the way, which is said once."""
+        """Open the stream; return None if that fails, and report the reason once."""
         obstacle = self._opened()
         if obstacle and obstacle != self.obstacle:
             self.say(f"{obstacle}; {self._meanwhile()}")
@@ -222,7 +222,7 @@ class Follower:
         return self.source
 
     def _opened(self) -> str:
-        """Return what stands in the way."""
+        """Open the stream; return the reason if that fails, else ""."""
         try:
             source = open_stream(self.name)
         except FileNotFoundError:
@@ -237,15 +237,15 @@ class Follower:
         return ""
 
     def lost(self) -> str:
-        """Let go of a stream that is not there any more; return in words what happened, "" for nothing."""
+        """Close a stream that was removed or recreated; return what happened in words, "" for nothing."""
         same = self.source.same() if self.source is not None else True
         if same:
             return ""
         self.close()
-        return "was removed" if same is None else "was made anew"
+        return "was removed" if same is None else "was recreated"
 
     def close(self) -> None:
-        """Let go of the stream."""
+        """Close the stream."""
         if self.source is not None:
             self.source.close()
             self.source = None

@@ -1,4 +1,4 @@
-"""What the engine publishes, as streams of ImageStreamIO or dao: for milk, cacao and dao's controllers."""
+"""The engine's slopes and commands as ImageStreamIO or dao streams, for milk, cacao and dao."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.image_stream import ImageStreamWriter
 from faintspot.realtime.stream import Follower, split_name
 
-_LOOK_S = 0.1  # between two looks for a stream that is not there
+_LOOK_S = 0.1  # between two attempts to open a missing stream
 _PARK_S = 0.05
 
 
 class StreamOut:
-    """Follows a stream of the engine's, and publishes the same for other programs.
+    """Republication of a stream of the engine for other programs.
 
     Parameters
     ----------
     stream : str
-        As NAME_slopes or NAME_commands; it need not exist yet.
+        Name of the stream, e.g. NAME_slopes or NAME_commands; it need not exist yet.
     target : str
         isio:NAME or dao:FILE.
     say : function, optional
-        Told in one line what happens to the stream.
+        Called with a one-line message when the stream changes.
 
     Attributes
     ----------
     published, missed : int
-        What was passed on, and what was overwritten before.
+        Publications that were passed on, and those overwritten before.
 
     Raises
     ------
     InputError
-        For a target of another kind.
+        When the target is of another kind.
     MissingExtraError
-        Without pyshmem.
+        When pyshmem is not installed.
     """
 
     def __init__(self, stream: str, target: str, say: Callable[[str], None] | None = None) -> None:
         self._kind, self._target = split_name(target)
         if not self._kind:
-            raise InputError(f"{target}: expected isio:NAME or dao:FILE; pyshmem's stream is {stream}")
+            raise InputError(f"{target}: expected isio:NAME or dao:FILE (pyshmem programs can read {stream})")
         self._follower = Follower(stream, say or (lambda _: None), _incompatible, lambda: "waiting")
         self._writer: ImageStreamWriter | None = None
         self._seen = self.published = self.missed = 0
 
     def run(self, stop: StopEvent) -> None:
-        """Pass on what comes until `stop` is set.
+        """Pass publications on until `stop` is set.
 
         Raises
         ------
         InputError
-            When the target cannot be made, or is another living process's.
+            When the target cannot be made, or belongs to another living process.
         """
         try:
             while not stop.is_set():
@@ -67,7 +67,7 @@ class StreamOut:
             self.close()
 
     def step(self) -> bool:
-        """Follow the stream for a moment, 0.1 s at most; return whether something was passed on."""
+        """Follow the stream for at most 0.1 s; return whether something was passed on."""
         source = self._follower.source
         if source is None:
             source = self._follower.open()
@@ -93,7 +93,7 @@ class StreamOut:
         return True
 
     def close(self) -> None:
-        """Let go of the stream and remove ours."""
+        """Close the engine's stream and remove the target."""
         self._follower.close()
         if self._writer is not None:
             with contextlib.suppress(OSError):
@@ -101,7 +101,7 @@ class StreamOut:
             self._writer = None
 
     def _prepare(self, shape: tuple[int, ...]) -> None:
-        """Have a stream of that size."""
+        """Make the target with that size, unless it exists."""
         writer = self._writer
         if writer is not None and writer.shape[-1:] == shape:
             return
@@ -112,5 +112,5 @@ class StreamOut:
 
 
 def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """Return what is expected where this is not a vector of the engine's."""
+    """Return the expected shape and type, or "" if this is a vector from the engine."""
     return "" if len(shape) == 1 and dtype == np.float32 else "a vector of float32"

@@ -1,18 +1,18 @@
-"""Telemetry: what the engine did with each frame, through shared memory to whoever records or watches it.
+"""Telemetry: the engine's data of each frame, passed through shared memory to recorders and displays.
 
-The engine's thread writes, any number of processes of the same user read; the writer never waits. A reader
-that is too slow loses the oldest records and is told how many. There are three rings in one segment, named
-NAME_telemetry: a record for every frame, pixel images of some frames, and changes of settings.
+The engine's thread writes; any number of processes of the same user read. The writer never waits. A reader
+that is too slow loses the oldest records and gets their number. One segment, NAME_telemetry, holds three
+rings: a record for every frame, pixel images of some frames, and changes of settings.
 
-The segment is that of a pixel ring with a single slot, of bytes (see `faintspot.realtime.pixel_segment`),
-so that it is created, found stale and replaced in the same way. The slot holds::
+The segment is a pixel ring with a single slot of bytes (see `faintspot.realtime.pixel_segment`), so that it
+is created, recognised as stale and replaced in the same way. The slot holds::
 
     magic, length and checksum of the description; the description, JSON text
     three counts, 128 bytes apart: records, images, changes ever written
-    the three rings, item k of a ring in place k % length
+        the three rings; item k of a ring is in place k % length
 
-An item is written first and counted afterwards (`faintspot.kernels.ordered`). The item that comes next
-overwrites the oldest, which is why a reader counts that one as lost already.
+An item is written first and counted afterwards (`faintspot.kernels.ordered`). The next item overwrites the
+oldest, so a reader already counts the oldest as lost.
 """
 
 from __future__ import annotations
@@ -61,25 +61,25 @@ _RECORD_BYTES, _IMAGE_BYTES = 1 << 25, 1 << 24  # small enough for a container's
 
 
 class TelemetryRing(Closing):
-    """The writer's side, made by `create`. As a context manager it closes itself.
+    """Writer of an engine's telemetry, made by `create`. As a context manager it closes itself.
 
-    Records, images and changes may come from three threads, but each of them from one alone.
+    Records, images and changes may be written from three threads, each kind from one thread only.
 
     Attributes
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     """
 
     def __init__(self, name: str, ring: PixelRing, begin: int, description: Mapping[str, Any]) -> None:
-        """For `create` only."""
+        """Use `create` instead."""
         self.name, self._ring = name, ring
         self._memory = ring.pixels[0, 0].data
         self._rings = rings = Rings(ring.pixels[0, 0], begin, description)
         self._written = 0
         items = rings.records.items
         self._places, self._itemsize, self._begin = len(items), items.itemsize, rings.first_record
-        # A column each; a row of it is the target of one copy, for which nothing else is made.
+        # One array per field; each row is the target of one copy, without temporary objects.
         self._x, self._y, self._flux = items["x"], items["y"], items["flux"]
         self._error_x, self._error_y = items["standard_error_x"], items["standard_error_y"]
         self._iterations, self._flags = items["iterations"], items["flags"]
@@ -100,28 +100,28 @@ class TelemetryRing(Closing):
         records: int | None = None,
         image_slots: int | None = None,
     ) -> TelemetryRing:
-        """Make the rings of an engine.
+        """Create the rings of an engine.
 
         Parameters
         ----------
         name : str
-            The engine's; the segment is /dev/shm/NAME_telemetry.
+            Name of the engine; the segment is /dev/shm/NAME_telemetry.
         layout : Layout
         settings : str
-            The settings to begin with, for readers: TOML text (`faintspot.pipeline.configuration.to_text`).
+            The initial settings, for readers: TOML text (`faintspot.pipeline.configuration.to_text`).
         arms : sequence of str, optional
-            Names of the arms of interleaved settings, for readers.
+            Names of the interleaved configurations, for readers.
         commands : int
-            Number of the mirror's commands; 0: the engine makes none.
+            Number of the mirror's commands; 0: none.
         reference : (2 n,) array, optional
-            Reference slopes that are subtracted, px, for readers.
+            Reference slopes that were subtracted, px, for readers.
         parts : mapping, optional
             Calibration, PSF and score, for readers (`faintspot.pipeline.configuration.packed`).
         records : int, optional
-            Places for records of about 60 + 25 n bytes: a reader may lag behind by one frame less. Default:
-            as many as fit into 32 MiB, up to 4096.
+            Number of records, about 60 + 25 n bytes each: a reader may lag by one frame less. Default: as
+            many as fit into 32 MiB, up to 4096.
         image_slots : int, optional
-            Places for images. Default: as many as fit into 16 MiB, 2 to 16.
+            Number of images. Default: as many as fit into 16 MiB, 2 to 16.
 
         Raises
         ------
@@ -160,22 +160,22 @@ class TelemetryRing(Closing):
         loop: int = 0,
         commands: NDArray[np.float64] | None = None,
     ) -> None:
-        """Write the record of one frame; a few microseconds, nobody is waited for, nothing is checked.
+        """Write the record of one frame: takes a few microseconds, never waits, checks nothing.
 
         Parameters
         ----------
         frame : int
-            The camera's number.
+            Frame number of the camera.
         arm, change : int
-            Which of interleaved settings, and the number of the last change of settings that is in them.
+            Numbers of the interleaved configuration and of the last change of settings that applies.
         last_row_ns, published_ns : int
-            CLOCK_MONOTONIC, ns.
+            Times of CLOCK_MONOTONIC, ns.
         slopes : Slopes
-            Of one frame; copied.
+            Slopes of one frame; copied.
         loop : int
-            The loop's state, as `record_type` has it.
+            State of the loop, as in `record_type`.
         commands : (commands,) array, optional
-            That followed from the slopes; needed where the telemetry has commands.
+            Commands that follow from the slopes; needed if the telemetry has commands.
         """
         written = self._written
         place = written % self._places
@@ -213,18 +213,18 @@ class TelemetryRing(Closing):
     ) -> None:
         """Write a change of settings that has taken effect.
 
-        Of one that is too long for its place (4 KiB) the names alone are written, and that it was.
+        If the change is longer than 4 KiB, only its names are written, and a note that it was too long.
 
         Parameters
         ----------
         frame : int
-            The first one that was measured with it.
+            First frame that was measured with it.
         number : int
-            Of the change, as in `write`.
+            Number of the change, as in `write`.
         changes : mapping
             New values by name.
         where : sequence of int, optional
-            Sub-apertures; None: all.
+            Indices of the sub-apertures; None: all.
         """
         place = {"frame": int(frame), "number": int(number)}
         whole = {**place, "changes": dict(changes), "where": where}
@@ -241,28 +241,28 @@ class TelemetryRing(Closing):
         ring.count(written + 1)
 
     def close(self) -> None:
-        """Remove the segment's name and tell readers that nothing more comes. Harmless when repeated."""
+        """Remove the segment's name and notify readers of the end. Repeated calls do nothing."""
         self._ring.close()
 
 
 class TelemetryReader:
-    """A reader's side, made by `attach`.
+    """Reader of an engine's telemetry, made by `attach`.
 
-    A cursor is the number of the next item that a reader has not seen; 0: begin with the oldest there is.
+    A cursor is the number of the next item to read; 0 starts with the oldest one available.
 
     Attributes
     ----------
     name : str
-        The engine's.
+        Name of the engine.
     layout : Layout
     settings : str
-        With which the engine began: TOML text.
+        Initial settings of the engine: TOML text.
     description : dict
-        What the writer says of itself, as plain values.
+        The writer's description of itself, as plain values.
     """
 
     def __init__(self, name: str, ring: PixelRing, begin: int, description: dict[str, Any]) -> None:
-        """For `attach` only."""
+        """Use `attach` instead."""
         self.name, self._ring, self.description = name, ring, description
         self.layout = Layout(**description["layout"])
         self.settings: str = description["settings"]
@@ -275,62 +275,62 @@ class TelemetryReader:
         Raises
         ------
         InputError
-            When there is none of that name, or it is not of this version and this user.
+            When there is no such telemetry, or it is not of this version and user.
         """
         path = segment_path(f"{name}_telemetry")
         if not path.exists():
-            raise InputError(f"{path}: there is no telemetry of {name!r}; is the engine running?")
+            raise InputError(f"{path}: no telemetry of {name!r}; start the engine first")
         ring = PixelRing.attach(path.name)
         memory = ring.pixels[0, 0]
         magic, length, checksum = _START.unpack_from(memory) if len(memory) >= _START.size else (b"", 0, 0)
         text = memory[_START.size : _START.size + length].tobytes()
         if magic != _MAGIC or zlib.crc32(text) != checksum:
-            raise InputError(f"{path}: is not telemetry of this version of faintspot")
+            raise InputError(f"{path}: expected telemetry of this version of faintspot")
         return cls(name, ring, up_to_pages(_START.size + length), json.loads(text))
 
     @property
     def newest(self) -> int:
-        """Cursor behind the newest record: what comes from now on."""
+        """Cursor after the newest record."""
         return self._rings.records.written
 
     @property
     def newest_image(self) -> int:
-        """Cursor behind the newest images."""
+        """Cursor after the newest images."""
         return self._rings.images.written
 
     @property
     def record_type(self) -> np.dtype[np.void]:
-        """Type of the records, see `record_type`."""
+        """Type of the records; see `record_type`."""
         return self._rings.records.items.dtype
 
     @property
     def image_type(self) -> np.dtype[np.void]:
-        """Type of the images, see `image_type`."""
+        """Type of the images; see `image_type`."""
         return self._rings.images.items.dtype
 
     @property
     def stale(self) -> bool:
-        """Whether nothing more comes: the engine has ended or died, or another one has taken its name.
+        """Whether no more data come: the engine has ended or died, or another one has taken its name.
 
-        What is there can still be read.
+        Existing data can still be read.
         """
         return self._ring.closed or self._ring.stale
 
     def records_since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
-        """Return copies of the records from a cursor on, in their order.
+        """Return copies of the records from a cursor on, in order.
 
         Parameters
         ----------
         cursor : int
         most : int, optional
-            Not more than so many, the oldest. Default: all that there are.
+            Maximum number of records; the oldest are returned. Default: all available.
 
         Returns
         -------
         records : structured array, (m,)
             See `record_type`.
         cursor : int
-            For the next call.
+            Cursor for the next call.
         dropped : int
             Records that were overwritten before they could be copied.
         """
@@ -350,12 +350,12 @@ class TelemetryReader:
         return changes, cursor, dropped
 
     def close(self) -> None:
-        """Let go of the segment."""
+        """Close the segment."""
         self._ring.close()
 
 
 def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]:
-    """Make the segment, with its description and empty rings; return it and where the rings begin."""
+    """Create the segment, with its description and empty rings; return it and the offset of the rings."""
     text = json.dumps(description).encode()
     begin = up_to_pages(_START.size + len(text))
     rings = sum(up_to_pages(kind.itemsize * places) for kind, places in kinds_of(description))
@@ -368,8 +368,8 @@ def _segment(name: str, description: Mapping[str, Any]) -> tuple[PixelRing, int]
         raise InputError(f"telemetry of {name}: {error}") from None
     ring = PixelRing(segment, memory, header, identity)
     slot = ring.pixels[0, 0]
-    slot[::PAGE] = 0  # every page is there before the first frame
+    slot[::PAGE] = 0  # touch every page before the first frame
     slot[_START.size : _START.size + len(text)] = np.frombuffer(text, np.uint8)
     fence()
-    _START.pack_into(slot.data, 0, _MAGIC, len(text), zlib.crc32(text))  # last: now it may be read
+    _START.pack_into(slot.data, 0, _MAGIC, len(text), zlib.crc32(text))  # last: from here on it can be read
     return ring, begin

@@ -1,4 +1,4 @@
-"""What lies where in a telemetry segment: the types of its three rings, and reading and writing them."""
+"""Layout of a telemetry segment: the types of its three rings, and reading and writing them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from faintspot.kernels.ordered import fence, load, store
 from faintspot.sensor.layout import Layout
 
 CHANGE_BYTES = 4096
-"""Bytes of one place in the ring of changes: the length of the text, 8 bytes, and the text."""
+"""Bytes per place in the ring of changes: the length of the text (8 bytes), then the text."""
 CHANGE_SLOTS = 256
 PAGE = 4096
-_CELL_BYTES = 128  # counts are so far apart that no two share a cache line, or the pair fetched with it
+_CELL_BYTES = 128  # distance of the counts, so that no two share a cache line or a prefetched pair
 
 
 def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
-    """Return the type of a record of n sub-apertures; px and electrons as in `faintspot.Slopes`.
+    """Return the type of a record of n sub-apertures; units as in `faintspot.Slopes`.
 
-    `sequence` counts the records from 0, `frame` is the camera's number, `arm` says which of interleaved
-    settings were used, `change` the last change of settings that is in them. Times are of CLOCK_MONOTONIC,
-    ns; `clock_offset_ns`, added to them, gives Unix time by the wall clock at that moment. With commands,
-    also those that followed from the frame, in the interaction matrix's unit, and the loop's state `loop`:
-    1 open, 2 closed.
+    `sequence` counts the records from 0, `frame` is the camera's number, `arm` the number of the interleaved
+    configuration, `change` that of the last change of settings that applies. Times are of CLOCK_MONOTONIC,
+    ns; `clock_offset_ns` added to them gives Unix time by the wall clock at that moment. With commands, the
+    record also has those that follow from the frame, in the interaction matrix's unit, and the loop's state
+    `loop`: 1 open, 2 closed.
     """
     numbers = ("sequence", "frame", "arm", "change", "last_row_time_ns", "published_time_ns")
     head = [(name, np.int64) for name in (*numbers, "clock_offset_ns")]
@@ -52,35 +52,35 @@ def image_type(frame_shape: tuple[int, int], n: int, window: tuple[int, int]) ->
 
 
 class Ring:
-    """One of the rings: a number of places, and the count of items ever written."""
+    """One of the rings: its places, and the count of items ever written."""
 
     def __init__(self, cells: NDArray[np.int64], row: int, items: NDArray[Any]) -> None:
         self.items, self._cell = items, cells[row]
 
     @property
     def written(self) -> int:
-        """Items ever written."""
+        """Number of items ever written."""
         count: int = load(self._cell, 0)
         return count
 
     def count(self, written: int) -> None:
-        """Say how many items have been written."""
+        """Set the number of items written."""
         store(self._cell, 0, written)
         fence()  # before the next item overwrites the oldest
 
     def since(self, cursor: int, most: int | None) -> tuple[NDArray[Any], int, int]:
-        """Copies of the items from number `cursor` on, the next cursor, how many were lost."""
+        """Return copies of the items from number `cursor` on, the next cursor, and how many were lost."""
         places, written = len(self.items), self.written
-        first = max(cursor, written - places + 1)  # one place is being written to at any time
+        first = max(cursor, written - places + 1)  # one place may be in use by the writer
         last = max(first, written if most is None else min(written, first + most))
         copies = self.items[np.arange(first, last) % places]
-        fence()  # before looking what was overwritten meanwhile
+        fence()  # before checking what was overwritten meanwhile
         overwritten = min(max(self.written - places + 1 - first, 0), len(copies))
         return copies[overwritten:], last, first - cursor + overwritten
 
 
 class Rings:
-    """The three rings as they lie in the segment's memory."""
+    """The three rings in the segment's memory."""
 
     def __init__(self, memory: NDArray[np.uint8], begin: int, description: Mapping[str, Any]) -> None:
         cells = memory[begin : begin + PAGE].view(np.int64).reshape(-1, _CELL_BYTES // 8)
@@ -95,7 +95,7 @@ class Rings:
 
 
 def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], int]]:
-    """Type and number of places of the three rings."""
+    """Return the type and number of places of each of the three rings."""
     layout = description["layout"]
     n, shape, window = len(layout["corners"]), tuple(layout["frame_shape"]), tuple(layout["window"])
     change = np.dtype([("length", np.int64), ("text", np.uint8, (CHANGE_BYTES - 8,))])
@@ -107,17 +107,17 @@ def kinds_of(description: Mapping[str, Any]) -> list[tuple[np.dtype[np.void], in
 
 
 def layout_values(layout: Layout) -> dict[str, Any]:
-    """The layout as plain values, from which `Layout` makes it again."""
+    """Return a layout as plain values, from which `Layout` can be rebuilt."""
     return {
         name: plain(value) if isinstance(value, np.ndarray) else value for name, value in vars(layout).items()
     }
 
 
 def plain(value: Any) -> Any:
-    """NumPy's numbers and arrays as plain ones, others as text."""
+    """Convert NumPy's numbers and arrays to plain values, and other objects to text."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def up_to_pages(size: int) -> int:
-    """Bytes rounded up to whole pages."""
+    """Round a number of bytes up to whole pages."""
     return -(-size // PAGE) * PAGE

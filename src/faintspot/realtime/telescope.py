@@ -1,4 +1,4 @@
-"""A simulated telescope at a camera's pace: commands in, pixels and the truth out, through shared memory."""
+"""A simulated telescope at a camera's pace, which reads commands and publishes pixels and truth."""
 
 from __future__ import annotations
 
@@ -26,64 +26,64 @@ from faintspot.realtime.shared_streams import create_stream, held
 from faintspot.realtime.telescope_orders import Conditions
 
 TRUTH = ("frame", "strehl", "rms_nm", "r0_m", "time_s", "begun_s", "command_frame", "photons")
-"""What NAME_truth holds of a frame, float64.
+"""Values of NAME_truth for a frame, float64.
 
-Strehl ratio and rms of the wavefront after the mirror, r0, the middle of the exposure in the air's own time,
-when the exposure began (CLOCK_MONOTONIC), the frame number with which the commands that acted were stamped
-(-1: none yet), photo-electrons of a fully lit sub-aperture.
+Strehl ratio and rms of the residual wavefront, r0, the middle of the exposure on the atmosphere's clock, the
+start of the exposure (CLOCK_MONOTONIC), the frame number stamped on the commands in use (-1: none yet), and
+photo-electrons per fully illuminated sub-aperture.
 """
 LENGTHY = ("set",)
-"""Commands that wait for the next exposure: other commands are answered meanwhile."""
-_EFFECT_TIMEOUT_S = 0.5  # for an order to take effect, before the reply says that no exposure has begun yet
+"""Commands that wait for the next exposure; other commands are answered meanwhile."""
+_EFFECT_TIMEOUT_S = 0.5  # to wait for an order to take effect
 _BETWEEN_COMPLAINTS_S = 10.0
 
 
 @dataclass(eq=False)
 class Order:
-    """Conditions that somebody has asked for."""
+    """Requested change of the observing conditions."""
 
     conditions: Conditions
     frame: int = -1
-    """The first with them."""
+    """First frame with them."""
     in_effect: threading.Event = field(default_factory=threading.Event)
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """A frame, and the truth as `TRUTH`."""
+    """A frame, and its truth as in `TRUTH`."""
 
     pixels: NDArray[Any]
     truth: tuple[float, ...]
 
 
 class SimulatedTelescope(Readout, Closing):
-    """Observes as `simulate_loop` does, with the commands of a stream.
+    """Telescope that observes as `simulate_loop` does, with the commands of a stream.
 
-    The exposure of a frame takes a frame time, its read-out a part of the next one. When an exposure begins,
-    the mirror takes the newest commands of the stream NAME_commands and holds them until it ends. Frame k is
-    that of `simulate_loop` with the same commands, seed and realisation; where frames come late, so does the
-    air. Simulation and read-out are threads of their own.
+    The exposure takes one frame time, the read-out a part of the next one. At the start of an exposure the
+    mirror takes the newest commands of the stream NAME_commands and holds them until its end. Frame k equals
+    that of `simulate_loop` with the same commands, seed and realisation; late frames delay the atmosphere,
+    too. Simulation and read-out run in separate threads.
 
-    Rows go into the pixel ring NAME. When the last one is out, the stream NAME_truth says what the frame
-    was (`TRUTH`) and NAME_frames has it as a whole, both stamped with its number.
+    Rows go into the pixel ring NAME. After the last one, the stream NAME_truth gets the truth (`TRUTH`) and
+    NAME_frames the whole frame, both stamped with its number.
 
     Parameters
     ----------
     configuration : LoopConfiguration
-        Its frame rate is the camera's.
+        Its frame rate is that of the camera.
     name : str
-        Of the pixel ring, and of the streams.
+        Name of the pixel ring and of the streams.
     seed : int, optional
         Default: the configuration's.
     realisation : int
     readout_fraction : float
         Part of the frame time in which the rows arrive, 0 to 1.
     rows_per_block : int, optional
-        Rows that are published together. Default: those of a sub-aperture.
+        Rows that are published together. Default: the rows of a sub-aperture.
     slots : int
         Frames in the ring.
     say : function, optional
-        Told in one line what happens to the commands, and when the pace cannot be kept.
+        Called with a one-line message about the commands, and when the pace cannot be kept.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class SimulatedTelescope(Readout, Closing):
     InputError
         When a value is out of its range, parts do not fit together, or the ring or a stream cannot be made.
     MissingExtraError
-        Without HCIPy or pyshmem.
+        When HCIPy or pyshmem is not installed.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class SimulatedTelescope(Readout, Closing):
         self._complained_s, self._complained_of = -np.inf, 0
 
     def close(self) -> None:
-        """Remove the ring and the streams; closing again does nothing."""
+        """Remove the ring and the streams; repeated calls do nothing."""
         self._resources.close()
 
     def run(
@@ -153,12 +153,12 @@ class SimulatedTelescope(Readout, Closing):
         stop: StopEvent | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> CameraReport:
-        """Observe until there are `n_frames` or `stop` is set; a later run goes on.
+        """Observe until `n_frames` are out or `stop` is set; a later call continues.
 
         Raises
         ------
         InputError
-            When `n_frames` is not a whole number of at least 1, or somebody else holds a stream's lock.
+            When `n_frames` is not a whole number of at least 1, or another process holds a stream's lock.
         """
         self._complained_of = 0
         with held(self._frames, self._truth):
@@ -170,7 +170,7 @@ class SimulatedTelescope(Readout, Closing):
         Raises
         ------
         InputError
-            For a name or value that is not understood; nothing changes then.
+            When a name or value is not valid; nothing changes then.
         """
         with self._orders:
             before = self._conditions if self._order is None else self._order.conditions
@@ -178,7 +178,7 @@ class SimulatedTelescope(Readout, Closing):
             return self._order
 
     def status(self) -> dict[str, Any]:
-        """Return what the telescope has done and sees, for the control channel."""
+        """Return the telescope's counters and conditions, for the control channel."""
         last = self._last
         return {
             "name": self.name,
@@ -200,14 +200,14 @@ class SimulatedTelescope(Readout, Closing):
     # ---- frame by frame
 
     def _frame(self) -> NDArray[Any]:
-        """Return frame number `_next`, whose exposure began a frame time ago, but for the first one."""
+        """Return frame number `_next`, whose exposure began a frame time ago (except for the first one)."""
         if self._underway is None:
             self._underway = self._begin(self._next)
         self._last = self._underway.result()
         return self._last.pixels
 
     def _publish(self, moment: int, frame: NDArray[Any]) -> None:
-        """Read out one frame; the exposure of the next one begins."""
+        """Read out one frame while the exposure of the next one begins."""
         number, exposure = self._next, self._last
         assert exposure is not None
         self._underway = self._begin(number + 1)
@@ -217,7 +217,7 @@ class SimulatedTelescope(Readout, Closing):
         self._complain()
 
     def _begin(self, number: int) -> Future[Exposure]:
-        """Begin an exposure: with the conditions and commands of this moment."""
+        """Begin an exposure with the present conditions and commands."""
         begun_s = time.monotonic()
         self.commands.take()
         time_s = (number + 0.5) / self.configuration.control.frame_rate_hz
@@ -231,7 +231,7 @@ class SimulatedTelescope(Readout, Closing):
         return self._worker.submit(self._expose, number, time_s, self.commands.commands_nm, stamps)
 
     def _set(self, conditions: Conditions, time_s: float) -> None:
-        """Change flux and atmosphere; the wind goes on from where it has blown the air to."""
+        """Change flux and turbulence; the phase screens stay where the wind has moved them."""
         atmosphere = self.telescope_model.atmosphere.blown(self._wind * conditions.wind_factor, time_s)
         self.telescope_model.atmosphere = replace(atmosphere, r0_range_m=conditions.r0_m)
         self.telescope_model.photons = conditions.photons
@@ -240,14 +240,14 @@ class SimulatedTelescope(Readout, Closing):
     def _expose(
         self, number: int, time_s: float, commands_nm: NDArray[np.float64], stamps: tuple[float, ...]
     ) -> Exposure:
-        """Simulate one frame; in a thread of its own."""
+        """Simulate one frame; runs in a separate thread."""
         after, seen = self.telescope_model.wavefronts(time_s, commands_nm)
         truth = self.telescope_model.truth(time_s, after)
         known = (float(number), truth.strehl, truth.rms_nm, truth.r0_m, time_s)
         return Exposure(self.telescope_model.frame(number, seen), known + stamps)
 
     def _complain(self) -> None:
-        """Say that the pace cannot be kept, now and then."""
+        """Report, at intervals, that the pace cannot be kept."""
         now = time.monotonic()
         if self.overruns <= self._complained_of or now - self._complained_s < _BETWEEN_COMPLAINTS_S:
             return
@@ -260,7 +260,7 @@ class SimulatedTelescope(Readout, Closing):
 
 
 def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
-    """Return the commands: status and set."""
+    """Return the commands of the control channel: status and set."""
 
     def status(fields: dict[str, Any]) -> Mapping[str, Any]:
         return telescope.status()

@@ -13,48 +13,48 @@ from faintspot.base.toml_files import check_keys
 from faintspot.turbulence.von_karman import R0_WAVELENGTH_M
 
 ORDERS = ("photons", "magnitude", "r0_m", "seeing_arcsec", "wind_factor")
-_FWHM = 0.976  # of a long exposure, in wavelength / r0, without outer scale (Roddier 1981)
+_FWHM = 0.976  # long-exposure FWHM in units of wavelength / r0, without outer scale (Roddier 1981)
 _LARGEST_PHOTONS = 1e9
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """The star's flux and the air.
+    """The star's flux and the turbulence.
 
     Raises
     ------
     InputError
-        For more flux than a camera can take.
+        When the flux exceeds what a camera can take.
     """
 
     photons: float
-    """Photo-electrons of a fully lit sub-aperture in a frame."""
+    """Photo-electrons per fully illuminated sub-aperture and frame."""
     r0_m: tuple[float, float]
-    """Between which the Fried parameter at 500 nm drifts."""
+    """Range within which the Fried parameter at 500 nm drifts."""
     wind_factor: float = 1.0
-    """Winds as a multiple of the configuration's."""
+    """Wind speeds as a multiple of the configuration's."""
 
     def __post_init__(self) -> None:
         number_between("photons", self.photons, 0, _LARGEST_PHOTONS, low_open=True)
 
     @classmethod
     def of(cls, configuration: LoopConfiguration) -> Conditions:
-        """Return the configuration's own."""
+        """Return the configuration's own conditions."""
         r0 = configuration.atmosphere.r0_m
         return cls(configuration.photons, r0 if isinstance(r0, tuple) else (r0, r0))
 
     def ordered(self, configuration: LoopConfiguration, changes: Mapping[str, Any]) -> Conditions:
-        """Return them with changes, by the names of `ORDERS`.
+        """Return the conditions with changes, by the names of `ORDERS`.
 
         Raises
         ------
         InputError
-            For an unknown name, a value out of its range, two amounts of flux or two kinds of seeing.
+            For an unknown name, a value out of its range, two values of the flux or two of the seeing.
         """
         check_keys("", changes, ORDERS, what="order")
         for pair in (("photons", "magnitude"), ("r0_m", "seeing_arcsec")):
             if all(name in changes for name in pair):
-                raise InputError(f"{' and '.join(pair)}: expected one of them, got both")
+                raise InputError(f"{' and '.join(pair)}: expected one of the two, got both")
         new: dict[str, Any] = {}
         if "photons" in changes:
             new["photons"] = number_between("photons", changes["photons"], 0, _LARGEST_PHOTONS, low_open=True)
@@ -72,7 +72,7 @@ class Conditions:
 
 
 def _two_ends(name: str, value: Any, low: float, high: float) -> tuple[float, float]:
-    """Return one number twice, or two as they are."""
+    """Return a single number twice, or a pair unchanged."""
     ends = numbers_between(name, value, low, high)
     if ends.size not in (1, 2) or ends.ndim > 1:
         raise InputError(f"{name}: expected one number, or two to drift between, got {value!r:.80}")

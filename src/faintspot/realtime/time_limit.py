@@ -1,4 +1,4 @@
-"""Calling code of others that may never come back."""
+"""Calls of user code that may never return."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
     Parameters
     ----------
     limit_s : float
-        After so long it is given up; its thread is asked to end, see `end_thread`.
+        Time limit; a call that exceeds it is abandoned and its thread asked to end, see `end_thread`.
     what : str
-        Of whom the error speaks.
+        Subject of the error message.
 
     Raises
     ------
     InputError
-        When the time is over, or the function raises what would end the process or the calling thread, such
-        as SystemExit. Other exceptions are raised here as they are.
+        When the time is over, or the function raises an exception that would end the process or the thread,
+        such as SystemExit. Other exceptions are passed on.
     """
     replies: SimpleQueue[tuple[Result | None, BaseException | None]] = SimpleQueue()
 
     def work() -> None:
         try:
             replies.put((function(*arguments), None))
-        except BaseException as error:  # whatever it is, it belongs to the caller
+        except BaseException as error:  # pass any exception to the caller
             replies.put((None, error))
 
     thread = threading.Thread(target=work, name=_TRIAL, daemon=True)
@@ -54,17 +54,18 @@ def call_within(limit_s: float, what: str, function: Callable[..., Result], *arg
 
 
 def call_is_under_way() -> bool:
-    """Return whether a `call_within` is under way in this process: it may compile, and hold up other threads.
+    """Return whether a `call_within` is running in this process: it may compile and delay other threads.
 
-    One that was given up counts until its thread has ended.
+    An abandoned call counts until its thread has ended.
     """
     return any(thread.name == _TRIAL for thread in threading.enumerate())
 
 
 def end_thread(thread: threading.Thread) -> None:
-    """Ask a thread that is given up to end: Python code there is left at its next step.
+    """Ask an abandoned thread to end; Python code ends at its next step.
 
-    Else an endless loop would go on to take turns with all other threads. Compiled code does not notice.
+    Otherwise an endless loop would keep taking turns with all other threads. Compiled code is not
+    interrupted.
     """
     if thread.ident is not None:
         identifier, exception = ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit)

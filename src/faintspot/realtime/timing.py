@@ -1,4 +1,4 @@
-"""What a running engine counts: latencies as a histogram of fixed size, and events."""
+"""Statistics of a running engine: a latency histogram of fixed size, and counters."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from faintspot.base.checks import number_between
 
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide
-_LONGEST_NS = 2**37 - 1  # 137 s; what is longer counts in the last bin
+_LONGEST_NS = 2**37 - 1  # 137 s; longer durations count in the last bin
 _BINS = ((_LONGEST_NS.bit_length() - _BITS - 1) << _BITS) + 2 ** (_BITS + 1)
 RESOLUTION = 2.0 ** -(_BITS + 1)
 """Largest relative error of a percentile."""
 
 
 class Latencies:
-    """Distribution of durations, in memory that does not grow.
+    """Distribution of durations in a fixed amount of memory.
 
-    A duration's bin is its leading 8 bits, so that finding it takes two shifts; durations below 256 ns
-    are counted exactly, longer ones to within 0.4 %. Count, mean, smallest and largest are exact.
+    A duration's bin is given by its leading 8 bits, so that finding it takes two shifts. Durations below 256
+    ns are counted exactly, longer ones to within 0.4 %. Count, mean, smallest and largest are exact.
 
     One thread adds and resets; others may read at the same time.
     """
@@ -35,14 +35,14 @@ class Latencies:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything; the memory stays."""
+        """Clear the distribution."""
         self._counts[:] = array("q", bytes(8 * _BINS))
         self._total = 0
         self._smallest = -1
         self._largest = 0
 
     def add(self, duration_ns: int) -> None:
-        """Count a duration, ns, a plain int; a negative one counts as 0."""
+        """Count a duration [ns], a plain int; a negative one counts as 0."""
         if duration_ns < 0:
             duration_ns = 0
         if duration_ns > self._largest:
@@ -64,24 +64,24 @@ class Latencies:
 
     @property
     def mean_ns(self) -> float:
-        """Arithmetic mean, ns; NaN when there is nothing."""
+        """Arithmetic mean [ns]; NaN without durations."""
         count = self.count
         return self._total / count if count else math.nan
 
     @property
     def smallest_ns(self) -> int:
-        """Shortest duration, ns; 0 when there is nothing."""
+        """Shortest duration [ns]; 0 without durations."""
         return max(self._smallest, 0)
 
     @property
     def largest_ns(self) -> int:
-        """Longest duration, ns; 0 when there is nothing."""
+        """Longest duration [ns]; 0 without durations."""
         return self._largest
 
     def percentile_ns(self, percent: float) -> float:
-        """Return the shortest duration that at least `percent` % of all do not exceed, ns.
+        """Return the shortest duration that at least `percent` % of all do not exceed [ns].
 
-        Within a factor 1 +- `RESOLUTION` of the exact value; NaN when there is nothing.
+        Within a factor 1 +- `RESOLUTION` of the exact value; NaN without durations.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class Latencies:
         return self._percentile(self._snapshot(), percent)
 
     def distribution(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Return the bins that hold something: shortest and longest duration (ns, inclusive) and count."""
+        """Return the bins in use: shortest and longest duration [ns, inclusive] and count."""
         counts = self._snapshot()
         index = np.flatnonzero(counts)
         shift = np.maximum((index >> _BITS) - 1, 0)
@@ -100,7 +100,7 @@ class Latencies:
         return lowest, lowest + (1 << shift) - 1, counts[index]
 
     def merge(self, other: Latencies) -> Latencies:
-        """Return the distribution of both together."""
+        """Return the sum of both distributions."""
         both = Latencies()
         both._counts = array("q", (self._snapshot() + other._snapshot()).tobytes())
         both._total = self._total + other._total
@@ -110,7 +110,7 @@ class Latencies:
         return both
 
     def as_dict(self) -> dict[str, int | float | None]:
-        """Return count, and mean, percentiles, smallest and largest in microseconds; None without any."""
+        """Return the count, and mean, percentiles, smallest and largest [us]; None without durations."""
         counts = self._snapshot()
         count = int(counts.sum())
         values = {
@@ -124,7 +124,7 @@ class Latencies:
         return {"count": count, **{name: value / 1e3 if count else None for name, value in values.items()}}
 
     def _snapshot(self) -> NDArray[np.int64]:
-        """A copy of the counts, made in one step, so that one reading's figures fit together."""
+        """Return a copy of the counts, so that the figures of one reading are consistent."""
         return np.array(self._counts, np.int64)
 
     def _percentile(self, counts: NDArray[np.int64], percent: float) -> float:
@@ -144,43 +144,43 @@ class Latencies:
 
 @dataclass(slots=True)
 class Counters:
-    """What an engine has seen and done since it started; plain numbers, changed in place."""
+    """Counters of an engine since its start, changed in place."""
 
     frames_in: int = 0
     """Frames that began to arrive."""
     processed: int = 0
     """Frames whose slopes were published."""
     dropped: int = 0
-    """Frames that arrived and whose slopes were not published."""
+    """Frames that arrived but whose slopes were not published."""
     late: int = 0
-    """Frames whose slopes were published after the time allowed."""
+    """Frames whose slopes were published later than allowed."""
     repeated: int = 0
-    """Frames whose number was that of the frame before, or lower."""
+    """Frames whose number was not above that of the frame before."""
     skipped: int = 0
     """Frame numbers that the source left out."""
     short: int = 0
-    """Frames that ended before their last row; they count as dropped too."""
+    """Frames that ended before their last row; also counted as dropped."""
     torn: int = 0
-    """Frames that were overwritten while they were measured; they count as dropped too."""
+    """Frames that were overwritten while being measured; also counted as dropped."""
     invalid_subapertures: int = 0
-    """Slopes that were not valid."""
+    """Invalid slopes."""
     at_iteration_limit: int = 0
     """Slopes whose denoising ended at the iteration limit."""
     iterations: int = 0
-    """Iterations of the denoising, of all sub-apertures together."""
+    """Total number of denoising iterations of all sub-apertures."""
     settings_changes: int = 0
     """Changes of settings that took effect."""
     settings_refused: int = 0
     """Changes that were refused."""
     source_restarts: int = 0
-    """How often the source went away and came back, or its frame numbers jumped too far ahead."""
+    """Number of times that the source restarted or its frame numbers jumped too far ahead."""
     commands_renewed: int = 0
-    """How often NAME_commands was removed and made anew."""
+    """Number of times that NAME_commands was removed and recreated."""
     estimator_failures: int = 0
     """Frames in which an estimator in NumPy failed: all their slopes are invalid."""
     worker_restarts: int = 0
     """Worker threads that died and were replaced."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the numbers by name."""
+        """Return the counters by name."""
         return asdict(self)

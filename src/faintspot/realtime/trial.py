@@ -1,7 +1,7 @@
-"""The first trial of a file with estimators, in a process of its own: a crash or hang there is one line here.
+"""First trial of a file with estimators, in a separate process that may crash or hang without harm.
 
-The process is given all that makes the pipelines, runs the file, tries its estimators on `trial_frames`, and
-answers in one line of JSON. It ends when the time is over, also when nobody waits for it any more.
+The process receives all that makes the pipelines, runs the file, tries its estimators on `trial_frames`, and
+answers with one line of JSON. It ends at the time limit, even if the parent has gone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from faintspot.realtime.estimator_file import load_estimators
 from faintspot.realtime.python_path import tried
 
 LIMIT_S = 90.0
-_GRACE_S = 5.0  # for the process to end by itself
+_GRACE_S = 5.0  # for the process to end on its own
 _PROGRAM = (
     f"import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from {__name__} import main; main()"
 )
@@ -42,11 +42,11 @@ class Trial:
     path : path
         Python file that registers estimators.
     make_pipeline : function
-        Makes a pipeline from settings; can be pickled.
+        Function that makes a pipeline from settings; can be pickled.
     settings : Settings
-        Its shared options are those of the trial.
+        Settings whose shared options are used in the trial.
     limit_s : float
-        Longest time of the trial.
+        Time limit of the trial.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Trial:
         Raises
         ------
         InputError
-            When it is refused.
+            When the file is refused.
         """
         file = load_estimators(self.path)
         for name in file.kinds:
@@ -68,12 +68,12 @@ class Trial:
         return {"estimators": list(file.kinds), "digest": file.digest}
 
     def elsewhere(self) -> dict[str, Any]:
-        """Try the file in a process of its own; return what `here` returns.
+        """Try the file in a separate process; return the same as `here`.
 
         Raises
         ------
         InputError
-            When it is refused, ends or crashes that process, or does not return.
+            When the file is refused, ends or crashes the process, or does not return.
         """
         late = f"{self.path}: did not return within {self.limit_s:g} s in its trial"
         try:
@@ -88,7 +88,9 @@ class Trial:
         except subprocess.TimeoutExpired:
             raise InputError(late) from None
         except OSError as error:
-            raise InputError(f"{self.path}: no process for its trial ({error.strerror or error})") from None
+            raise InputError(
+                f"{self.path}: cannot start a process for its trial ({error.strerror or error})"
+            ) from None
         if done.returncode == -signal.SIGALRM:
             raise InputError(late)
         if done.returncode < 0:
@@ -105,16 +107,16 @@ class Trial:
 
 
 def main() -> None:
-    """Try the file that standard input describes; the process's whole life."""
+    """Try the file that standard input describes; the main function of the process."""
     answer = os.dup(1)
-    os.dup2(2, 1)  # what the file prints is not the answer
+    os.dup2(2, 1)  # the file's output is not the answer
     trial: Trial = pickle.load(sys.stdin.buffer)
-    signal.alarm(max(1, round(trial.limit_s)))  # ends compiled code as well
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a crash leaves no file behind
+    signal.alarm(max(1, round(trial.limit_s)))  # interrupts compiled code, too
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file after a crash
     try:
         reply = trial.here()
     except BaseException as error:
         refused = isinstance(error, InputError)
         reply = {"error": str(error) if refused else f"{trial.path}: {one_line(error)}"}
     os.write(answer, json.dumps(reply).encode())
-    os._exit(0)  # threads that do not return are left behind
+    os._exit(0)  # do not wait for threads that never return

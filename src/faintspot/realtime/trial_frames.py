@@ -10,13 +10,13 @@ from faintspot.pipeline.slope_pipeline import SlopePipeline
 _FLUX_E = 300.0
 _NOISE_E = 3.0
 _SPOT_STD_PX = 1.0
-_SATURATED_ADU = 65535.0  # where nothing else is known
+_SATURATED_ADU = 65535.0  # if the detector's saturation is not known
 
 
 def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
     """Return frames (h, w) in ADU: without flux, with typical spots, of noise, of saturated pixels.
 
-    The same ones every time.
+    The frames are the same each time.
     """
     calibration = pipeline.calibration
     dark, scale = _dark_and_scale(pipeline)
@@ -27,7 +27,7 @@ def trial_frames(pipeline: SlopePipeline) -> list[NDArray[np.float32]]:
 
 
 def typical_frame(pipeline: SlopePipeline) -> NDArray[np.float32]:
-    """Return a frame (h, w) in ADU with a spot in every sub-aperture, and read noise; always the same one."""
+    """Return a frame (h, w) in ADU with a spot in every sub-aperture and read noise; the same each time."""
     layout = pipeline.layout
     dark, scale = _dark_and_scale(pipeline)
     rng = np.random.default_rng(2015)
@@ -45,7 +45,7 @@ def typical_frame(pipeline: SlopePipeline) -> NDArray[np.float32]:
 
 
 def _dark_and_scale(pipeline: SlopePipeline) -> NDArray[np.float32]:
-    """Dark (ADU) and electrons per ADU of every pixel, bad ones like good ones."""
+    """Return dark (ADU) and electrons per ADU of every pixel, treating bad pixels like good ones."""
     maps = pipeline.calibration.maps(pipeline.layout.frame_shape)
     maps[0], maps[1] = np.nan_to_num(maps[0]), np.nan_to_num(maps[1], nan=1.0, posinf=1.0)
     return maps

@@ -1,4 +1,4 @@
-"""Long-lived threads that measure parts of a frame: they wait inside compiled code, without the GIL."""
+"""Long-lived threads that measure parts of a frame and wait in compiled code, without the GIL."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _POSTED = 0
 _STOP_CELL = 0
 
 Task = Callable[[int], bool]
-"""Does the share of one worker, by its number from 1; says whether it came to its end."""
+"""Function that does the share of one worker, numbered from 1; returns whether it was completed."""
 
 
 class Workers:
     """Threads that do a task together with the caller, each its own share.
 
-    While they are awake they spin, so that a task begins within a microsecond; `park` lets them sleep.
+    While awake they poll, so that a task begins within a microsecond; `park` lets them sleep.
 
     Parameters
     ----------
     count : int
-        Threads beside the caller's.
+        Number of threads in addition to the caller's.
     cpus : sequence of int, optional
-        Processors to pin them to, in turn. Default: they run where the system puts them.
+        Processors to pin them to, cyclically. Default: not pinned.
     """
 
     def __init__(self, count: int, cpus: Sequence[int] | None = None) -> None:
@@ -40,18 +40,18 @@ class Workers:
         self._whole = [False] * (1 + count)
         self._task: Task | None = None
         self.fault: str | None = None
-        """What the last worker to die died of."""
+        """Error of the last worker that died."""
         self._awake, self._closed = threading.Event(), False
         self._awake.set()
         self._threads = [self._started(number) for number in range(1, 1 + count)]
 
     def post(self, task: Task) -> None:
-        """Let all begin a task; `wait` before the next one."""
+        """Start a task on all threads; call `wait` before the next one."""
         self._task = task
         store(self._cells, _POSTED, load(self._cells, _POSTED) + 1)
 
     def wait(self) -> bool:
-        """Wait until all have done their share; return whether every share came to its end."""
+        """Wait until all shares are done; return whether all were completed."""
         job = self._cells[_POSTED]
         for number in range(1, 1 + self.count):
             cell = number * _LINE
@@ -59,17 +59,17 @@ class Workers:
         return all(self._whole[1:])
 
     def park(self) -> None:
-        """Let the threads sleep, between two tasks."""
+        """Let the threads sleep between two tasks."""
         self._awake.clear()
         self._control[_STOP_CELL] = 1
 
     def wake(self) -> None:
-        """Let them spin again."""
+        """Wake the threads."""
         self._control[_STOP_CELL] = 0
         self._awake.set()
 
     def replace_dead(self) -> int:
-        """Start anew what has died, and give up its share; return how many. By any one other thread."""
+        """Restart dead threads and abandon their shares; return how many. For any one other thread."""
         dead = [index for index, thread in enumerate(self._threads) if not thread.is_alive()]
         for index in dead:
             number = index + 1
@@ -93,9 +93,9 @@ class Workers:
         return thread
 
     def _serve(self, number: int) -> None:
-        """Do the share of every task that comes."""
+        """Do the share of every task."""
         if self._cpus:
-            with suppress(OSError):  # said already where the caller's own processors were asked for
+            with suppress(OSError):  # already reported for the caller's own processors
                 os.sched_setaffinity(0, {self._cpus[number % len(self._cpus)]})
         cells = self._cells
         done = int(cells[number * _LINE])
@@ -114,4 +114,4 @@ class Workers:
 
 
 _NEVER = np.zeros(1, np.int64)
-"""Does not end any waiting: a share is done, or given up for its worker."""
+"""Cell that never ends a wait: shares are completed, or abandoned for a dead worker."""

@@ -1,4 +1,4 @@
-"""How every picture of a report looks: figures without global state, colours, maps of sub-apertures."""
+"""Common style of a report's figures: no global state, colours, maps of sub-apertures."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ except ImportError:
     raise MissingExtraError("matplotlib", "web", "Drawing pictures") from None
 
 COLOUR_MAP = "cividis"
-# Okabe & Ito (2008): told apart with any colour vision.
+# Okabe & Ito (2008): readable with any colour vision.
 ARM_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7")
 TRUTH_COLOUR = "#56B4E9"
 GREY = "#9a9a9a"
 FLUX_GREY = "#e4e4e4"
 DOTS_PER_INCH = 144
 MOST_WITH_GAPS = 600
-"""With more sub-apertures than this, gaps between them and outlines would only make a moiré."""
+"""Number of sub-apertures above which gaps and outlines are left out, because they cause a moiré pattern."""
 WIDTH = 13.0
-"""Inches of a picture as wide as the page."""
+"""Width of a full-width figure [inch]."""
 
 _STYLE: dict[str, Any] = {
     "font.size": 12,
@@ -52,7 +52,7 @@ _Result = TypeVar("_Result")
 
 
 def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Make a drawing function use the report's style, whatever the user's own settings are."""
+    """Make a drawing function use the report's style, independent of the user's settings."""
 
     @functools.wraps(draw)
     def with_style(*arguments: _Arguments.args, **options: _Arguments.kwargs) -> _Result:
@@ -65,13 +65,13 @@ def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty white figure, inches."""
+    """Return an empty white figure; width and height in inches."""
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
-@styled  # ticks are made only now
+@styled  # ticks are created here
 def png(figure: Figure, *, tight: bool = True) -> bytes:
-    """Return a figure as a PNG picture; `tight` cuts the margins, for which all is drawn twice."""
+    """Return a figure as PNG; `tight` trims the margins, which requires drawing twice."""
     stream = io.BytesIO()
     cut: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.15} if tight else {}
     figure.savefig(stream, format="png", dpi=DOTS_PER_INCH, **cut)
@@ -80,7 +80,7 @@ def png(figure: Figure, *, tight: bool = True) -> bytes:
 
 @styled
 def svg(figure: Figure) -> bytes:
-    """Return a figure as an SVG picture, the same bytes for the same figure."""
+    """Return a figure as SVG; equal figures give equal bytes."""
     matplotlib.rcParams["svg.hashsalt"] = "faintspot"
     stream = io.BytesIO()
     figure.savefig(stream, format="svg", metadata={"Date": None})
@@ -101,7 +101,7 @@ def subaperture_map(
     limits: tuple[float, float],
     title: str,
 ) -> None:
-    """Draw one value per sub-aperture at its place; without a value (NaN) it is an empty outline."""
+    """Draw one value per sub-aperture at its position; NaN gives an empty outline."""
     shapes = subaperture_shapes(layout)
     known = np.isfinite(values)
     empty = PolyCollection(list(shapes[~known]), facecolors="white", edgecolors=GREY, linewidths=0.6)
@@ -116,14 +116,14 @@ def subaperture_map(
 
 
 def plain_ticks(axis: XAxis | YAxis, values: Iterable[float], form: str = "g") -> None:
-    """Put ticks at these values and nowhere else, written as plain numbers."""
+    """Set ticks at these values only, formatted as plain numbers."""
     axis.set_major_locator(FixedLocator([float(value) for value in values]))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:{form}}"))
 
 
 def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str = "right") -> None:
-    """Put a colour bar beside one or several axes."""
+    """Add a colour bar to one or several axes."""
     first = axes[0] if isinstance(axes, list) else axes
     figure = first.get_figure()
     assert figure is not None
@@ -132,7 +132,7 @@ def colour_bar(axes: Axes | list[Axes], mappable: Any, label: str, location: str
 
 
 def place_axes(axes: Axes, layout: Layout) -> None:
-    """Set the limits of axes in frame pixels so that all sub-apertures are within."""
+    """Set the limits of axes in frame pixels so that all sub-apertures are visible."""
     shapes = subaperture_shapes(layout).reshape(-1, 2)
     margin = 0.25 * lenslet_pitch(layout)
     low, high = shapes.min(axis=0) - margin, shapes.max(axis=0) + margin
@@ -144,7 +144,7 @@ def place_axes(axes: Axes, layout: Layout) -> None:
 
 
 def limits_of(*arrays: NDArray[Any], low: float | None = None, percent: float = 100.0) -> tuple[float, float]:
-    """Return the colour limits for values of several maps together; never an empty range."""
+    """Return common colour limits for several maps; never an empty range."""
     values = np.concatenate([array[np.isfinite(array)] for array in map(np.ravel, arrays)])
     if values.size == 0:
         return 0.0, 1.0

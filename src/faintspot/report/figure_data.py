@@ -1,4 +1,4 @@
-"""A figure, what it is in words, and its numbers as a table."""
+"""A figure with its description, and its numbers as a table."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FigureWithData:
-    """A figure for a page: with numbers (a header) it is drawn as SVG and its data may be saved, else as PNG.
+    """A figure for a page: drawn as SVG with data to save if it has a header of numbers, else as PNG.
 
     Attributes
     ----------
     name : str
-        Of its files.
+        Base name of its files.
     title, caption : str
     figure : matplotlib Figure
     header, rows : sequence
-        Its numbers; none for pictures.
+        Its numbers; none for images.
     """
 
     name: str

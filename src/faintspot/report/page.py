@@ -1,4 +1,4 @@
-"""One page made of sections: an HTML text that needs nothing else."""
+"""Report page made of sections: one HTML text without external files."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from faintspot.base.version import __version__
 from faintspot.report.figure_data import FigureWithData
 
 POSITIONS = "Positions are in pixels from each sub-aperture’s centre, x along columns, y along rows."
-"""For the foot of a page."""
+"""Remark for the foot of a page."""
 _CSS_PIXELS_PER_INCH = 100
 _MEDIA_TYPES = {"png": "image/png", "svg": "image/svg+xml", "csv": "text/csv;charset=utf-8"}
 
 
 @dataclass(frozen=True)
 class Badge:
-    """A word on a coloured ground: an outcome. `colour`: "good", "mixed", "bad" or "grey"."""
+    """A word on a coloured background: an outcome. `colour`: "good", "mixed", "bad" or "grey"."""
 
     word: str
     colour: str = "grey"
@@ -30,16 +30,16 @@ class Badge:
 
 @dataclass(frozen=True)
 class Cell:
-    """What is in a cell of a table when it is more than a text."""
+    """Content of a table's cell with more than text."""
 
     text: str = ""
     badge: Badge | None = None
     small: str = ""
-    """Below the text, in small letters."""
+    """Small text below."""
     items: Sequence[tuple[str, str]] = ()
-    """A list: each a text, and a remark in small letters below it."""
+    """List of items: a text, and a small remark below it."""
     link: tuple[str, str] | None = None
-    """Name of a section and the words that lead there."""
+    """Name of a section, and the text of the link to it."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class Table:
     rows : sequence of sequences of str or Cell
     caption : str
     words : bool
-        The last column is prose.
+        Whether the last column is prose.
     prose : bool
-        All columns are.
+        Whether all columns are prose.
     csv : tuple of str, optional
         Name of a file and its text, for readers to save.
     folded : str
-        The line to click on where the table is shown only then.
+        Line to click on to show the table; "" shows it always.
     """
 
     header: Sequence[str]
@@ -82,16 +82,16 @@ class Section:
     Attributes
     ----------
     name : str
-        For links to it.
+        Name for links.
     title : str
     text : sequence of str
         Paragraphs.
     tables : sequence of Table
     figures : sequence of FigureWithData
     missing : str
-        Why something is not in it.
+        Reason why something is missing from it.
     points : sequence of str
-        A list, below the text.
+        List below the text.
     code : str
         Text of a file, shown after a click.
     """
@@ -108,7 +108,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: what it is about, what to look at first, and its sections."""
+    """A page: title, warnings, and sections."""
 
     title: str
     facts: Mapping[str, str]
@@ -116,18 +116,18 @@ class Page:
     warnings: Sequence[str] = ()
     warnings_title: str = "What to look at first"
     remark: str = ""
-    """For the foot of the page: what units and signs mean."""
+    """Remark for the foot of the page about units and signs."""
 
 
 @dataclass(frozen=True)
 class DrawnFigure:
-    """A figure as files: their contents by ending, png alone or png, svg and csv."""
+    """A drawn figure: contents of its files by ending, png alone or png, svg and csv."""
 
     name: str
     title: str
     caption: str
     width: int
-    """CSS pixels."""
+    """Width in CSS pixels."""
     contents: Mapping[str, bytes] = field(default_factory=dict)
 
     def uri(self, ending: str) -> str:
@@ -147,7 +147,7 @@ def html_of(page: Page) -> str:
 
 
 def write_page(page: Page, path: str | Path) -> list[Path]:
-    """Write a page and, in a folder beside it, each figure with data as PNG and SVG and its numbers as CSV.
+    """Write a page and a folder beside it with each figure that has data: PNG, SVG and numbers as CSV.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def write_page(page: Page, path: str | Path) -> list[Path]:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}: choose another place") from None
+        raise InputError(f"{folder}: {error.strerror}; choose another folder") from None
     for name, content in contents.items():
         write_atomically(folder / name, content)
     return [path, *(folder / name for name in contents)]
@@ -193,12 +193,12 @@ def write_report(path: str | Path, html: str) -> None:
 
 
 def data_uri(ending: str, content: bytes) -> str:
-    """Return a file (png, svg or csv) as a link that holds it."""
+    """Return a file (png, svg or csv) as a data URI."""
     return f"data:{_MEDIA_TYPES[ending]};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def configuration_section(text: str, name: str = "Configuration") -> Section:
-    """Return the section that shows a configuration or a specification; "" when it is not known."""
+    """Return the section that shows a configuration or a specification; "" if unknown."""
     missing = "" if text.strip() else f"The {name.lower()} of this run is not known."
     identifier = "-".join(re.findall(r"\w+", name.lower()))
     return Section(identifier, name, code=text.strip(), missing=missing)
@@ -210,7 +210,7 @@ def style() -> str:
 
 
 def _drawn(page: Page) -> dict[str, list[DrawnFigure]]:
-    """Draw the figures of every section, by its name."""
+    """Draw the figures of every section, by section name."""
     return {section.name: [_draw(figure) for figure in section.figures] for section in page.sections}
 
 
@@ -220,7 +220,7 @@ def _draw(item: FigureWithData) -> DrawnFigure:
     width = round(item.figure.get_size_inches()[0] * _CSS_PIXELS_PER_INCH)
     contents = {"png": drawing.png(item.figure)}
     if item.header:
-        item.figure.set_layout_engine("none")  # it has its layout now, which takes long to find
+        item.figure.set_layout_engine("none")  # keep the layout, which is slow to compute
         contents |= {"svg": drawing.svg(item.figure), "csv": item.csv().encode()}
     return DrawnFigure(item.name, item.title, item.caption, width, contents)
 

@@ -1,4 +1,4 @@
-"""Wavefronts from slopes: Zernike modes, their fit, and how it is shown and written."""
+"""Wavefronts from slopes: Zernike modes, their fit, figures and files."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ _NEGLIGIBLE = 1e-9  # of the largest singular value
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What of the slopes is not the gradient of any wavefront.
+    """Part of the slopes that is not the gradient of any wavefront.
 
     Examples
     --------
@@ -37,32 +37,32 @@ class Discrepancy:
     """
 
     rms_px: Floats
-    """(n_frames,): per slope that could be compared, so that noise alone gives its own rms."""
+    """Rms per slope that can be compared, (n_frames,): equals the noise's rms if there is only noise."""
     expected_px: Floats
-    """(n_frames,): from the slopes' standard errors; NaN where they are not known."""
+    """Rms expected from the slopes' standard errors, (n_frames,); NaN if they are not known."""
     degrees_of_freedom: int
-    """Combinations of slopes that no wavefront causes."""
+    """Number of combinations of slopes that no wavefront causes."""
 
     @property
     def ratio(self) -> float:
-        """Measured over expected, as mean squares over all frames; 1 where noise alone is there."""
+        """Measured over expected, as mean squares over all frames; 1 for noise alone."""
         return float(np.sqrt(np.mean(self.rms_px**2) / np.mean(self.expected_px**2)))
 
 
 def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     """Return the part of the slopes that is not a gradient, frame by frame.
 
-    Wavefronts are those of a phase at the corners of the sub-apertures (Fried 1977, JOSA 67, 370): with them,
-    the sum of slopes around a closed path is 0. What is left is noise, and what spoils slopes: centroid gains
-    that differ between x and y or from place to place (quad cells above all), wrong references, a rotation of
-    the lenslets against the detector, scintillation.
+    The wavefront is modelled by a phase at the corners of the sub-apertures (Fried 1977, JOSA 67, 370), for
+    which the sum of slopes around a closed path is 0. The remainder is noise, or an error of the slopes:
+    centroid gains that differ between x and y or between sub-apertures (above all in quad cells), wrong
+    references, a rotation of the lenslets against the detector, scintillation.
 
     Parameters
     ----------
     slopes : Slopes
-        Of one frame or several, relative to their reference.
+        Slopes of one frame or several, relative to their reference.
     layout : Layout
-        Square.
+        Layout with square geometry.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
     used = np.tile(valid.all(axis=0), 2)
     others = _not_gradients(_corner_gradients(layout)[used])
     if not others.shape[1]:
-        raise InputError("slopes: expected more valid sub-apertures: any slopes of these are a wavefront's")
+        raise InputError("slopes: expected more valid sub-apertures; these cannot show a discrepancy")
     errors = np.concatenate(
         [np.atleast_2d(getattr(slopes, f"standard_error_{axis}")) for axis in "xy"], axis=1
     )[:, used].astype(np.float64)
@@ -106,7 +106,7 @@ def slope_discrepancy(slopes: Slopes, layout: Layout) -> Discrepancy:
 
 
 def _corner_gradients(layout: Layout) -> Floats:
-    """Return the slopes (2 n, corners) of a phase of 1 at each corner of the lit sub-apertures."""
+    """Return the slopes (2 n, corners) of a phase of 1 at each corner of the illuminated sub-apertures."""
     rows, columns = layout.cells.T
     places = np.stack([[rows + down, columns + right] for down in (0, 1) for right in (0, 1)])
     corners, index = np.unique(places.transpose(0, 2, 1).reshape(-1, 2), axis=0, return_inverse=True)
@@ -126,7 +126,7 @@ def _corner_gradients(layout: Layout) -> Floats:
 
 
 def _not_gradients(gradients: Floats) -> Floats:
-    """Return an orthonormal basis (slopes, k) of what is not a combination of gradients (slopes, corners)."""
+    """Return an orthonormal basis (slopes, k) orthogonal to the gradients (slopes, corners)."""
     if not len(gradients):
         return np.zeros((0, 0))
     left, size, _ = np.linalg.svd(gradients, full_matrices=True)

@@ -1,4 +1,4 @@
-"""The picture of a wavefront: maps with and without tip and tilt, and its coefficients."""
+"""Figure of a wavefront: maps with and without tip and tilt, and its coefficients."""
 
 from __future__ import annotations
 
@@ -45,8 +45,9 @@ def wavefront_figure(
         below.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     above.suptitle(name, fontsize=14)
     caption = (
-        f"{what.capitalize()} over the disk of the pupil, in the frame's directions, with the lit "
-        "sub-apertures outlined; it grows towards where spots are displaced to. Below: its coefficients in "
+        f"{what.capitalize()} over the disk of the pupil, in the frame's directions, with the "
+        "illuminated sub-apertures outlined; it increases in the direction in which spots "
+        "are displaced. Below: its coefficients in "
         "Noll's order ± standard error"
         + (", and in grey the rms of each over the frames (motion and noise)." if several else ".")
     )
@@ -65,14 +66,14 @@ def wavefront_figure(
 
 
 def _map(axes: Axes, wavefront: Wavefront, layout: Layout, *, tilt: bool) -> None:
-    """Draw the mean wavefront where it is in the frame, the lit sub-apertures outlined."""
+    """Draw the mean wavefront at its position in the frame, with the illuminated sub-apertures outlined."""
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Circle
 
     pupil, sheet = wavefront.pupil, wavefront.sheet(tilt=tilt)
     (x, y), radius = pupil.centre_px, pupil.radius_px
     largest = float(np.nanmax(np.abs(sheet))) or 1.0
-    half = radius * len(sheet) / (len(sheet) - 1)  # the outermost points lie on the circle
+    half = radius * len(sheet) / (len(sheet) - 1)  # the outermost points are on the circle
     extent = (x - half, x + half, y - half, y + half)
     image = axes.imshow(sheet, cmap=_SIGNED_COLOURS, vmin=-largest, vmax=largest, extent=extent)
     if len(layout) <= _MOST_OUTLINED:

@@ -19,7 +19,7 @@ from faintspot.wavefront.zernike import mode_name, noll_to_nm
 
 
 def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
-    """Write a wavefront to a file; one that is there is replaced.
+    """Write a wavefront to a file, replacing an existing one.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
     Raises
     ------
     InputError
-        When the ending is another, or the file cannot be written.
+        When the ending is unknown, or the file cannot be written.
     MissingExtraError
         When astropy is needed and not installed.
 
@@ -55,9 +55,9 @@ def save_wavefront(path: str | Path, wavefront: Wavefront) -> None:
 
 
 def check_ending(path: Path) -> None:
-    """Refuse a name that says no format, before the work."""
+    """Refuse an unknown ending before the work."""
     if path.suffix.lower() not in _WRITERS:
-        raise InputError(f"{path}: expected a name that ends with {', '.join(_WRITERS)}")
+        raise InputError(f"{path}: expected a name ending in {', '.join(_WRITERS)}")
 
 
 def _csv(wavefront: Wavefront) -> str:
@@ -110,7 +110,7 @@ def _json(wavefront: Wavefront) -> str:
 
 
 def _plain(values: Floats) -> Any:
-    """Return an array as lists in which None stands for what is not known."""
+    """Return an array as lists with None for unknown values."""
     plain = values.astype(object)
     plain[~np.isfinite(values)] = None
     return plain.tolist()
@@ -128,7 +128,7 @@ def _fits(wavefront: Wavefront) -> bytes:
     primary.header["SUBAPRAD"] = (wavefront.pupil.radius_subapertures, "radius of the disk, sub-apertures")
     if wavefront.pupil.radius_m is not None:
         primary.header["PUPILRAD"] = (wavefront.pupil.radius_m, "radius of the disk, m")
-    primary.header["ERRFROM"] = (wavefront.errors_from, "what standard errors come from")
+    primary.header["ERRFROM"] = (wavefront.errors_from, "source of the standard errors")
     orders = np.array([noll_to_nm(int(j)) for j in wavefront.modes])
     columns = [
         fits.Column("NOLL", "J", array=wavefront.modes),

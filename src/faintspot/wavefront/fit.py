@@ -18,8 +18,8 @@ from faintspot.wavefront.zernike import mean_gradients, zernike
 Floats = NDArray[np.float64]
 
 LARGEST_CONDITION = 100.0
-"""Of the gradients of the modes, each scaled to 1: beyond, noise of one mode is amplified that much."""
-_HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # by default; higher orders are seldom asked for
+"""Largest condition number of the modes' gradients, each scaled to 1: the noise amplification allowed."""
+_HIGHEST_ORDER, _USUAL_CONDITION = 8, 20.0  # defaults; higher orders are rarely needed
 _TILTS = 2
 _NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
 
@@ -28,8 +28,8 @@ _NM_PER_ARCSEC_M = 1e9 * np.pi / (180 * 3600)
 class Wavefront:
     """Zernike coefficients of the wavefront in one frame or several.
 
-    The wavefront is the path by which light arrives late or early, less its mean, and grows towards where
-    spots are displaced to. All is over the whole disk of the pupil: a central obscuration has no modes of its
+    The wavefront is the optical path difference minus its mean; it increases in the direction of the spots'
+    displacement. All values refer to the whole disk of the pupil: a central obscuration has no modes of its
     own.
 
     Examples
@@ -49,36 +49,36 @@ class Wavefront:
     """
 
     modes: NDArray[np.int64]
-    """(k,): Noll's numbers, from 2."""
+    """Noll indices, (k,), from 2."""
     coefficients: Floats
-    """(n_frames, k): rms over the disk, as each mode's mean square is 1; NaN in frames not `fitted`."""
+    """Coefficients, (n_frames, k): rms over the disk, as each mode has mean square 1; NaN if not `fitted`."""
     standard_errors: Floats
-    """(n_frames, k): of the coefficients, from the slopes' noise; NaN where that cannot be told."""
+    """Standard errors of the coefficients from the slopes' noise, (n_frames, k); NaN if unknown."""
     errors_from: str
-    """"slopes": from their standard errors; "residuals": from their scatter about the fitted modes, which
-    counts modes that are not fitted as noise."""
+    """Source of the errors: "slopes" (their standard errors) or "residuals" (their scatter about the fitted
+    modes, which counts modes that are not fitted as noise)."""
     residual_px: Floats
-    """(n_frames,): rms of the slopes about the fitted modes, px per axis."""
+    """Rms of the slopes about the fitted modes, px per axis, (n_frames,)."""
     unit: str
-    """"nm", or "px × sub-aperture": slopes in pixels times lengths in sub-apertures."""
+    """Unit: "nm", or "px × sub-aperture" (slopes in pixels times lengths in sub-apertures)."""
     pupil: Pupil
     condition: float
     """Condition number of the fit with every sub-aperture that is ever valid."""
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
-        """(n_frames,): whether enough sub-apertures were valid to tell the modes apart."""
+        """Whether enough sub-apertures were valid to separate the modes, (n_frames,)."""
         return np.asarray(np.isfinite(self.coefficients).all(axis=1))
 
     @property
     def mean(self) -> Floats:
-        """(k,): coefficients of the mean wavefront."""
+        """Coefficients of the mean wavefront, (k,)."""
         mean: Floats = self.coefficients[self.fitted].mean(axis=0)
         return mean
 
     @property
     def mean_standard_error(self) -> Floats:
-        """(k,): of the mean: from the scatter over frames, as if independent; of one frame, its own."""
+        """Standard error of the mean, (k,), from the scatter over frames; for one frame, its own."""
         kept = self.coefficients[self.fitted]
         if len(kept) == 1:
             error: Floats = self.standard_errors[self.fitted][0]
@@ -88,12 +88,12 @@ class Wavefront:
 
     @property
     def rms_of_frames(self) -> Floats:
-        """(k,): root mean square of each coefficient over the frames."""
+        """Root mean square of each coefficient over the frames, (k,)."""
         rms: Floats = np.sqrt(np.mean(self.coefficients[self.fitted] ** 2, axis=0))
         return rms
 
     def rms(self, *, tilt: bool = True) -> Floats:
-        """Return the rms of each frame's wavefront over the disk, (n_frames,), with tip and tilt or not."""
+        """Return the rms of each frame's wavefront over the disk, (n_frames,)."""
         return total(self.coefficients, tilt=tilt)
 
     def sheet(self, coefficients: Floats | None = None, *, points: int = 201, tilt: bool = True) -> Floats:
@@ -104,9 +104,9 @@ class Wavefront:
         coefficients : (k,) array, optional
             Default: those of the mean wavefront.
         points : int
-            Along the diameter; rows go along y, columns along x, the outermost at the disk's edge.
+            Points along the diameter; rows go along y, columns along x, the outermost at the disk's edge.
         tilt : bool
-            False leaves out tip and tilt.
+            Whether to include tip and tilt.
         """
         values = self.mean if coefficients is None else coefficients
         line = np.linspace(-1, 1, points)
@@ -121,7 +121,7 @@ class Wavefront:
 
 
 def total(coefficients: Floats, *, tilt: bool = True) -> Floats:
-    """Return the rms of wavefronts over the disk: the root of the sum of squares along the last axis."""
+    """Return the rms of wavefronts over the disk: the root sum of squares along the last axis."""
     rms: Floats = np.sqrt(np.sum(coefficients[..., 0 if tilt else _TILTS :] ** 2, axis=-1))
     return rms
 
@@ -129,26 +129,26 @@ def total(coefficients: Floats, *, tilt: bool = True) -> Floats:
 def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -> Wavefront:
     """Fit Zernike modes to slopes, each frame by least squares over its valid sub-apertures.
 
-    What is compared with a slope is the mean gradient of a mode over the lenslet's square or hexagon, exactly
-    integrated; a sub-aperture that the pupil's edge cuts counts as whole, one with its centre beyond not at
-    all: a mode outside its disk is no wavefront's.
+    The model of a slope is the mean gradient of a mode over the lenslet's square or hexagon, integrated
+    exactly. A sub-aperture cut by the pupil's edge counts as whole. One whose centre is outside is left out,
+    because modes have no meaning outside their disk.
 
     Parameters
     ----------
     slopes : Slopes
-        Of one frame or several; relative to a reference, the wavefront is, too.
+        Slopes of one frame or several; relative to a reference, the wavefront is, too.
     layout : Layout
         With `pixel_scale_arcsec`, and `subaperture_m` or `diameter_m`, the wavefront is in nm.
     modes : int, optional
-        How many, from tip and tilt on. Default: all up to the highest radial order, at most 8, of which there
-        are no more than three for four sub-apertures and that can be told apart well. What is in orders that
-        are not fitted leaks into the two highest that are.
+        Number of modes, from tip and tilt on. Default: all up to the highest radial order (at most 8) with no
+        more than three modes for four sub-apertures and a good condition number. Orders that are not fitted
+        leak into the two highest fitted ones.
 
     Raises
     ------
     InputError
-        When slopes and layout do not fit together, no slope is valid, or the valid sub-apertures cannot tell
-        so many modes apart.
+        When slopes and layout do not fit together, no slope is valid, or the valid sub-apertures cannot
+        separate so many modes.
 
     Examples
     --------
@@ -171,7 +171,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
     valid = valid & inside_pupil(layout, pupil)
     illuminated = np.asarray(valid.any(axis=0))
     if not illuminated.any():
-        raise InputError("slopes: expected some to fit a wavefront to, found none that is valid")
+        raise InputError("slopes: expected valid sub-apertures to fit a wavefront, found none")
     gradients, condition = _chosen_gradients(modes, layout, pupil, illuminated)
     unit, scale = _unit(layout, pupil)
     errors = np.concatenate(
@@ -196,7 +196,7 @@ def fit_wavefront(slopes: Slopes, layout: Layout, *, modes: int | None = None) -
 def _chosen_gradients(
     modes: int | None, layout: Layout, pupil: Pupil, illuminated: NDArray[np.bool_]
 ) -> tuple[Floats, float]:
-    """Return the mean gradients (2 n, k) of the modes to fit, all x, then all y, and their condition."""
+    """Return the mean gradients (2 n, k) of the modes to fit (all x, then all y) and their condition."""
     n = int(np.count_nonzero(illuminated))
     if modes is None:
         counts = [order * (order + 3) // 2 for order in range(_HIGHEST_ORDER, 0, -1)]
@@ -211,13 +211,13 @@ def _chosen_gradients(
         if condition <= limit:
             return gradients[:, :count], condition
     raise InputError(
-        f"modes = {count}: {n} valid sub-apertures cannot tell so many apart (condition number "
-        f"{condition:.3g}, expected at most {LARGEST_CONDITION:g}): take fewer"
+        f"modes = {count}: {n} valid sub-apertures cannot separate so many (condition number "
+        f"{condition:.3g}, expected at most {LARGEST_CONDITION:g}); use fewer"
     )
 
 
 def _unit(layout: Layout, pupil: Pupil) -> tuple[str, float]:
-    """Return the unit of coefficients, and what makes it of pixels times the disk's radius."""
+    """Return the unit of coefficients, and its value for one pixel times the disk's radius."""
     if layout.pixel_scale_arcsec is None or pupil.radius_m is None:
         return "px × sub-aperture", pupil.radius_subapertures
     return "nm", layout.pixel_scale_arcsec * pupil.radius_m * _NM_PER_ARCSEC_M
@@ -234,10 +234,10 @@ def _condition(gradients: Floats) -> float:
 def _fit(
     slopes: Floats, valid: NDArray[np.bool_], gradients: Floats, errors: NDArray[Any] | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return coefficients, their standard errors and the rms of the residuals, for a radius and px of 1.
+    """Return coefficients, their standard errors and the residuals' rms, for a radius and px of 1.
 
-    Frames with the same valid sub-apertures share one pseudo-inverse. Without errors of the slopes, the
-    residuals say what they are.
+    Frames with the same valid sub-apertures share one pseudo-inverse. Without standard errors of the slopes,
+    they are estimated from the residuals.
     """
     frames, k = len(slopes), gradients.shape[1]
     coefficients, standard_errors = np.full((frames, k), np.nan), np.full((frames, k), np.nan)

@@ -1,4 +1,4 @@
-"""A wavefront as a table and in sentences, for the terminal and for pages."""
+"""A wavefront as tables and sentences, for the terminal and for pages."""
 
 from __future__ import annotations
 
@@ -51,27 +51,27 @@ def rms_table(wavefront: Wavefront) -> tuple[list[str], list[list[str]]]:
 
 
 def remarks(wavefront: Wavefront) -> list[str]:
-    """Return what a reader must know: sizes, units, where errors come from, what could not be fitted."""
+    """Return remarks for the reader: sizes, units, source of the errors, frames that could not be fitted."""
     pupil = wavefront.pupil
     modes, frames = wavefront.modes, len(wavefront.fitted)
     size = "" if pupil.radius_m is None else f" ({2 * pupil.radius_m:.3g} m)"
     lines = [
         f"Zernike modes Z{modes[0]} to Z{modes[-1]} in Noll's order on a disk of "
         f"{2 * pupil.radius_subapertures:.3g} sub-apertures{size}, fitted by least squares; condition number "
-        f"{wavefront.condition:.3g}. All rms are over the whole disk, also where the pupil is obscured. "
-        "Part of the orders above leaks into the two highest orders fitted."
+        f"{wavefront.condition:.3g}. All rms values are over the whole disk, including obscured parts. "
+        "Higher orders leak partly into the two highest fitted orders."
     ]
     if wavefront.unit != "nm":
         lines.append(
-            "In pixels times sub-apertures: for nm the layout needs pixel_scale_arcsec, and subaperture_m or "
-            "diameter_m (faintspot layout --pixel-scale-arcsec, --subaperture-m, --diameter-m)."
+            "In pixels times sub-apertures; for nm, add pixel_scale_arcsec and subaperture_m or diameter_m "
+            "to the layout (faintspot layout --pixel-scale-arcsec, --subaperture-m, --diameter-m)."
         )
     if wavefront.errors_from == "slopes":
-        noise = "Noise comes from the slopes' standard errors."
+        noise = "The noise is computed from the slopes' standard errors."
     else:
         noise = (
-            "The slopes have no standard errors: noise is told from their residuals about the fitted modes, "
-            "which higher modes enlarge."
+            "The slopes have no standard errors: the noise is estimated from their residuals about the "
+            "fitted modes, which include higher modes."
         )
     lines.append(noise)
     fitted = int(np.count_nonzero(wavefront.fitted))
@@ -82,7 +82,7 @@ def remarks(wavefront: Wavefront) -> list[str]:
         )
     if fitted < frames:
         lines.append(
-            f"{frames - fitted} of {frames} frames have too few valid sub-apertures and are left out."
+            f"{frames - fitted} of {frames} frames have too few valid sub-apertures and were left out."
         )
     left = float(np.sqrt(np.mean(wavefront.residual_px[wavefront.fitted] ** 2)))
     lines.append(f"The slopes scatter about the fitted modes by {left:.3g} px rms per axis.")
@@ -95,6 +95,6 @@ def _cell(coefficients: Floats, tilt: bool, digits: int) -> str:
 
 
 def _decimals(values: Floats) -> int:
-    """Return how many decimals show the largest value with four digits."""
+    """Return the number of decimals that shows the largest value with four digits."""
     largest = float(np.abs(values).max())
     return 3 if largest == 0 else int(np.clip(3 - np.floor(np.log10(largest)), 0, 6))

@@ -1,6 +1,6 @@
 """Zernike polynomials in Noll's order, and their mean gradients over sub-apertures.
 
-Noll (1976), JOSA 66, 207: mode j has mean square 1 over the unit disk, and even j go with the cosine.
+Noll (1976), JOSA 66, 207: mode j has mean square 1 over the unit disk, and even j have the cosine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NAMES = {
 
 
 def noll_to_nm(j: int) -> tuple[int, int]:
-    """Return radial order n and azimuthal order m of mode j = 1, 2 ...; m < 0 stands for the sine."""
+    """Return radial order n and azimuthal order m of mode j = 1, 2 ...; m < 0 means the sine."""
     n = 0
     while (n + 1) * (n + 2) // 2 < j:
         n += 1
@@ -37,13 +37,13 @@ def noll_to_nm(j: int) -> tuple[int, int]:
 
 
 def mode_name(j: int) -> str:
-    """Return what a mode is called, up to spherical; else its orders."""
+    """Return the name of a mode up to spherical, otherwise its orders."""
     n, m = noll_to_nm(j)
     return _NAMES.get(j, f"n = {n}, m = {m}")
 
 
 def zernike(j: int, x: ArrayLike, y: ArrayLike) -> Floats:
-    """Return mode j at points in units of the disk's radius; a polynomial, so outside the disk as well.
+    """Return mode j at points in units of the disk's radius; being a polynomial, also outside the disk.
 
     The radial part is the Jacobi polynomial (-1)^k r^m P_k^(m,0)(1 - 2 r^2) with k = (n - m) / 2.
     """
@@ -61,21 +61,21 @@ def zernike(j: int, x: ArrayLike, y: ArrayLike) -> Floats:
 def mean_gradients(modes: ArrayLike, outlines: Floats) -> Floats:
     """Return the mean gradient of modes over polygons, exactly.
 
-    The integral of a gradient over an area is that of the mode times the outward normal along its edge. Along
-    a straight edge the mode is a polynomial of order n, which (n + 2) // 2 Gauss-Legendre points integrate
-    without error.
+    The integral of a gradient over an area equals that of the mode times the outward normal along its edge.
+    Along a straight edge the mode is a polynomial of order n, which (n + 2) // 2 Gauss-Legendre points
+    integrate exactly.
 
     Parameters
     ----------
     modes : (k,) array of int
-        Noll's j.
+        Noll indices j.
     outlines : (n, corners, 2) array
         x, y of each polygon's corners, going round from +x towards +y, in units of the disk's radius.
 
     Returns
     -------
     (2, n, k) array
-        Along x and along y, for each unit of radius.
+        Gradients along x and along y, per unit of radius.
     """
     numbers = [int(j) for j in np.asarray(modes)]
     highest = max(noll_to_nm(j)[0] for j in numbers)

@@ -7,5 +7,5 @@
     slopec:
       class: FaintspotSlopec
 
-SPECULA finds a class in the file of its name, `faintspot_slopec.py`.
+SPECULA looks for a class in the file of its name, `faintspot_slopec.py`.
 """

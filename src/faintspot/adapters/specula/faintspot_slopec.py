@@ -1,4 +1,4 @@
-"""SPECULA's slope computer with faintspot inside."""
+"""SPECULA's slope computer with faintspot's slope pipeline."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ TESTED = "1.1.0", "1.1.0"
 
 
 class FaintspotSlopec(Slopec):  # type: ignore[misc]
-    """Slopes of a Shack-Hartmann sensor, in place of SPECULA's `ShSlopec`.
+    """Slopes of a Shack-Hartmann sensor; replaces SPECULA's `ShSlopec`.
 
     Unit, order and sign of the slopes, slope nulls, filters and calibration files are those of `ShSlopec`.
-    Pixels are in electrons, or in ADU with a calibration that says so.
+    Pixels are in electrons, or in ADU with a calibration.
 
     Parameters
     ----------
@@ -39,19 +39,19 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
     faintspot : str or dict
         A faintspot.toml, or its tables: `settings` (and `estimator`), `calibration`, `psf`, `score`.
     calibrating : bool
-        True in parameter files that calibrate (slope null, interaction matrix), whose detector has no noise:
-        frames are then measured at `calibration_flux_e`, see `ToolSlopes.calibrating`.
+        True in parameter files for calibration (slope null, interaction matrix), whose detector is
+        noise-free: frames are then measured at `calibration_flux_e`, see `ToolSlopes.calibrating`.
     calibration_flux_e : float
-        Mean flux of a sub-aperture, electrons.
+        Mean flux of a sub-aperture in calibrations, electrons.
     flux_frames : float
         Time constant of the running mean of the flux, frames; 0: none.
     sn, filtmat, interleave, target_device_idx, precision
-        As for `ShSlopec`; slopes are measured on the processor.
+        As for `ShSlopec`; slopes are measured on the CPU.
 
     Raises
     ------
     InputError
-        For sub-apertures that are no squares of pixels, or as for `ToolSlopes`.
+        When sub-apertures are not squares of pixels, or as for `ToolSlopes`.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         check_version("SPECULA", "specula", *TESTED)
         for part in () if filtmat is None else filtmat:
             check_matrix("filtmat", cpuArray(part))
-        self.subapdata = subapdata  # the base class asks for the number of sub-apertures
+        self.subapdata = subapdata  # used by the base class for the number of sub-apertures
         super().__init__(
             sn=sn,
             filtmat=filtmat,
@@ -94,10 +94,10 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
 
     @classmethod
     def input_names(cls) -> Any:
-        """Return SPECULA's inputs, and the slopes that a loop predicts."""
+        """Return SPECULA's inputs, and the predicted slopes."""
         return {
             **super().input_names(),
-            "in_predicted": InputDesc(Slopes, "Slopes that are expected, after the slope null (optional)"),
+            "in_predicted": InputDesc(Slopes, "Predicted slopes, after the slope null (optional)"),
         }
 
     @classmethod
@@ -110,24 +110,24 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         return int(self.subapdata.n_subaps)
 
     def nslopes(self) -> int:
-        """Return twice that."""
+        """Return the number of slopes, twice that of sub-apertures."""
         return 2 * self.nsubaps()
 
     @property
     def measured(self) -> ToolSlopes:
-        """What measures: `last` slopes (px), flags, `standard_errors`, `flux`.
+        """Measurement: `last` slopes (px), flags, `standard_errors`, `flux`.
 
         Raises
         ------
         InputError
-            Before the first frame.
+            When there was no frame yet.
         """
         if self._tool is None:
-            raise InputError("slopes: expected a frame to be measured first, got none")
+            raise InputError("slopes: no frame has been measured yet; measure one first")
         return self._tool
 
     def compute_slopes(self) -> None:
-        """Measure the pixels that came in; SPECULA then subtracts the slope null."""
+        """Measure the input pixels; SPECULA then subtracts the slope null."""
         pixels = np.asarray(cpuArray(self.local_inputs["in_pixels"].pixels))
         if self._tool is None:
             self._tool, self._idxs = self._prepared((int(pixels.shape[0]), int(pixels.shape[1])))
@@ -149,12 +149,12 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         self.subap_counts.value[:] = flux.mean()
 
     def post_trigger(self) -> None:
-        """Say when the outputs were made."""
+        """Set the time of the outputs."""
         super().post_trigger()
         self.outputs["out_subapdata"].generation_time = self.current_time
 
     def _prepared(self, frame_shape: tuple[int, int]) -> tuple[ToolSlopes, NDArray[np.int64]]:
-        """Make the pipeline for frames of a shape, and which pixels it reads, as one tall frame."""
+        """Create the pipeline for frames of a shape; return it, and its pixels as one tall frame."""
         idxs = checked_squares(np.asarray(cpuArray(self.subapdata.idxs)), frame_shape)
         n, side = len(idxs), int(self.subapdata.np_sub)
         layout, unit = Layout.stacked(n, (side, side)), (2.0 / side, 2.0 / side)
@@ -163,12 +163,12 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
 
 
 def checked_squares(idxs: NDArray[Any], frame_shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Return SPECULA's sub-apertures, when they are squares of a frame's pixels.
+    """Return SPECULA's sub-apertures after checking that they are squares of a frame's pixels.
 
     Parameters
     ----------
     idxs : (n, pixels) array of int
-        Pixels of each, counted along the rows of the frame.
+        Pixels of each sub-aperture, counted along the rows of the frame.
     frame_shape : (int, int)
 
     Raises
@@ -194,7 +194,7 @@ def checked_squares(idxs: NDArray[Any], frame_shape: tuple[int, int]) -> NDArray
 
 
 def _two_rows(name: str, slopes: Any, n: int) -> NDArray[np.float64]:
-    """X and y slopes of a Slopes object, (2, n)."""
+    """Return x and y slopes of a Slopes object, (2, n)."""
     rows = [np.asarray(cpuArray(part), np.float64).ravel() for part in (slopes.xslopes, slopes.yslopes)]
     if rows[0].size != n or rows[1].size != n:
         raise InputError(
@@ -204,7 +204,7 @@ def _two_rows(name: str, slopes: Any, n: int) -> NDArray[np.float64]:
     bad = sum(int(np.count_nonzero(~np.isfinite(row))) for row in rows)
     if bad:
         raise InputError(
-            f"{name}: expected finite numbers, got {bad} NaN or infinite of {2 * n}; make it anew, with "
-            "light in every sub-aperture"
+            f"{name}: expected finite numbers, got {bad} NaN or infinite of {2 * n}; remake it with "
+            "every sub-aperture illuminated"
         )
     return np.stack(rows)

@@ -5,10 +5,10 @@ import { inWords } from "./message.js";
 
 const SHORT = new Intl.NumberFormat("en", { notation: "compact" });
 const inTime = (us) => us < 1e3 ? `${inWords(us)} µs` : us < 1e6 ? `${inWords(us / 1e3)} ms` : `${inWords(us / 1e6)} s`;
-const GAP_S = 1; // for longer nothing came: no line goes across
+const GAP_S = 1; // longest gap that a line crosses
 const LEFT = 52, BOTTOM = 20, TOP = 6, RIGHT = 8;
 
-/** Axes with a grid; return functions from values to places. */
+/** Draw axes with a grid; return functions from values to canvas positions. */
 function axes(canvas, low, high, yTicks) {
   const { context, width, height } = cleared(canvas);
   const y = (value) => height - BOTTOM - (value - low) / (high - low) * (height - BOTTOM - TOP);
@@ -38,7 +38,7 @@ function yTicksOf(low, high, logarithmic, inWordsOf = SHORT.format) {
 
 /**
  * Draw lines against time, seconds before now.
- * lines: [{values, colour, dash, points}], NaN: nothing there. marks: values of which those above 0 are ticked.
+ * lines: [{values, colour, dash, points}], NaN: no data. marks: values; those above 0 get a tick.
  */
 export function drawStrip(canvas, times, seconds, lines, { from, to, logarithmic = false, marks } = {}) {
   const seen = lines.flatMap((line) => Array.from(line.values).filter(Number.isFinite))
@@ -87,7 +87,7 @@ export function drawStrip(canvas, times, seconds, lines, { from, to, logarithmic
   context.restore();
 }
 
-/** Draw how often each latency came: both axes logarithmic. */
+/** Draw a histogram of the latencies with logarithmic axes. */
 export function drawHistogram(canvas, { from_us: edges, counts }, marks) {
   const most = Math.ceil(Math.log10(Math.max(...counts, 10)));
   const labels = yTicksOf(0, most, true);
@@ -120,7 +120,7 @@ export function drawHistogram(canvas, { from_us: edges, counts }, marks) {
   context.setLineDash([]);
 }
 
-/** Draw values side by side about zero. */
+/** Draw values as bars from zero. */
 export function drawBars(canvas, values) {
   const reach = Math.max(...values.map(Math.abs), 1e-9);
   const { context, width, y } = axes(canvas, -reach, reach, yTicksOf(-reach, reach, false));

@@ -1,11 +1,11 @@
-// The web socket: messages in, requests out; it comes back by itself.
+// The web socket: receives messages, sends requests, reconnects automatically.
 
 import { unpacked } from "./message.js";
 
 const KEY = `faintspot-token-${location.port}`;
 const AGAIN_MS = 1000;
 
-/** The token from the address, from where the address bar and history do not show it. */
+/** Return the token from the address, and remove it from the address bar and history. */
 function tokenOfAddress() {
   if (location.hash.length > 1) {
     sessionStorage.setItem(KEY, decodeURIComponent(location.hash.slice(1)));
@@ -15,7 +15,7 @@ function tokenOfAddress() {
 }
 
 export class Connection {
-  /** Calls onMessage(message), onAccess({ok, may_change, error}) and onLost(). */
+  /** Call onMessage(message), onAccess({ok, may_change, error}) and onLost(). */
   constructor(handlers) {
     this.handlers = handlers;
     this.token = tokenOfAddress();
@@ -43,7 +43,7 @@ export class Connection {
     };
   }
 
-  /** Say who we are. */
+  /** Identify this client. */
   async hello() {
     const reply = await this.ask("hello", { token: this.token });
     if (!reply.ok && this.token) sessionStorage.removeItem(KEY);
@@ -57,7 +57,7 @@ export class Connection {
     return this.hello();
   }
 
-  /** Ask for something; the answer is {ok, ...} or {ok: false, error}. */
+  /** Send a request; the answer is {ok, ...} or {ok: false, error}. */
   ask(what, fields = {}) {
     if (this.socket.readyState !== WebSocket.OPEN) return Promise.resolve({ ok: false, error: "not connected" });
     const id = ++this.number;

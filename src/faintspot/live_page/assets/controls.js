@@ -1,4 +1,4 @@
-// Forms: what is changed, and what is said to it beside the field.
+// Forms for changes, with errors shown beside the fields.
 
 const byId = (id) => document.getElementById(id);
 
@@ -50,7 +50,7 @@ export class Controls {
     byId(button).addEventListener("click", async () => answer(place, await this.connection.ask(what, fields)));
   }
 
-  /** Show the forms to those who may change things. */
+  /** Show the forms to clients with the token. */
   access({ ok, may_change: mayChange, error }) {
     byId("controls").hidden = !mayChange;
     byId("token-form").hidden = Boolean(mayChange);
@@ -67,7 +67,7 @@ export class Controls {
 
   // Settings ---------------------------------------------------------------------------------------------
 
-  /** Fill in the settings that run; what is being edited stays. */
+  /** Fill in the running settings; keep fields that are being edited. */
   settings(rows) {
     const names = rows.map((row) => row.name + row.choices).join();
     if (names !== this.names) {
@@ -118,7 +118,7 @@ export class Controls {
     const changed = this.inputs().filter((input) => input.value !== input.dataset.now);
     this.clearErrors();
     byId("apply").disabled = true;
-    answer("settings-answer", { ok: true, text: "being prepared" });
+    answer("settings-answer", { ok: true, text: "in preparation" });
     const reply = await this.connection.ask("set", {
       changes: changed.map((input) => `${input.name}=${input.value}`), subapertures: byId("subapertures").value });
     byId("settings-answer").textContent = "";
@@ -140,7 +140,7 @@ export class Controls {
     for (const input of byId("settings-form").querySelectorAll("[aria-invalid]")) input.removeAttribute("aria-invalid");
   }
 
-  /** Put an error beside the field that it names. */
+  /** Show an error beside the field that it names. */
   showError(reply, changed) {
     let named = changed.find((input) => new RegExp(`\\b${input.name}\\b`).test(reply.error));
     let place = named && byId(`${named.id}-error`);
@@ -154,7 +154,7 @@ export class Controls {
     named.focus();
   }
 
-  // What the engine says ---------------------------------------------------------------------------------
+  // State of the engine ---------------------------------------------------------------------------------
 
   status(status) {
     const { loop, recording, arms } = status;

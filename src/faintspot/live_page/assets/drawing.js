@@ -1,6 +1,6 @@
-// What all drawings share: a canvas of the screen's own pixels, colours, ticks.
+// Shared by all drawings: canvas in screen pixels, colours, ticks.
 
-// Cividis (Nunez, Anderton and Renslow 2018), told apart with any colour vision: every 32nd colour.
+// Cividis (Nunez, Anderton and Renslow 2018), readable with any colour vision: every 32nd colour.
 const CIVIDIS = [[0, 34, 78], [26, 56, 111], [63, 78, 109], [92, 101, 110], [120, 123, 116], [150, 146, 114],
   [183, 172, 101], [219, 199, 79], [254, 232, 56]];
 
@@ -16,7 +16,7 @@ export function cssColour(value) {
   return `rgb(${c & 255} ${c >> 8 & 255} ${c >> 16 & 255})`;
 }
 
-/** The page's own colours, which change between light and dark. */
+/** Read the page's colours, which differ between light and dark mode. */
 export const ink = {};
 function readInk() {
   const style = getComputedStyle(document.documentElement);
@@ -42,7 +42,7 @@ export function cleared(canvas) {
   return { context, width, height };
 }
 
-/** Round values between two ends, about so many. */
+/** Return about `about` round values between two ends. */
 export function ticks(low, high, about) {
   const raw = (high - low) / about, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;

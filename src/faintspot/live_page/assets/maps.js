@@ -1,10 +1,10 @@
-// Pictures and maps of the sensor, x to the right and y upwards.
+// Images and maps of the sensor, x to the right and y upwards.
 
 import { COLOURS, cleared, cssColour, ink } from "./drawing.js";
 
 const scratch = document.createElement("canvas");
 
-/** From pixels of the frame to the canvas: as large as fits. */
+/** Return the mapping from frame pixels to the canvas, as large as fits. */
 function placed(canvas, sensor) {
   const view = cleared(canvas);
   const [rows, columns] = sensor.frame_shape;
@@ -14,7 +14,7 @@ function placed(canvas, sensor) {
   return { ...view, zoom, x: (value) => left + zoom * (value + 0.5), y: (value) => bottom - zoom * (value + 0.5) };
 }
 
-/** Draw a frame of bytes; zeros of `hollow` ones are nothing. */
+/** Draw a frame of bytes; zeros are transparent if it is `hollow`. */
 export function drawFrame(canvas, sensor, image, hollow) {
   const view = placed(canvas, sensor);
   const [rows, columns] = image.shape;
@@ -46,7 +46,7 @@ export function drawWindows(view, sensor) {
   }
 }
 
-/** Rings where spots were found, crosses where none is valid. */
+/** Draw rings at valid spots and crosses at invalid ones. */
 export function drawSpots(view, sensor, x, y, flags, invalid) {
   const { context } = view, centres = sensor.centres.data;
   const radius = Math.max(3, Math.min(7, view.zoom * sensor.window[0] / 6));
@@ -73,7 +73,7 @@ function cross(context, u, v, radius) {
   context.lineTo(u + radius, v - radius);
 }
 
-/** Draw arrows so that one of `reach` pixels is as long as half a sub-aperture. */
+/** Draw arrows; a slope of `reach` pixels is half a sub-aperture long. */
 export function drawArrows(canvas, sensor, x, y, flags, invalid, reach) {
   const view = placed(canvas, sensor), { context } = view, centres = sensor.centres.data;
   outlines(view, sensor, () => { context.strokeStyle = ink.line; context.lineWidth = 1; context.stroke(); });
@@ -129,12 +129,12 @@ export function drawMap(canvas, sensor, values, low, high) {
   });
 }
 
-/** What is said of a sub-aperture: 0 nothing, 1 a remark, 2 not valid. */
+/** Return the state of a sub-aperture: 0 no flag, 1 flagged but valid, 2 invalid. */
 export function verdict(flags, invalid) {
   return flags & invalid ? 2 : flags ? 1 : 0;
 }
 
-/** Draw what the flags say: plain, with a dot, or with a cross, so that colours are not needed. */
+/** Draw the flags as plain, dotted or crossed cells, readable without colour. */
 export function drawValidity(canvas, sensor, flags, invalid) {
   const view = placed(canvas, sensor), { context } = view, centres = sensor.centres.data;
   const size = Math.max(2, view.zoom * Math.min(...sensor.window) / 5);

@@ -1,4 +1,4 @@
-// A message of the server: values and named arrays; see messages.py.
+// Messages from the server: values and named arrays; see messages.py.
 
 const TYPES = {
   float32: Float32Array, float64: Float64Array, uint8: Uint8Array, int32: Int32Array,
@@ -16,7 +16,7 @@ export function unpacked(buffer) {
   return { kind: head.kind, values: head.values, arrays };
 }
 
-/** Numbers as people read them: a few digits, "–" where there is none. */
+/** Format a number with a few digits; "–" if it is missing. */
 export function inWords(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value !== 0 && (Math.abs(value) >= 1e7 || Math.abs(value) < 1e-4)) return value.toExponential(2);

@@ -1,4 +1,4 @@
-// The page: what comes is kept, and drawn when the screen is ready for it.
+// The page: keep the newest message of each kind, and draw it with the next screen refresh.
 
 import { Connection } from "./connection.js";
 import { drawBars, drawHistogram, drawStrip } from "./charts.js";
@@ -10,9 +10,9 @@ import { inWords } from "./message.js";
 const byId = (id) => document.getElementById(id);
 const say = (id, text) => { if (byId(id).textContent !== text) byId(id).textContent = text; };
 const known = {}; // the newest message of each kind
-let stale = new Set(); // kinds that have come since the last drawing
+let stale = new Set(); // kinds received since the last drawing
 let held = false, connected = false, drawnFrames = 0;
-let reach = 0.5, flux = [0, 1]; // scales, which follow slowly
+let reach = 0.5, flux = [0, 1]; // scales, adjusted slowly
 
 const connection = new Connection({
   onMessage(message) {
@@ -67,7 +67,7 @@ function sensorCame() {
   flux = [0, 1];
 }
 
-// Where we are ------------------------------------------------------------------------------------------
+// State of the source ------------------------------------------------------------------------------------------
 
 function showState() {
   const place = known.place?.values, status = known.status?.values;
@@ -80,7 +80,7 @@ function showState() {
   if (!place) return;
   say("name", place.name);
   document.title = `${place.name} · faintspot`;
-  const trouble = !connected ? "The server does not answer: is faintspot live still running?"
+  const trouble = !connected ? "The server does not answer; check that faintspot live is running."
     : place.error || status?.source_refused || status?.estimator_fault || (there && status?.error) || "";
   byId("trouble").hidden = !trouble;
   say("trouble", trouble);
@@ -158,7 +158,7 @@ function showSlopes(values, arrays, where) {
   const wanted = roundUp(lengths[Math.floor(0.9 * lengths.length)] || reach);
   if (wanted > 1.5 * reach || wanted < reach / 2.1) reach = wanted;
   drawArrows(byId("slopes"), where, x, y, flags, invalid, reach);
-  say("slopes-caption", `half a window: ${inWords(reach, 2)} px`);
+  say("slopes-caption", `half a sub-aperture: ${inWords(reach, 2)} px`);
 
   const light = arrays.flux.data, lit = Array.from(light).filter((_, i) => used[i]);
   const low = Math.min(0, ...lit), high = Math.max(...lit, 1);
@@ -195,9 +195,9 @@ function colourBar(id, [low, high], unit) {
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** Keys with the same marks as the map, and how often each flag is set. */
+/** Show the legend of the map, and how often each flag is set. */
 function showLegend(flags, kinds) {
-  const words = ["nothing to remark", "remark", "not valid"];
+  const words = ["no flag", "valid, flagged", "invalid"];
   const named = flagList().map(({ bit, name }) => [name, flags.filter((flag) => flag & bit).length]);
   const text = named.filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ");
   const state = JSON.stringify([kinds.map(Boolean), text, ink.first]);
@@ -235,14 +235,14 @@ function showStrips({ strip: names, strip_s: seconds }, { data, shape }) {
   say("latency-caption", "µs: typical (line), longest (dashed), lost frames (ticks)");
   const rms = column("rms_px"), light = column("flux_e");
   drawStrip(byId("rms"), times, seconds, [{ values: rms, colour: "first" }], { from: 0 });
-  say("rms-caption", `about their mean: ${inWords(last(rms))} px`);
+  say("rms-caption", `about the mean slopes: ${inWords(last(rms))} px`);
   drawStrip(byId("mean-flux"), times, seconds, [{ values: light, colour: "first" }], { from: 0 });
-  say("mean-flux-caption", `of a sub-aperture: ${inWords(last(light))} e⁻`);
+  say("mean-flux-caption", `per sub-aperture: ${inWords(last(light))} e⁻`);
   const strehl = column("strehl"), some = strehl.some(Number.isFinite);
   byId("strehl-figure").hidden = !some;
   if (some) {
     drawStrip(byId("strehl"), times, seconds, [{ values: strehl, colour: "third" }], { from: 0, to: 1 });
-    say("strehl-caption", `the simulated telescope’s truth: ${inWords(last(strehl), 2)}, ${inWords(last(column("rms_nm")))} nm rms`);
+    say("strehl-caption", `true, from the simulated telescope: ${inWords(last(strehl), 2)}, ${inWords(last(column("rms_nm")))} nm rms`);
   }
 }
 
@@ -253,7 +253,7 @@ function showFigures() {
     const { 50: half, 99: most, 99.9: nearly } = values.percentiles_us;
     drawHistogram(byId("histogram"), values.histogram, [half, most]);
     say("histogram-caption", `p50 ${inWords(half)} µs, p99 ${inWords(most)}, p99.9 ${inWords(nearly)}, longest `
-      + `${inWords(values.longest_us)}; ${inWords(values.frames)} frames of ${inWords(values.seconds, 2)} s`);
+      + `${inWords(values.longest_us)}; ${inWords(values.frames)} frames in ${inWords(values.seconds, 2)} s`);
   }
   showArms(values.arms || []);
   const changes = values.changes || [];
@@ -278,7 +278,7 @@ function showArms(arms) {
     return made;
   };
   byId("arms").replaceChildren(
-    element("thead", {}, [element("tr", {}, [element("th", { textContent: "arm" }), element("th", { textContent: "frames" }),
+    element("thead", {}, [element("tr", {}, [element("th", { textContent: "method" }), element("th", { textContent: "frames" }),
       ...titles.map((title) => element("th", { textContent: title }))])]),
     element("tbody", {}, arms.map((arm) => element("tr", {}, [element("th", { textContent: arm.arm, scope: "row" }),
       element("td", { textContent: inWords(arm.frames) }), ...titles.map((title) => cell(arm.figures[title]))]))),
@@ -309,8 +309,8 @@ function showTiles() {
     ["frames/s", inWords(figures.rate_hz)],
     ["latency p50", `${inWords(percentiles[50])} µs`],
     ["p99", `${inWords(percentiles[99])} µs`],
-    ["lost, seen here", inWords(now.lost)],
-    ...(now.arm && figures.arms?.length ? [["arm", now.arm]] : []),
+    ["lost frames", inWords(now.lost)],
+    ...(now.arm && figures.arms?.length ? [["method", now.arm]] : []),
     ...(loop && loop.state !== "none" ? [["loop", loop.state], ...(loop.gain == null ? [] : [["gain", inWords(loop.gain)]])] : []),
   ]);
 }
@@ -324,7 +324,7 @@ function showStatus() {
   say("advice", advice.join("\n"));
   const counters = { ...values.counters };
   if (values.subapertures && counters.processed) {
-    counters["iterations a sub-aperture"] = counters.iterations / (counters.processed * values.subapertures);
+    counters["iterations per sub-aperture"] = counters.iterations / (counters.processed * values.subapertures);
   }
   delete counters.iterations;
   const missed = known.now?.values.missed || 0;
@@ -332,8 +332,8 @@ function showStatus() {
     ...Object.entries(counters).map(([name, value]) => [name.replaceAll("_", " "), inWords(value)]),
     ...(values.latency ? Object.entries(values.latency).filter(([name]) => name !== "count").map(([name, value]) =>
       [`latency ${name.replace("_us", "").replace("_", ".")}, µs`, inWords(value, 4)]) : []),
-    ["not seen by this page", inWords(missed)],
+    ["records missed by this page", inWords(missed)],
     ...Object.entries(values.loaded || {}).map(([estimator, file]) => [`${estimator} loaded from`, file]),
-    ...(values.preparing ? [["being prepared", Object.keys(values.preparing.changes).join(", ")]] : []),
+    ...(values.preparing ? [["in preparation", Object.keys(values.preparing.changes).join(", ")]] : []),
   ]);
 }
