@@ -103,7 +103,8 @@ def tv_denoise(
         deviation, ``lambda ||div p - div p_previous|| <= tolerance * ||u - mean(u)||``; tested every 24
         iterations and at the last one. 0 never stops early. The default 0.02 nearly always gives 24
         iterations. The slope error is then within 1 % of the converged one if the usual number of pixels is
-        kept, but not if most of a window is kept: docs/fast.md. Tolerances of different algorithms and
+        kept, but not if most of a window is kept: docs/results/iterations.md.
+        Tolerances of different algorithms and
         packages are not comparable: "chambolle" changes less in an iteration and stops farther from the
         solution.
     max_iterations : int, optional

@@ -25,7 +25,7 @@ def command(name: str | None) -> None:
 
     table = Table(box=None, pad_edge=False)
     if name is None:
-        for heading in ("name", "what it does", "needs"):
+        for heading in ("name", "method", "requires"):
             table.add_column(heading)
         for own, kind in estimators().items():
             table.add_row(own, kind.method or kind.label, needs_in_words(kind))

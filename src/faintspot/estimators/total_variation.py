@@ -59,7 +59,7 @@ class TotalVariation(KeepingBrightest):
     preset: str = option(
         "accurate",
         '"fast": 8 denoising iterations for every image, so that the run time is constant. Its accuracy is '
-        "given in docs/fast.md.",
+        "given in docs/results/iterations.md.",
         choices=PRESETS,
         per_subaperture=False,
     )

@@ -175,7 +175,7 @@ def markdown(dataset: xarray.Dataset, command: str) -> str:
         "the Cramer-Rao bound?\n",
         f"Made by `{command}`: {dataset.attrs['n']} images of each cell, settings chosen on one half and "
         f"scored on the other, seed {dataset.attrs['seed']}; all arms have the range of true positions as "
-        "their search range. The arms are those of [study.md](study.md).\n",
+        "their search range. The methods are those of the study.\n",
         *([f"{_OF_WINDOWS}\n"] if Window.name in dataset["arm"].values else []),
         "## What it says\n",
         *(f"- {line}" for line in findings(dataset)),
