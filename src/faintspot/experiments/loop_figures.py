@@ -29,11 +29,13 @@ from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.statistics import paired_mean
 from faintspot.report.drawing import FLUX_GREY, GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
+from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+_TEXT = Texts("faintspot.experiments")
 _STREHL = "H-band Strehl ratio"
 _DODGE = 0.008  # of the axis, between arms at the same magnitude
 _DECADES = 3  # of intensity in images
@@ -64,38 +66,17 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
         low, middle, high = np.array([[d.low, d.value, d.high] for d in differences]).T
         if arm != reference:
             right.errorbar(place, middle, np.nan_to_num([middle - low, high - middle]), capsize=2, **style)
-        rows += [
-            [name, m, p, v, e, len(s), *ends]
-            for m, p, v, e, s, *ends in zip(
-                result.magnitudes,
-                result.photons,
-                value,
-                error,
-                result.strehl[arm],
-                low,
-                middle,
-                high,
-                strict=True,
-            )
-        ]
+        count = np.full(len(value), result.strehl.shape[-1])
+        columns = result.magnitudes, result.photons, value, error, count, low, middle, high
+        rows += [[name, *row] for row in zip(*columns, strict=True)]
     right.axhline(0, color=GREY, lw=1)
     left.set(xlabel="guide-star magnitude", ylabel=label)
     left.set_ylim(bottom=0)
-    right.set(
-        xlabel="guide-star magnitude",
-        ylabel=f"Strehl less that of {result.labels[reference]}, paired",
-    )
+    right.set(xlabel="guide-star magnitude", ylabel=f"Strehl less that of {result.labels[reference]}, paired")
     for panel in (left, right):
         _photon_axis(panel, result)
     figure.legend(loc="outside lower center", ncols=min(4, len(result.labels)), frameon=False)
-    caption = (
-        "Every arm tuned at every flux on other air. Left, bars: standard error between realisations of the "
-        "air. Right: the same realisations compared; bars hold for all fluxes of an arm together with 95 %; "
-        "points are moved sideways to be told apart."
-    )
-    header = ["arm", "magnitude", "photons", "strehl", "standard_error", "realisations"]
-    header += ["difference_low", "difference", "difference_high"]
-    return FigureWithData("magnitude", "Strehl against magnitude", caption, figure, header, rows)
+    return _TEXT.figure("magnitude", figure, rows)
 
 
 @styled
@@ -114,9 +95,7 @@ def gain_figure(result: MagnitudeResult) -> FigureWithData:
     panel.set(xlabel="photo-electrons of a sub-aperture in a frame", ylabel="centroid gain")
     panel.set_ylim(bottom=0)
     figure.legend(loc="outside right upper", frameon=False)
-    caption = "Slope measured for a displacement of 1 px, at the flux of the run, with spots as in the loop."
-    header = ["arm", "photons", "centroid_gain"]
-    return FigureWithData("gain", "Centroid gain", caption, figure, header, rows)
+    return _TEXT.figure("gain", figure, rows)
 
 
 @styled
@@ -154,11 +133,8 @@ def psf_figure(images: Sequence[NDArray[Any]], names: Sequence[str], where: str)
         panels[-1].semilogy(radius, profile, style.line, color=style.colour, label=name)
     panels[-1].set(xlabel="distance from the axis (λ/D)", ylabel="mean intensity", title="Profiles")
     panels[-1].legend(frameon=False)
-    caption = f"{where}; the same logarithmic scale in both. Strehl ratio: intensity on the axis."
     rows = [[r, *p] for r, *p in zip(radius, *profiles, strict=True)]
-    return FigureWithData(
-        "psf", "Long-exposure image", caption, figure, ["radius_lambda_over_d", *names], rows
-    )
+    return _TEXT.figure("psf", figure, rows, ["radius_lambda_over_d", *names], where=where)
 
 
 @styled
@@ -181,12 +157,7 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
     panel.invert_yaxis()
     panel.set(xlabel=label)
     figure.legend(loc="outside lower center", ncols=min(3, arms), frameon=False)
-    caption = (
-        "One term of the error budget switched off at a time. Bars: standard error between realisations; "
-        "dotted: the whole loop."
-    )
-    header = ["arm", "switched_off", "strehl", "standard_error"]
-    return FigureWithData("budget", "Error budget", caption, figure, header, rows)
+    return _TEXT.figure("budget", figure, rows)
 
 
 def _switched(term: str) -> str:
@@ -266,12 +237,7 @@ def strehl_figure(table: Measurements, label: str) -> FigureWithData:
         panel.set_ylim(bottom=0)
     handles, names = panels["time"].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False)
-    caption = (
-        "One point for each measurement. Straight lines: least squares through the points of each group "
-        "with their correlation r. Right: points as on the left; line: means over ranges of strengths; "
-        "band: mean of the measurements without TV and its standard error, which the drift of r0 widens."
-    )
-    return FigureWithData("strehl", "Strehl with and without TV", caption, figure, *_measurement_rows(table))
+    return _TEXT.figure("strehl", figure, _measurement_rows(table))
 
 
 @styled
@@ -291,13 +257,7 @@ def differences_figure(table: Measurements) -> FigureWithData:
     panel.set(xlabel="strength of the denoising (e⁻)", ylabel="Strehl with TV less Strehl without")
     low_end, high_end = panel.get_ylim()
     panel.set_ylim(max(low_end, -1.0), min(high_end, 1.0))
-    caption = (
-        "Each measurement less the straight line between those without TV before and after it: what drifts "
-        "cancels. Squares: means over ranges of strengths; bars: intervals that hold for all ranges together "
-        "with 95 %, where there are enough measurements for one. Grey: strengths 0.6 to 1.1."
-    )
-    header = ["strength_e", "difference", "low", "high", "measurements"]
-    return FigureWithData("differences", "Paired differences by strength", caption, figure, header, rows)
+    return _TEXT.figure("differences", figure, rows)
 
 
 @styled
@@ -312,39 +272,18 @@ def seeing_figure(table: Measurements) -> FigureWithData:
     panel.plot(ends, ends, color=GREY, lw=1)
     for name in (TV, TV_BEST, NO_TV):
         chosen = known & (table.group(name) if name != TV else table.group(TV) & ~table.group(TV_BEST))
-        panel.plot(
-            100 * table.true_r0_m[chosen],
-            100 * table.r0_m[chosen],
-            label=_legend_name(name),
-            **_marker(name),
-        )
-    panel.set(
-        xlim=(0, top),
-        ylim=(0, top),
-        aspect="equal",
-        xlabel="true r0 at 500 nm (cm)",
-        ylabel="r0 from pseudo-open-loop slopes (cm)",
-    )
+        true, found = 100 * table.true_r0_m[chosen], 100 * table.r0_m[chosen]
+        panel.plot(true, found, label=_legend_name(name), **_marker(name))
+    panel.set(xlim=(0, top), ylim=(0, top), aspect="equal")
+    panel.set(xlabel="true r0 at 500 nm (cm)", ylabel="r0 from pseudo-open-loop slopes (cm)")
     panel.legend(frameon=False, loc="upper left")
-    caption = (
-        "From the variance of the slopes about their mean over the pupil, against von Karman theory with the "
-        "configured outer scale; noise taken out by lagged covariance. A measurement lasts seconds, in which "
-        "few independent pieces of turbulence pass: single points scatter, the whole does not. Points beyond "
-        "the axes are of a loop that had lost the star."
-    )
-    return FigureWithData("seeing", "r0 from the telemetry", caption, figure, *_measurement_rows(table))
+    return _TEXT.figure("seeing", figure, _measurement_rows(table))
 
 
 def _marker(group: str) -> dict[str, Any]:
     colour, marker = _GROUP_STYLES[group]
-    return {
-        "color": colour,
-        "marker": marker,
-        "ls": "",
-        "ms": 4 if group == TV else 6,
-        "mec": "white",
-        "mew": 0.4,
-    }
+    size = 4 if group == TV else 6
+    return {"color": colour, "marker": marker, "ls": "", "ms": size, "mec": "white", "mew": 0.4}
 
 
 def _legend_name(group: str) -> str:
@@ -353,10 +292,8 @@ def _legend_name(group: str) -> str:
 
 def _starts(table: Measurements) -> Floats:
     """Return where each set begins on the common axis of time, s."""
-    lengths = [
-        float(table.time_s[table.set_number == number].max(initial=0.0)) + _GAP_S
-        for number in range(len(table.set_names))
-    ]
+    sets = [table.time_s[table.set_number == number] for number in range(len(table.set_names))]
+    lengths = [float(times.max(initial=0.0)) + _GAP_S for times in sets]
     return np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
 
 
@@ -365,14 +302,8 @@ def _name_sets(panel: Axes, table: Measurements, start: Floats) -> None:
     for name, begin, end in zip(table.set_names, start, ends, strict=True):
         if end is not None:
             panel.axvline(end - _GAP_S / 2, color=GREY, lw=1)
-        panel.annotate(
-            name,
-            (begin, 1.0),
-            (0, -14),
-            xycoords=("data", "axes fraction"),
-            textcoords="offset points",
-            fontsize=10,
-        )
+        place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        panel.annotate(name, (begin, 1.0), (0, -14), fontsize=10, **place)
 
 
 def _draw_regression(panel: Axes, table: Measurements) -> None:
@@ -393,16 +324,14 @@ def _draw_means(panel: Axes, table: Measurements) -> None:
     without = table.strehl[table.group(NO_TV)]
     if len(without):
         error = np.nan_to_num(paired_mean(without).standard_error)
-        panel.axhspan(
-            without.mean() - error, without.mean() + error, color=_GROUP_STYLES[NO_TV][0], alpha=0.2, lw=0
-        )
+        ends = without.mean() - error, without.mean() + error
+        panel.axhspan(*ends, color=_GROUP_STYLES[NO_TV][0], alpha=0.2, lw=0)
         panel.axhline(without.mean(), color=_GROUP_STYLES[NO_TV][0], lw=1.3, label=NO_TV)
     rows = differences_by_strength(table)
     panel.plot([row.strength_e for row in rows], [row.strehl for row in rows], color="#000000", lw=1.3)
 
 
-def _measurement_rows(table: Measurements) -> tuple[list[str], list[list[Any]]]:
-    header = ["set", "time_s", "strength_e", "strehl", "r0_m", "true_r0_m", "frames"]
+def _measurement_rows(table: Measurements) -> list[list[Any]]:
     columns = (table.time_s, table.strength_e, table.strehl, table.r0_m, table.true_r0_m, table.frames)
     names = [table.set_names[number] for number in table.set_number]
-    return header, [[name, *row] for name, *row in zip(names, *(c.tolist() for c in columns), strict=True)]
+    return [[name, *row] for name, *row in zip(names, *(c.tolist() for c in columns), strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +48,10 @@ from faintspot.experiments.loop_verdict import (
 )
 from faintspot.experiments.statistics import paired_mean
 from faintspot.report.figure_data import FigureWithData
-from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of, write_page
+from faintspot.report.page import POSITIONS, Page, Section, configuration_section, html_of, write_page
+from faintspot.report.texts import Texts
 
+_TEXT = Texts("faintspot.experiments")
 _FEW_REALISATIONS = 5
 _SHOWN_STRENGTH = 0.85  # of the images: in the middle of 0.6 to 1.1
 _LEAST_STREHL = 0.1  # of a flux whose images are shown
@@ -89,22 +92,14 @@ def loop_warnings(results: LoopResults) -> list[str]:
             continue
         missing = int(np.isnan(strehl).sum())
         if missing:
-            lines.append(
-                f"{name}: {missing} of {strehl.size} runs are still missing; what is there will change."
-            )
+            lines.append(_TEXT("loop.unfinished", name=name, missing=missing, runs=strehl.size))
         if strehl.shape[-1] < _FEW_REALISATIONS:
-            lines.append(
-                f"{name}: {strehl.shape[-1]} realisations of the air; errors between fewer than "
-                f"{_FEW_REALISATIONS} are themselves uncertain."
-            )
+            few = {"count": strehl.shape[-1], "fewest": _FEW_REALISATIONS}
+            lines.append(_TEXT("loop.few_realisations", name=name, **few))
     if results.interleaved is not None:
         frames = measurements(results.interleaved).frames
         if frames.min() < 400:
-            lines.append(
-                f"Interleaved observations: measurements of {frames.min()} frames after settling; at "
-                "least 400 "
-                "make a Strehl ratio that means something."
-            )
+            lines.append(_TEXT("loop.few_frames", frames=frames.min()))
     return lines
 
 
@@ -132,13 +127,9 @@ def _interleaved(result: InterleavedResult) -> list[Section]:
     table = measurements(result)
     record = result.records[0]
     strehl, *others = interleaved_figures(table, record.science_wavelength_m)
-    text = [
-        f"{len(table.strehl)} measurements in {len(result.records)} sets of {np.median(table.frames):.0f} "
-        "frames "
-        f"({np.median(table.frames) / record.frame_rate_hz:.1f} s) each after settling: first one without "
-        "TV, then "
-        "with rising strengths, again and again. Strehl ratios are of the long exposure."
-    ]
+    frames = np.median(table.frames)
+    told = {"count": len(table.strehl), "sets": len(result.records), "frames": frames}
+    text = [_TEXT("loop.interleaved", **told, seconds=frames / record.frame_rate_hz)]
     seeing = _seeing_line(table)
     return [
         Section(
@@ -160,16 +151,10 @@ def _seeing_line(table: Measurements) -> list[str]:
         if chosen.any():
             ratio = table.r0_m[chosen] / table.true_r0_m[chosen]
             within = float((np.abs(ratio - 1) < 0.1).mean())
-            lines.append(
-                f"Measurements {name}: r0 from the telemetry is {np.median(ratio):.2f} of the true one in "
-                "the median; "
-                f"{100 * within:.0f} % of {chosen.sum()} single measurements are within 10 %."
-            )
+            told = {"ratio": np.median(ratio), "within": 100 * within, "count": chosen.sum()}
+            lines.append(_TEXT("loop.r0", name=name, **told))
     if not known.all():
-        lines.append(
-            f"{int((~known).sum())} measurements tell no r0: fewer than 90 % of their slopes could be "
-            "measured."
-        )
+        lines.append(_TEXT("loop.no_r0", count=int((~known).sum())))
     return lines
 
 
@@ -186,17 +171,11 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
         ]
     pairs = [(arm, without) for _, arm, without in options_that_may_pay(result)]
     if pairs:
-        tables.append(
-            difference_table(
-                result, pairs, "Whether the loop’s own prediction, weights and the gain’s correction pay."
-            )
-        )
-    realisations = result.strehl.shape[-1]
-    text = [
-        f"{len(result.labels)} arms, {len(result.photons)} fluxes, {realisations} realisations of the "
-        "air, the same "
-        f"for all arms. Compared with {base}."
-    ]
+        table = difference_table(result, pairs)
+        tables.append(replace(table, caption=_TEXT["tables.difference.options"] + table.caption))
+    arms, fluxes, realisations = result.strehl.shape
+    counts = {"arms": arms, "fluxes": fluxes, "realisations": realisations}
+    text = [_TEXT("loop.magnitude", **counts, reference=base)]
     return [
         Section(
             "magnitude",
@@ -232,7 +211,7 @@ def _images_of_arms(result: MagnitudeResult) -> FigureWithData | None:
     good = np.flatnonzero(curve >= _LEAST_STREHL)
     flux = int(good[0]) if len(good) else int(np.nanargmax(curve))
     images = [result.psf[arm, flux] for arm in (reference, tv)]
-    where = f"Mean of {result.strehl.shape[-1]} realisations at {result.photons[flux]:.3g} photo-electrons"
+    where = _TEXT("loop.images_of_arms", realisations=result.strehl.shape[-1], photons=result.photons[flux])
     return psf_figure(images, [result.labels[arm] for arm in (reference, tv)], where)
 
 
@@ -243,7 +222,7 @@ def _images_of_set(result: InterleavedResult) -> FigureWithData | None:
         return None
     tv = strong[np.argmin(np.abs(strengths[strong] - _SHOWN_STRENGTH))]
     names = [NO_TV, f"TV, strength {strengths[tv]:.2g} e⁻"]
-    where = f"Mean of all frames of each in the set “{result.set_names[0]}”, settling ones included"
+    where = _TEXT("loop.images_of_set", name=result.set_names[0])
     return psf_figure([record.psf[without[0]], record.psf[tv]], names, where)
 
 
@@ -259,14 +238,8 @@ def _budget(result: BudgetResult, results: LoopResults) -> Section:
             change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
             off = "–" if number == 0 else term
             rows.append([name, off, with_error(strehl), with_error(residual, 0), in_words(change)])
-    table = Table(
-        ["arm", "switched off", "Strehl", "residual wavefront (nm rms)", "change in Strehl"],
-        rows,
-        "Means and their standard errors. Change: against the whole loop, over the same realisations, with "
-        "its 95 % interval. "
-        + "; ".join(f"{term}: {TERMS[term].meaning}" for term in result.terms[1:] if term in TERMS)
-        + ".",
-    )
+    meanings = "; ".join(f"{term}: {TERMS[term].meaning}" for term in result.terms[1:] if term in TERMS)
+    table = _TEXT.table("tables.budget", rows, meanings=meanings)
     text = _budget_lines(result)
     return Section("budget", "Error budget", text, [table], [budget_figure(result, label)])
 
@@ -283,9 +256,7 @@ def _budget_lines(result: BudgetResult) -> list[str]:
             lines.append(f"{name}: most Strehl is gained without {', then '.join(parts)}.")
         if _SLOPE_ERROR in result.terms:
             most = in_words(gains[result.terms.index(_SLOPE_ERROR)])
-            lines.append(
-                f"{name}: slopes without any error would change the Strehl by {most} at this loop gain."
-            )
+            lines.append(_TEXT("loop.true_slopes", name=name, change=most))
     for arm, name in enumerate(result.labels[1:], start=1):
         parts = [
             f"{_without(number, term)} {in_words(paired_mean(difference))}"
@@ -349,27 +320,16 @@ def _facts(results: LoopResults) -> dict[str, str]:
     configuration = configuration_of(results)
     if configuration is None:
         return {}
-    telescope, sensor, atmosphere = configuration.telescope, configuration.sensor, configuration.atmosphere
-    camera, control = configuration.camera, configuration.control
-    r0 = (
-        f"{atmosphere.r0_m[0]:g} to {atmosphere.r0_m[1]:g}"
-        if isinstance(atmosphere.r0_m, tuple)
-        else f"{atmosphere.r0_m:g}"
-    )
-    return {
-        "Telescope": f"{telescope.diameter_m:g} m, central obstruction {telescope.obstruction:g} of the "
-        "diameter",
-        "Sensor": f"{sensor.subapertures} × {sensor.subapertures} sub-apertures of "
-        f"{configuration.subaperture_m:.2g} m, "
-        f"{sensor.pixels} × {sensor.pixels} px, {sensor.wavelength_m * 1e9:.0f} nm",
-        "Atmosphere": f"r0 {r0} m at 500 nm, outer scale {atmosphere.outer_scale_m:g} m, "
-        f"{len(atmosphere.fraction)} layers",
-        "Camera": f"read noise {camera.read_noise_e / camera.em_gain:.3g} e⁻"
-        + (f", multiplication gain {camera.em_gain:g}" if camera.em_gain > 1 else ""),
-        "Star": f"{configuration.photons:g} photo-electrons of a sub-aperture in a frame, where not varied",
-        "Control": f"{control.frame_rate_hz:g} frames/s, {control.mode} loop; the command computed from "
-        "frame k acts "
-        f"first during frame k + {control.delay_frames}",
-        "Wavefront": "that of the middle of each exposure stands for all of it",
-        "Strehl ratio": f"on axis at {configuration.science.wavelength_m * 1e6:.3g} µm",
+    camera, r0 = configuration.camera, configuration.atmosphere.r0_m
+    values = {
+        **{name: getattr(configuration, name) for name in ("telescope", "sensor", "atmosphere", "control")},
+        "r0": f"{r0[0]:g} to {r0[1]:g}" if isinstance(r0, tuple) else f"{r0:g}",
+        "side": configuration.subaperture_m,
+        "nm": configuration.sensor.wavelength_m * 1e9,
+        "layers": len(configuration.atmosphere.fraction),
+        "noise": camera.read_noise_e / camera.em_gain,
+        "gain": f", multiplication gain {camera.em_gain:g}" if camera.em_gain > 1 else "",
+        "photons": configuration.photons,
+        "science_um": configuration.science.wavelength_m * 1e6,
     }
+    return {name: _TEXT(f"loop.facts.{name}", **values) for name in _TEXT["loop.facts"]}

@@ -25,46 +25,30 @@ from faintspot.experiments.loop_results import (
 )
 from faintspot.experiments.statistics import paired_mean
 from faintspot.report.page import Table
+from faintspot.report.texts import Texts
+
+_TEXT = Texts("faintspot.experiments")
 
 
 def strehl_groups_table(result: InterleavedResult, table: Measurements) -> Table:
     """Return the paper's table, of all sets together and of each, with paired differences."""
     rows = [_group_rows("all sets", table, None)]
     rows += [_group_rows(name, table, number) for number, name in enumerate(result.set_names)]
-    return Table(
-        [
-            "set",
-            "group",
-            "mean Strehl",
-            "standard deviation",
-            "measurements",
-            "paired difference",
-            "at equal r0",
-        ],
-        [row for part in rows for row in part],
-        "Standard deviation: of the measurements, mostly the drift of r0. Paired difference: from the "
-        "neighbouring measurements without TV, with its 95 % interval from drawing whole cycles. At equal "
-        "r0: the same after the dependence of Strehl on the measured r0 is taken out, of measurements "
-        "that tell "
-        "it, which those are not where the loop lost the star. “All strengths”: above 0.",
-    )
+    return _TEXT.table("tables.strehl_groups", [row for part in rows for row in part])
 
 
 def regression_table(table: Measurements) -> Table:
     """Return the regression lines of Strehl against r0."""
-    return Table(
-        ["group", "slope (Strehl for 1 cm of r0)", "correlation", "measurements"],
+    rows = [
         [
-            [
-                name,
-                f"{line.slope / 100:.4f} ({line.slope_low / 100:.4f} to {line.slope_high / 100:.4f})",
-                f"{line.correlation:.2f}",
-                str(line.count),
-            ]
-            for name, line in regression_lines(table).items()
-        ],
-        "Strehl against r0: least-squares lines, slopes with 95 % intervals.",
-    )
+            name,
+            f"{line.slope / 100:.4f} ({line.slope_low / 100:.4f} to {line.slope_high / 100:.4f})",
+            f"{line.correlation:.2f}",
+            str(line.count),
+        ]
+        for name, line in regression_lines(table).items()
+    ]
+    return _TEXT.table("tables.regression", rows)
 
 
 def _group_rows(name: str, table: Measurements, number: int | None) -> list[list[str]]:
@@ -83,103 +67,54 @@ def _group_rows(name: str, table: Measurements, number: int | None) -> list[list
 
 def seeing_table(result: InterleavedResult) -> Table:
     """Return r0 of each set, measured in several ways, and the truth."""
-    rows = [
-        [
-            item.set_name,
-            f"{100 * item.true_r0_m:.1f}",
-            *(
-                f"{100 * value:.1f} ({100 * (value / item.true_r0_m - 1):+.0f} %)".replace("-", "−")
-                for value in (
-                    item.seeing.r0_m,
-                    item.seeing.r0_x_m,
-                    item.seeing.r0_y_m,
-                    item.with_tip_tilt.r0_m,
-                    item.with_tip_tilt.r0_kolmogorov_m,
-                )
-            ),
-            f"{item.seeing.noise_std_px:.2f}",
-        ]
-        for item in seeing_of_sets(result)
-    ]
-    return Table(
-        [
-            "set",
-            "true",
-            "measured",
-            "x alone",
-            "y alone",
-            "with tip and tilt",
-            "Kolmogorov",
-            "slope noise (px)",
-        ],
-        rows,
-        "r0 in cm at 500 nm from all frames of a set, and its deviation from the truth. Measured: from "
-        "slopes "
-        "about their mean over the pupil. Kolmogorov: what whole slopes give when the outer scale is "
-        "ignored.",
-    )
+    rows = []
+    for item in seeing_of_sets(result):
+        plain, whole = item.seeing, item.with_tip_tilt
+        found = (plain.r0_m, plain.r0_x_m, plain.r0_y_m, whole.r0_m, whole.r0_kolmogorov_m)
+        apart = [f"{100 * r0:.1f} ({100 * (r0 / item.true_r0_m - 1):+.0f} %)" for r0 in found]
+        cells = [item.set_name, f"{100 * item.true_r0_m:.1f}", *(cell.replace("-", "−") for cell in apart)]
+        rows.append([*cells, f"{plain.noise_std_px:.2f}"])
+    return _TEXT.table("tables.seeing", rows)
 
 
 def gain_table(result: MagnitudeResult, arms: Sequence[int], reference: int) -> Table:
     """Return the gains in limiting magnitude of arms over a reference at equal Strehl."""
     gains = {arm: gains_in_magnitude(result, arm, reference) for arm in arms}
     levels = next(([gain.strehl for gain in found] for found in gains.values()), [])
-    return Table(
-        ["arm", *(f"at Strehl {level:g}" for level in levels)],
-        [[result.labels[arm], *(gain_in_words(gain) for gain in found)] for arm, found in gains.items()],
-        f"Gain in limiting magnitude over {result.labels[reference]} at equal Strehl ratio, with its 95 % "
-        "interval "
-        "from drawing realisations. Read between the magnitudes measured, never beyond; “beyond” in an "
-        "interval: "
-        "more than 2.5 % of the draws left them. Strehl ratios that the reference does not pass are not "
-        "listed.",
-    )
+    rows = [[result.labels[arm], *map(gain_in_words, found)] for arm, found in gains.items()]
+    columns = [f"at Strehl {level:g}" for level in levels]
+    return _TEXT.table("tables.gain", rows, columns, reference=result.labels[reference])
 
 
-def difference_table(result: MagnitudeResult, pairs: Sequence[tuple[int, int]], caption: str = "") -> Table:
+def difference_table(result: MagnitudeResult, pairs: Sequence[tuple[int, int]]) -> Table:
     """Return the difference in Strehl of pairs of arms at each flux."""
-    return Table(
-        ["arm", "less", *(f"{photons:.3g}" for photons in result.photons)],
-        [
-            [
-                result.labels[arm],
-                result.labels[other],
-                *(in_words(each) for each in differences_by_flux(result, arm, other)),
-            ]
-            for arm, other in pairs
-        ],
-        f"{caption} Difference in Strehl at each number of photo-electrons, with intervals that hold for all "
-        "fluxes of a row together with 95 %.".strip(),
-    )
+    rows = [
+        [result.labels[arm], result.labels[other], *map(in_words, differences_by_flux(result, arm, other))]
+        for arm, other in pairs
+    ]
+    return _TEXT.table("tables.difference", rows, _fluxes(result))
 
 
 def centroid_gain_table(result: MagnitudeResult) -> Table:
     """Return the centroid gain of every arm at each flux."""
-    return Table(
-        ["arm", *(f"{photons:.3g}" for photons in result.photons)],
-        [
-            [label, *(with_error(paired_mean(values), 2) for values in result.centroid_gain[arm])]
-            for arm, label in enumerate(result.labels)
-        ],
-        "At each number of photo-electrons, with its standard error. Slopes are divided by it, except in "
-        "arms that start from the loop’s own prediction.",
-    )
+    rows = [
+        [label, *(with_error(paired_mean(values), 2) for values in gains)]
+        for label, gains in zip(result.labels, result.centroid_gain, strict=True)
+    ]
+    return _TEXT.table("tables.centroid_gain", rows, _fluxes(result))
 
 
 def settings_table(result: MagnitudeResult) -> Table:
     """Return the tuned loop gain and settings of every arm at each flux."""
     rows = [
-        [
-            label,
-            *(_settings_words(*each) for each in zip(result.choices[arm], result.settings[arm], strict=True)),
-        ]
-        for arm, label in enumerate(result.labels)
+        [label, *map(_settings_words, choices, settings)]
+        for label, choices, settings in zip(result.labels, result.choices, result.settings, strict=True)
     ]
-    return Table(
-        ["arm", *(f"{photons:.3g}" for photons in result.photons)],
-        rows,
-        "At each number of photo-electrons: loop gain, and settings that are not the default ones.",
-    )
+    return _TEXT.table("tables.settings", rows, _fluxes(result))
+
+
+def _fluxes(result: MagnitudeResult) -> list[str]:
+    return [f"{photons:.3g}" for photons in result.photons]
 
 
 def _settings_words(choice: str, text: str) -> str:
