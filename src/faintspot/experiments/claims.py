@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,13 +13,13 @@ from faintspot.experiments.curves import Curve, Gain, gain_at_error
 from faintspot.experiments.judges import LEVEL_PX
 from faintspot.experiments.study_curves import (
     AgainstTV,
-    Case,
     Configuration,
     Finding,
     Verdict,
     against_tv,
     study_curves,
 )
+from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
     import xarray
@@ -50,72 +49,17 @@ def verdicts(dataset: xarray.Dataset, seed: int = 2015) -> list[Verdict]:
     if not {NO_TV, TV} <= {str(name) for name in dataset["arm"].values}:
         return []
     results = []
-    for number, (claim, rule, judge) in enumerate(_CLAIMS, start=1):
+    for number, (text, judge) in enumerate(zip(_TEXT["claims"], judges.JUDGES, strict=True), start=1):
+        rule = text["rule"].format(level=LEVEL_PX, equal=judges.EQUAL)
         findings = []
         for mode in (BEST_MODE, fixed_mode(dataset)):
             rng = np.random.default_rng([seed, number])
             findings.append(Finding(mode, judge(dataset, mode, rng) if mode in modes else []))
-        results.append(Verdict(number, claim, rule, *findings))
+        results.append(Verdict(number, text["claim"], rule, *findings))
     return results
 
 
-_Judge = Callable[["xarray.Dataset", str, np.random.Generator], list[Case]]
-_INTERVAL = "all intervals 95 %"
-_CLAIMS: tuple[tuple[str, str, _Judge], ...] = (
-    (
-        "30 photons with TV equal 80 without (0.1 e- read noise)",
-        f"Holds where the interval of the flux gain at 80 e- ({_INTERVAL}) reaches 80 / 30 = 2.67; in part "
-        "where it reaches half of that in magnitudes, a factor 1.63.",
-        judges.thirty_equal_eighty,
-    ),
-    (
-        "A factor 2 to 3 less flux, up to one magnitude",
-        "Of each configuration (Nyquist-sampled, 16 × 16 px) the flux with the largest gain by the "
-        "interval's lower end. Holds where the interval reaches 2; in part where it reaches half of "
-        "that in magnitudes, a factor 1.41.",
-        judges.two_to_three,
-    ),
-    (
-        "Small spots gain most",
-        f"Flux gains at R = {judges.LEVEL_PX} px. Holds where the smallest spot's gain is above every other "
-        "size's by 1.96 standard errors; in part where not decided; not where another size gains more.",
-        judges.small_spots,
-    ),
-    (
-        "R with TV does not depend on the sub-aperture's size",
-        f"R of the largest window over R of the smallest. Holds where the interval reaches within "
-        f"{judges.EQUAL:.0%} of 1; in part where R changes, but by less than without TV.",
-        judges.independent_of_pixels,
-    ),
-    (
-        "R depends less on the number of brightest pixels kept",
-        "Best k: largest over smallest R as k runs, at the strength chosen for best k. Fixed k: the same "
-        "over the fixed k of the study, the strength chosen for each. Holds where TV's is smaller by 1.96 "
-        "standard errors; in part where not decided.",
-        judges.less_dependence_on_k,
-    ),
-    (
-        "Elongated spots: the gain grows with read noise, up to 25 % less flux above 3 e-",
-        f"Flux gains at R = {judges.LEVEL_PX} px. Holds where ln(gain) grows with log(read noise) by 1.96 "
-        "standard errors and the interval of the largest saving at 3 e- or more reaches 25 %; in part for "
-        "one of the two.",
-        judges.elongated,
-    ),
-    (
-        "One magnitude at 16 e- read noise",
-        "The largest gain, by the interval's lower end, at R = 0.1, 0.15, 0.2 or 0.3 px. Holds where its "
-        "interval reaches 1 mag; in part where it reaches 0.5 mag.",
-        judges.one_magnitude,
-    ),
-    (
-        "Never worse on average",
-        "Paired differences of R in all cells, with a false-alarm rate of 5 % for all of them together "
-        "(Bonferroni). Holds where no cell is worse; in part where more cells are better than worse.",
-        judges.never_worse,
-    ),
-)
-
-
+_TEXT = Texts("faintspot.experiments")
 _WORTH_IT = 1.1
 """Flux gain from which the cost of denoising is called worth it."""
 _MOST_LISTED = 4
@@ -142,16 +86,12 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
     """
     arms = {str(arm) for arm in dataset["arm"].values}
     if not {NO_TV, TV} <= arms:
-        return ["This study does not compare TV with brightest pixels alone, so it gives no advice on TV."]
+        return [_TEXT["guidance.no_tv"]]
     rng = np.random.default_rng(seed)
     curves = study_curves(dataset, BEST_MODE)
     best = _compared(curves, rng, SMOOTHING in arms)
     if not best:
-        return [
-            f"No configuration of this study has curves that reach R = {LEVEL_PX} px, so flux gains cannot "
-            "be given. The figures show what there is.",
-            *_against_baselines(dataset),
-        ]
+        return [_TEXT("guidance.no_gains", level=LEVEL_PX), *_against_baselines(dataset)]
     paragraphs = [_best_k(best), *_where(best)]
     fixed = fixed_mode(dataset)
     if fixed in dataset["mode"].values:
@@ -175,33 +115,32 @@ def _compared(
 
 
 def _best_k(best: list[_Compared]) -> str:
-    better = [item for item in best if item.gain.low > 1]
-    worse = [item for item in best if item.gain.high < 1]
+    better = sum(item.gain.low > 1 for item in best)
+    worse = sum(item.gain.high < 1 for item in best)
     factors = np.array([item.gain.factor for item in best])
     median = float(np.median(factors))
-    start = (
-        f"With the best k in every arm, and compared at R = {LEVEL_PX} px, TV needs less flux than "
-        f"brightest pixels alone in {len(better)} of {len(best)} configurations, more in {len(worse)}; in "
-        f"{len(best) - len(better) - len(worse)} the 95 % interval contains 1. "
+    return _TEXT(
+        "guidance.best_k",
+        level=LEVEL_PX,
+        better=better,
+        all=len(best),
+        worse=worse,
+        undecided=len(best) - better - worse,
+        least=factors.min(),
+        most=factors.max(),
+        median=median,
+        magnitudes=2.5 * np.log10(median),
     )
-    middle = f"The flux gain is {factors.min():.2f} to {factors.max():.2f}, with a median of {median:.2f} ("
-    return start + middle + f"{2.5 * np.log10(median):+.2f} mag)."
 
 
 def _where(best: list[_Compared]) -> list[str]:
     most = sorted(best, key=lambda item: -item.gain.low)
     worth = [item for item in most if item.gain.low > _WORTH_IT]
     costs = [item for item in reversed(most) if item.gain.high < 1]
-    paragraphs = []
-    if worth:
-        paragraphs.append(
-            f"It gains more than {_WORTH_IT:g} (interval above it) in {len(worth)} configurations, most in: "
-            + _listed(worth)
-        )
-    else:
-        paragraphs.append(f"In no configuration is the gain above {_WORTH_IT:g} beyond its error.")
+    found = "worth" if worth else "not_worth"
+    paragraphs = [_TEXT(f"guidance.{found}", worth=_WORTH_IT, count=len(worth), listed=_listed(worth))]
     if costs:
-        paragraphs.append(f"It loses flux in {len(costs)}, most in: {_listed(costs)}")
+        paragraphs.append(_TEXT("guidance.costs", count=len(costs), listed=_listed(costs)))
     return [*paragraphs, *_with_noise(best)]
 
 
@@ -219,7 +158,7 @@ def _with_noise(best: list[_Compared]) -> list[str]:
             lines.append(f"{profile} spots: {values}")
     if not lines:
         return []
-    return [f"Median gain of round spots of size 1 by read noise. {'. '.join(lines)}."]
+    return [_TEXT("guidance.with_noise", profiles=". ".join(lines))]
 
 
 def _fixed_k(best: list[_Compared], fixed: list[_Compared], mode: str) -> list[str]:
@@ -230,18 +169,10 @@ def _fixed_k(best: list[_Compared], fixed: list[_Compared], mode: str) -> list[s
     larger = sum(other.low > own.high for own, other in pairs)
     smaller = sum(other.high < own.low for own, other in pairs)
     own, other = (float(np.median([pair[i].factor for pair in pairs])) for i in (0, 1))
+    conclusion = _TEXT["guidance.fixed_k_flatters" if larger > smaller else "guidance.fixed_k_does_not"]
+    counts = {"pairs": len(pairs), "larger": larger, "smaller": smaller, "own": own, "other": other}
     k = mode.removeprefix("fixed")
-    text = (
-        f"With k fixed at {k} in both arms the median gain is {other:.2f} instead of {own:.2f} in the "
-        f"{len(pairs)} configurations that have both: larger in {larger}, smaller in {smaller}, beyond both "
-        "intervals. "
-    )
-    if larger > smaller:
-        return [
-            f"{text}Part of what TV seems to save there is what the k of the other arm costs: a system whose "
-            "k cannot be tuned gains more from TV than one whose k is."
-        ]
-    return [f"{text}So in this study a fixed k does not make TV look better than it is."]
+    return [_TEXT("guidance.fixed_k", k=k, **counts, conclusion=conclusion)]
 
 
 def _choosing_k(
@@ -258,32 +189,19 @@ def _choosing_k(
         return []
     k = mode.removeprefix("fixed")
     median = float(np.median(ratios))
-    start = f"Without any denoising, the best k in place of k = {k} divides R by {median:.2f} in the median "
-    middle = f"cell and by up to {max(ratios):.2f}"
-    if median > 1.02:
-        return [f"{start}{middle}: tune k before anything else."]
-    return [f"{start}{middle}: k = {k} is nearly as good as the best in most cells."]
+    conclusion = _TEXT("guidance.tune_k" if median > 1.02 else "guidance.k_is_good", k=k)
+    return [_TEXT("guidance.choosing_k", k=k, median=median, most=max(ratios), conclusion=conclusion)]
 
 
 def _against_gaussian(best: list[_Compared]) -> list[str]:
     known = [(item, item.over_gaussian) for item in best if item.over_gaussian is not None]
     if not known:
         return []
-    tv = [item for item, over in known if over.low > 1]
-    gaussian = [item for item, over in known if over.high < 1]
+    tv, gaussian = sum(over.low > 1 for _, over in known), sum(over.high < 1 for _, over in known)
     median = float(np.median([over.factor for _, over in known]))
-    text = (
-        f"Against linear Gaussian smoothing of the best width with the best k, at R = {LEVEL_PX} px, TV "
-        f"needs less flux in {len(tv)} of {len(known)} configurations and more in {len(gaussian)}; median "
-        f"flux gain of TV over it {median:.2f}. "
-    )
-    if len(tv) > len(gaussian):
-        return [text + "TV is the better of the two more often."]
-    if len(gaussian) > len(tv):
-        return [
-            text + "Gaussian smoothing, which is simpler and faster, is the better of the two more often."
-        ]
-    return [text + "Neither is the better more often; Gaussian smoothing is simpler and faster."]
+    verdict = {1: "tv_is_better", -1: "gaussian_is_better", 0: "neither"}[np.sign(tv - gaussian)]
+    counts = {"tv": tv, "all": len(known), "gaussian": gaussian, "median": median}
+    return [_TEXT("guidance.gaussian", level=LEVEL_PX, **counts, conclusion=_TEXT[f"guidance.{verdict}"])]
 
 
 def _against_baselines(dataset: xarray.Dataset) -> list[str]:
@@ -300,7 +218,7 @@ def _against_baselines(dataset: xarray.Dataset) -> list[str]:
         lines.append(f"{profile} spots ({rows[0].cells} cells): {verdict}")
     if not lines:
         return []
-    return [f"Cell by cell, at all signals, with the best k in every arm: {'; '.join(lines)}."]
+    return [_TEXT("guidance.baselines", lines="; ".join(lines))]
 
 
 def _recommendation(best: list[_Compared]) -> str:
@@ -310,29 +228,17 @@ def _recommendation(best: list[_Compared]) -> str:
         if item.gain.low > _WORTH_IT and (item.over_gaussian is None or item.over_gaussian.low > 1)
     ]
     worth = sum(item.gain.low > _WORTH_IT for item in best)
+    counts = {"worth": _WORTH_IT, "all": len(best)}
     if not worth:
-        return (
-            "Advice: do not use TV on the strength of this study. In no configuration does it save "
-            f"more than a factor {_WORTH_IT:g} of flux with a tuned k."
-        )
+        return _TEXT("guidance.advice_against", **counts)
     if not use:
-        return (
-            f"Advice: tune k first, and smooth with a Gaussian before you think of TV. TV saves more than a "
-            f"factor {_WORTH_IT:g} of flux with a tuned k in {worth} of {len(best)} configurations, but in "
-            "none of them is it ahead of Gaussian smoothing: use it only where smoothing is not at hand."
-        )
+        return _TEXT("guidance.advice_smoothing", **counts, count=worth)
     where = sorted(use, key=lambda item: -item.gain.low)
-    rest = len(best) - len(use)
-    tail = (
-        f" In the other {rest} configurations tune k first, and try Gaussian smoothing before TV."
-        if rest
-        else ""
-    )
+    left = len(best) - len(use)
+    rest = _TEXT("guidance.rest", count=left) if left else ""
     also = " and beats Gaussian smoothing" if any(item.over_gaussian for item in use) else ""
-    return (
-        f"Advice: use TV in the {len(use)} of {len(best)} configurations in which it saves more than a "
-        f"factor {_WORTH_IT:g} of flux with a tuned k{also}: {_listed(where)}{tail}"
-    )
+    listed = _listed(where)
+    return _TEXT("guidance.advice_for", **counts, count=len(use), also=also, listed=listed, rest=rest)
 
 
 def _listed(items: list[_Compared]) -> str:

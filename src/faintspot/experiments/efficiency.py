@@ -15,6 +15,7 @@ from faintspot.estimators.window import Window
 from faintspot.experiments.arms import knows_the_spot
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_curves import Configuration
+from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
     import xarray
@@ -29,11 +30,7 @@ EXPECTED_EFFICIENCY = {ML: 0.95, MAP: 0.95, Weighted.name: 0.75}
 """Least photon efficiency, by arm, where there is flux enough."""
 NEAR_BEST = 1.04
 """Gain-corrected rms over the smallest of all arms up to which an arm counts as near the best."""
-_OF_WINDOWS = (
-    "True positions are uniform within plus and minus the range that stands behind each cell (±1 px in "
-    "most) on each axis; how near to the limit an arm comes depends on it, that of a fixed window (`window`, "
-    "told the mean flux as `trained` is) above all: it lives from a narrow one, as in a closed loop."
-)
+_TEXT = Texts("faintspot.experiments")
 _OUTLIERS = 0.01  # fraction of the likelihood's slopes, from which outliers dominate its error
 
 
@@ -108,11 +105,9 @@ def _efficient(cells: _Cells) -> list[str]:
             values = np.where(enough, cells.of("photon_efficiency", arm), np.inf)
             lowest = int(np.argmin(values))
             reached = int(np.sum(values[enough] >= target))
-            found.append(
-                f"{arm}: photon efficiency of at least {target:g} in {reached} of {enough.sum()} cells that "
-                f"have flux enough (30 e- at 0.1 e- read noise, 120 at 3, 500 at 16; in between in "
-                f"proportion); lowest {values[lowest]:.3f} ({cells.words(lowest)})."
-            )
+            words = {"arm": arm, "target": target, "reached": reached, "cells": enough.sum()}
+            where = cells.words(lowest)
+            found.append(_TEXT("findings.efficient", **words, lowest=values[lowest], where=where))
     return found
 
 
@@ -124,14 +119,20 @@ def _outlier_dominated(cells: _Cells) -> list[str]:
         return []
     errors, se = cells.values("error", BEST)[dominated], cells.of("error_se", MAP)[dominated]
     own = cells.of("error", MAP)[dominated]
-    ratio = own / errors.min(axis=1)
+    smallest = errors.min(axis=1)
+    ratio = own / smallest
     stated = cells.of("stated_over_actual_all", MAP, None)[dominated]
     return [
-        f"Where more than {_OUTLIERS:.0%} of the likelihood's slopes are outliers ({dominated.sum()} "
-        f"cells), map has the smallest R of all arms in {int(np.sum(ratio <= 1))} and is within two "
-        f"standard errors of it in {int(np.sum(own - errors.min(axis=1) <= 2 * se))} (at most "
-        f"{ratio.max():.3f} of the smallest); its stated over its actual error, outliers included, is "
-        f"{stated.min():.2f} to {stated.max():.2f}."
+        _TEXT(
+            "findings.outliers",
+            limit=_OUTLIERS,
+            cells=dominated.sum(),
+            smallest=int(np.sum(ratio <= 1)),
+            near=int(np.sum(own - smallest <= 2 * se)),
+            most=ratio.max(),
+            low=stated.min(),
+            high=stated.max(),
+        )
     ]
 
 
@@ -148,10 +149,9 @@ def _near_the_best(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
             listed = ", ".join(
                 f"{arm} {near[arm]} (worst {100 * (worst[arm] - 1):.0f} %)" for arm in ranked[:5]
             )
-            found.append(
-                f"Gain-corrected rms of speckled spots ({words}, {part.sum()} cells): within "
-                f"{100 * (NEAR_BEST - 1):.0f} % of the best of all arms: {listed}."
-            )
+            near_percent = 100 * (NEAR_BEST - 1)
+            counts = {"which": words, "cells": part.sum(), "near": near_percent}
+            found.append(_TEXT("findings.near_best", **counts, ranked=listed))
     return found
 
 
@@ -170,13 +170,8 @@ def markdown(dataset: xarray.Dataset, command: str) -> str:
         That makes the page.
     """
     parts = [
-        "# How near to the limit\n",
-        "How near does each estimator come to the smallest slope error that photons and read noise allow, "
-        "the Cramer-Rao bound?\n",
-        f"Made by `{command}`: {dataset.attrs['n']} images of each cell, settings chosen on one half and "
-        f"scored on the other, seed {dataset.attrs['seed']}; all arms have the range of true positions as "
-        "their search range. The methods are those of the study.\n",
-        *([f"{_OF_WINDOWS}\n"] if Window.name in dataset["arm"].values else []),
+        _TEXT("markdown.head", command=command, n=dataset.attrs["n"], seed=dataset.attrs["seed"]),
+        *([_TEXT["markdown.windows"]] if Window.name in dataset["arm"].values else []),
         "## What it says\n",
         *(f"- {line}" for line in findings(dataset)),
         "",
@@ -193,10 +188,7 @@ def _efficiency_section(cells: _Cells) -> list[str]:
     values = cells.values("photon_efficiency", BEST)
     bound = cells.coordinate("bound")
     return [
-        "## Photon efficiency\n",
-        "The flux at which the Cramer-Rao bound has the arm's R, over the flux: 1 is the limit of an "
-        "estimator without bias; more where the search range, which the bound does not know, helps. "
-        "Standard error 0.02 where R is well above the floor of the range.\n",
+        _TEXT["markdown.efficiency"],
         *_table(cells, ["R at the bound, px"], lambda i: [f"{bound[i]:.4f}"], lambda i: _numbers(values[i])),
     ]
 
@@ -212,9 +204,7 @@ def _calibration_section(cells: _Cells) -> list[str]:
         texts = [f"{near[index, i]:.2f} ({whole[index, i]:.2f})" for i in kept]
         rows.append(f"| {cells.words(index)} | " + " | ".join(texts) + " |")
     return [
-        "\n## Calibration of the standard errors\n",
-        "Stated over actual error, root mean squares over slopes with errors below 1 px on both axes (in "
-        "brackets: over all of them).\n",
+        _TEXT["markdown.calibration"],
         *rows,
     ]
 
@@ -225,9 +215,7 @@ def _turbulence_section(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
     excess = 100 * (_ratio_to_best(values) - 1)
     best = np.nanargmin(values, axis=1)
     return [
-        "\n## Speckled spots\n",
-        "Gain-corrected rms (offset and gain taken off), settings chosen for it; of every arm how many "
-        "per cent more than the best. Standard error about 1 %.\n",
+        _TEXT["markdown.turbulence"],
         *_table(
             cells,
             ["best, px", "by"],

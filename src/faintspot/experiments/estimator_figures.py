@@ -14,6 +14,7 @@ from faintspot.experiments.study_tables import parameter_in_words, parameters_of
 from faintspot.experiments.sweep import PARAMETERS
 from faintspot.report.drawing import GREY, WIDTH, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
+from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
     import xarray
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+_TEXT = Texts("faintspot.experiments")
 _ROW_HEIGHT = 4.4
 _COLUMNS = 2
 _FEWEST_POINTS = 3
@@ -112,14 +114,8 @@ def _error_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
         panel.set_yscale("log")
         plain_ticks(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
     _label(axes, group, "slope error R (px)")
-    caption = (
-        "Solid: estimators that know the spot; dashed: those that do not, each with its own best k, "
-        "strength, width or threshold. Broad grey line: the Cramer-Rao bound. Dotted: R of always "
-        "answering the centre. Bars: one standard error. All have the same search range, that of the true "
-        "positions, from which a fixed window lives: the narrower, the better."
-    )
     _legend(figure, dataset, bound=True)
-    return _with_data(figure, dataset, group, "error", "Slope error against signal", caption)
+    return _with_data(figure, dataset, group, "error")
 
 
 @styled
@@ -130,14 +126,8 @@ def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
         panel.axhline(1.0, color="black", lw=3, alpha=0.35, zorder=1)
         panel.set_ylim(0, 1.35)
     _label(axes, group, "photon efficiency")
-    caption = (
-        "The flux with which an estimator at the Cramer-Rao bound would have the same R, over the flux "
-        "that was used. More than 1 at low flux: there the search range says more than the flux. "
-        "What lies above 1.35 is cut off; the numbers are in the data. The range of true positions is in the "
-        "title; a fixed window depends on it most."
-    )
     _legend(figure, dataset, bound=True)
-    return _with_data(figure, dataset, group, "efficiency", "Photon efficiency", caption)
+    return _with_data(figure, dataset, group, "efficiency")
 
 
 @styled
@@ -157,13 +147,8 @@ def _gain_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
     axes[1, 0].set_ylim(-1e-4, max(2e-3, min(1.0, 1.5 * float(np.nanmax(drawn)))))
     axes[0, 0].set_ylabel("gain")
     axes[1, 0].set_ylabel("fraction of errors beyond 1 px")
-    caption = (
-        "Above: slope of the estimate against the truth, 1 where nothing is lost. An estimator that falls "
-        "back to the centre has a small R and a small gain. Below: fraction of slopes with an error "
-        "beyond 1 px on either axis, linear below 0.001."
-    )
     _legend(figure, dataset, bound=False)
-    return _with_data(figure, dataset, group, "gain", "Gain and outliers", caption)
+    return _with_data(figure, dataset, group, "gain")
 
 
 @styled
@@ -183,23 +168,18 @@ def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData
         plain_ticks(panel.yaxis, (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2))
         panel.set_ylim(0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(drawn.values))))
     _label(axes, group, "gain-corrected rms (px)", flux=False)
-    caption = (
-        "Root mean square error per axis after each arm’s own offset and gain are taken off, with "
-        "settings chosen for it. Ring: the best arm of the cell. Bars: one standard error. Solid: "
-        "estimators that know the spot; dashed: those that do not."
-    )
     _legend(figure, dataset, bound=False)
-    return _with_data(figure, dataset, group, "turbulence", "Speckled spots", caption)
+    return _with_data(figure, dataset, group, "turbulence")
 
 
-def _with_data(
-    figure: Figure, dataset: xarray.Dataset, group: _Group, kind: str, subject: str, caption: str
-) -> FigureWithData:
+def _with_data(figure: Figure, dataset: xarray.Dataset, group: _Group, kind: str) -> FigureWithData:
     """Return a figure with its title and the numbers of the group's cells."""
+    subject, caption = (_TEXT[f"estimators.{kind}.{part}"] for part in ("title", "caption"))
     title = f"{subject}: {group.words}"
     figure.suptitle(title, fontsize=14)
-    numbers = table_of_cells(dataset, group.cells)
-    return FigureWithData(f"{kind}-{group.name}", title, caption, figure, *numbers)
+    return FigureWithData(
+        f"{kind}-{group.name}", title, caption, figure, *table_of_cells(dataset, group.cells)
+    )
 
 
 def _grid(group: _Group) -> tuple[Figure, list[Axes]]:

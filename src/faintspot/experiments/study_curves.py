@@ -140,14 +140,21 @@ def kept_panels(dataset: xarray.Dataset, profile: str) -> list[KeptPanel]:
     ]
 
 
-def spread(dataset: xarray.Dataset, cell: int, arm: str) -> tuple[float, float] | None:
-    """Return ln(largest R / smallest R) for k within KEPT_RANGE, and an upper limit of its standard error.
+def spread(
+    dataset: xarray.Dataset, cell: int, arm: str, modes: Sequence[str] = ()
+) -> tuple[float, float] | None:
+    """Return ln(largest R / smallest R) over k, and an upper limit of its standard error.
 
-    The two R are from the same realisations; their correlation, which is not known, would make the error
-    smaller. None when the arm has no k or the cell too few pixels.
+    Over k within KEPT_RANGE, or over modes of fixed k. The two R are from the same realisations; their
+    correlation, which is not known, would make the error smaller. None when the arm has no k or the cell too
+    few pixels.
     """
-    part = dataset.sel(arm=arm, k=slice(*KEPT_RANGE)).isel(cell=cell)
-    values, errors = part["error_at_k"].values, part["error_at_k_se"].values
+    part = dataset.sel(arm=arm).isel(cell=cell)
+    if modes:
+        values, errors = (part[name].sel(mode=modes).values for name in ("error", "error_se"))
+    else:
+        kept = part.sel(k=slice(*KEPT_RANGE))
+        values, errors = kept["error_at_k"].values, kept["error_at_k_se"].values
     if values.size < 2 or not np.all(np.isfinite(values)):
         return None
     low, high = int(np.argmin(values)), int(np.argmax(values))

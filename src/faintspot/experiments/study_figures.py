@@ -23,6 +23,7 @@ from faintspot.experiments.study_tables import (
 from faintspot.experiments.sweep import PARAMETERS
 from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
 from faintspot.report.figure_data import FigureWithData
+from faintspot.report.texts import Texts
 from faintspot.sensor.layout import Layout
 from faintspot.simulate import Detector, spots
 
@@ -32,21 +33,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+_TEXT = Texts("faintspot.experiments")
 _ROW_HEIGHT = 4.7
 _FEW_LINES = 5  # in a panel; with more it is made higher
 _LARGEST_RATIO = 1.6  # of R to R without denoising; what is above is cut off
 _MARKERS = "osD^vPX<>*"
-_AXIS_NAMES = {
-    "flux_e": "signal (photo-electrons per spot)",
-    "read_noise_e": "read noise (e-)",
-    "size": "spot size (1 = Nyquist sampled)",
-    "elongation": "elongation",
-    "pixels": "side of the sub-aperture (px)",
-    "position_range_px": "half range of true positions (px)",
-    "background_e": "background (e- per pixel)",
-    "em_gain": "EM gain",
-    "d_over_r0": "d/r0",
-}
 ERROR_AXIS = "slope error R (px)"
 MAIN_NOISES_E = (0.1, 3.0, 16.0)
 
@@ -98,11 +89,7 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
     fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
     named = [words for words in fixed if not words.startswith("no ")]
     figure.suptitle(f"{title}  ({', '.join(named)})" if named else title, fontsize=14)
-    caption = (
-        "Solid: with TV. Dashed: without. Left: each arm with its own best k; right: both with the same k. "
-        "Bars: one standard error of R. Dotted: R of always answering the centre, half of the positions’ "
-        f"range. The same in all panels: {', '.join(fixed) or 'nothing'}."
-    )
+    caption = _TEXT("sweep.caption", fixed=", ".join(fixed) or "nothing")
     return FigureWithData(name, title, caption, figure, *table_of_cells(dataset, cells))
 
 
@@ -133,14 +120,9 @@ def kept_pixels_figure(dataset: xarray.Dataset) -> FigureWithData | None:
             panel.set_xlabel("brightest pixels kept, k")
             panel.legend(frameon=False, fontsize=10, handlelength=1.2)
         line[0].set_ylabel(ERROR_AXIS)
-    title = "Figure 5: R against the number of brightest pixels kept"
-    figure.suptitle(f"{title}  (solid: TV, dashed: no TV)", fontsize=14)
-    caption = (
-        "Solid: with TV, at the strength chosen for best k. Dashed: without. Circles: the k chosen in the "
-        f"mode “best k”. Dotted: fixed k = {fixed}. Bands: one standard error."
-    )
+    figure.suptitle(f"{_TEXT['fig5.title']}  (solid: TV, dashed: no TV)", fontsize=14)
     header = ["panel", "arm", "k", "R_px", "R_se_px", *PARAMETERS]
-    return FigureWithData("fig5", title, caption, figure, header, rows)
+    return _TEXT.figure("fig5", figure, rows, header, fixed=fixed)
 
 
 @styled
@@ -170,13 +152,9 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
         panels[0].set_ylabel("R / R without denoising")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    title = f"TV and the simpler methods: {profile} spots"
+    title = _TEXT("baselines.title", profile=profile)
     figure.suptitle(f"{title}  (size 1, 16 × 16 px, positions within ±{reach:g} px)", fontsize=14)
-    caption = (
-        "R of each method over R of brightest pixels without denoising: below 1 is better. Each with its own "
-        "best strength, width or threshold. The thresholded centre of gravity has no k. What lies above "
-        f"{_LARGEST_RATIO:g} is cut off; the numbers are in the data. Bars: one paired standard error."
-    )
+    caption = _TEXT("baselines.caption", largest=_LARGEST_RATIO)
     every = [cell for part in cells.values() for cell in part]
     return FigureWithData(f"baselines-{profile}", title, caption, figure, *table_of_cells(dataset, every))
 
@@ -251,7 +229,7 @@ def _label(panel: Axes, axis: str, *, log_y: bool = True) -> None:
     if log_y:
         panel.set_yscale("log")
         plain_ticks(panel.yaxis, (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2, 3))
-    panel.set_xlabel(_AXIS_NAMES[axis])
+    panel.set_xlabel(_TEXT[f"axes.{axis}"])
     panel.tick_params(labelbottom=True)
     panel.grid(which="major", color="#e4e4e4", lw=0.7)
 
@@ -360,19 +338,13 @@ def triple_picture() -> FigureWithData:
         spot = _show(axes[1, column], stack[shown], brightest, f"one spot, {name}")
     colour_bar(list(axes[0]), whole, "signal (e- per pixel)")
     colour_bar(list(axes[1]), spot, "signal (e- per pixel)")
-    caption = (
-        f"Simulated for this page, the same at every run: diffraction spots of size 1, {FLUX_E:g} e- each, "
-        f"{READ_NOISE_E:g} e- read noise, 16 × 16 px, positions within ±{POSITION_RANGE_PX:g} px. One colour "
-        "scale in all six. The data are the spot’s pixels."
-    )
     rows = [
         [y, x, *(f"{stack[shown, y, x]:.6g}" for stack in images)]
         for y in range(layout.window[0])
         for x in range(layout.window[1])
     ]
-    title = "Figure 1: a sensor without noise, with noise, and after TV"
-    header = ["row", "column", "without_noise_e", "noisy_e", "denoised_e"]
-    return FigureWithData("fig1", title, caption, figure, header, rows)
+    told = {"flux": FLUX_E, "noise": READ_NOISE_E, "reach": POSITION_RANGE_PX}
+    return _TEXT.figure("fig1", figure, rows, **told)
 
 
 def _show(panel: Axes, image: NDArray[np.float64], brightest: float, title: str) -> object:

@@ -27,19 +27,14 @@ from faintspot.experiments.study_tables import (
 from faintspot.experiments.sweep import PARAMETERS
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import Page, Section, configuration_section, html_of, write_page
+from faintspot.report.texts import Texts
 from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 
 if TYPE_CHECKING:
     import xarray
 
 
-_PAPER_TITLES = {
-    "fig2": "Figure 2: R against signal, by spot size",
-    "fig3": "Figure 3: R against signal, by sub-aperture size",
-    "fig4": "Figure 4: R against signal, by read noise",
-    "fig6": "Figure 6: R against signal, spots elongated 3 times, by read noise",
-    "fig7": "Figure 7: R against signal with a 16 e- camera, by spot size",
-}
+_TEXT = Texts("faintspot.experiments")
 _KEPT_PIXELS = "fig5"
 
 
@@ -111,7 +106,7 @@ def study_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
             if figure is not None:
                 yield figure
         elif cells:
-            yield sweep_figure(dataset, cells, name, _PAPER_TITLES.get(name, name))
+            yield sweep_figure(dataset, cells, name, _TEXT["paper"].get(name, name))
     for profile in sorted({str(name) for name in dataset["profile"].values}):
         figure = baselines_figure(dataset, profile)
         if figure is not None:
@@ -141,7 +136,7 @@ def _cells_by_figure(dataset: xarray.Dataset) -> dict[str, list[int]]:
 
 
 def _is_paper(names: Iterable[str]) -> bool:
-    return all(name in _PAPER_TITLES or name == _KEPT_PIXELS for name in names)
+    return all(name in _TEXT["paper"] or name == _KEPT_PIXELS for name in names)
 
 
 def _widths_in_words(specification: StudySpecification) -> str:
@@ -149,7 +144,7 @@ def _widths_in_words(specification: StudySpecification) -> str:
     said = "FWHM in px: " + ", ".join(f"{width} ({profile})" for profile, width in widths.items())
     largest = 2 * FWHM_OF_SIZE_1_PX["diffraction"]
     if _is_paper(sweep.name.split()[0] for sweep in specification.sweeps):
-        said += f"; the paper’s largest, of about 4 px, are s = 2: diffraction spots of {largest:.2f} px"
+        said += _TEXT("study.widths", largest=largest)
     return said
 
 
@@ -159,35 +154,30 @@ def _page(dataset: xarray.Dataset) -> Page:
     specification = StudySpecification.from_text(str(attributes["specification"]))
     of_estimators = compares_estimators(dataset)
     subject = "Slope errors of the estimators" if of_estimators else "Slope errors with and without TV"
-    missing = (
-        f"{total - done} cells are still missing. What is shown uses those that are there and will change; "
-        "run the same command again to go on."
-    )
+    values = {
+        "done": done,
+        "total": total,
+        "n": attributes["n"],
+        "widths": _widths_in_words(specification),
+        "seed": attributes["seed"],
+        "version": attributes.get("faintspot_version", "unknown"),
+    }
     return Page(
         title=f"{subject}: study “{specification.name}”",
-        facts={
-            "Cells": f"{done} of {total} finished",
-            "Realisations": f"{attributes['n']} a cell: settings chosen on one half, scored on the other",
-            "Slope error R": "mean of (|dx| + |dy|) / 2; ± one standard error, brackets 95 % intervals",
-            "±1 px, ±4 px": "the range that true positions were drawn from, on each axis",
-            "Spots of size s": _widths_in_words(specification),
-            "Seed": str(attributes["seed"]),
-            "Measured with": f"faintspot {attributes.get('faintspot_version', 'unknown')}",
-        },
+        facts={name: _TEXT(f"study.facts.{name}", **values) for name in _TEXT["study.facts"]},
         sections=[
             *(_of_estimators(dataset) if of_estimators else _of_claims(dataset)),
             configuration_section(str(attributes["specification"]), "Specification"),
         ],
-        warnings=[missing] if done < total else [],
+        warnings=[_TEXT("study.unfinished", missing=total - done)] if done < total else [],
         warnings_title="This study is not finished",
-        remark="Positions are in pixels from each sub-aperture’s centre; signals are photo-electrons of a "
-        "centred spot within its window.",
+        remark=_TEXT["study.remark"],
     )
 
 
 def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     found = findings(dataset)
-    missing = "" if found else "Nothing yet: no cell that says it is finished."
+    missing = "" if found else _TEXT["study.no_findings"]
     return [
         Section("findings", "What was found", points=found, missing=missing),
         *_figure_sections(dataset),

@@ -23,11 +23,13 @@ from faintspot.experiments.study_curves import (
 from faintspot.experiments.sweep import PARAMETERS
 from faintspot.report.figure_data import csv_text
 from faintspot.report.page import Badge, Cell, Section, Table
+from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
     import xarray
 
 
+_TEXT = Texts("faintspot.experiments")
 _STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction", "photon_efficiency")
 
 
@@ -46,42 +48,16 @@ def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[st
 
 def parameter_in_words(name: str, value: Any) -> str:
     """Return a cell's parameter with its unit."""
-    words = {
-        "flux_e": "{:g} e- signal",
-        "read_noise_e": "{:g} e- read noise",
-        "profile": "{} spots",
-        "size": "size {:g}",
-        "elongation": "elongated {:g} times",
-        "pixels": "{0:g} × {0:g} px",
-        "position_range_px": "positions within ±{:g} px",
-        "background_e": "background {:g} e-/px",
-        "em_gain": "EM gain {:g}",
-        "d_over_r0": "d/r0 {:g}",
-    }
-    without = {
-        ("elongation", 1.0): "round",
-        ("background_e", 0.0): "no background",
-        ("em_gain", 1.0): "no EM gain",
-        ("d_over_r0", 0.0): "no turbulence",
-    }
-    return without.get((name, value)) or words[name].format(value)
+    standard, words = _TEXT["standard_parameters"].get(name, (None, ""))
+    return words if value == standard else _TEXT[f"parameters.{name}"].format(value)
 
 
 def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
     """Return a table of all arms and modes of cells."""
-    header = [
-        *PARAMETERS,
-        "mode",
-        "arm",
-        "R_px",
-        "R_se_px",
-        "chosen_k",
-        "chosen_candidate",
-        "invalid_fraction",
-        *_STATISTICS,
+    columns = ("chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)
+    arrays = [
+        dataset[name].transpose("cell", "mode", "arm").values for name in ("error", "error_se", *columns)
     ]
-    names = ("error", "error_se", "chosen_k", "chosen_candidate", "invalid_fraction", *_STATISTICS)
-    arrays = [dataset[name].transpose("cell", "mode", "arm").values for name in names]
     rows = []
     for cell, parameters in zip(cells, parameters_of(dataset, cells), strict=True):
         for m, mode in enumerate(dataset["mode"].values):
@@ -89,7 +65,7 @@ def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[
                 values = [float(array[cell, m, a]) for array in arrays]
                 if np.isfinite(values[0]):
                     rows.append([*parameters.values(), str(mode), str(arm), *(f"{v:.6g}" for v in values)])
-    return header, rows
+    return [*PARAMETERS, "mode", "arm", "R_px", "R_se_px", *columns], rows
 
 
 _MOST_CASES_SHOWN = 3  # in the verdict table; the page lists all of them below it
@@ -102,11 +78,7 @@ def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
     title = "Verdicts on the claims of Basden et al. 2015"
     if not judged:
         return Section("verdicts", title, missing=f"No verdicts: they need the arms “{NO_TV}” and “{TV}”.")
-    text = (
-        f"{_summary(judged, fixed)}. Decided by the rules stated under each claim, from the numbers of this "
-        "study. “Best k”: each arm keeps its own best number of brightest pixels. "
-        f"“{fixed}”: both arms keep the same. A verdict holds when it does so in every case of both modes."
-    )
+    text = _TEXT("tables.verdicts.text", summary=_summary(judged, fixed), fixed=fixed)
     rows = [
         [
             Cell(f"{item.number}. {item.claim}", small=item.rule),
@@ -116,7 +88,7 @@ def verdicts_section(judged: list[Verdict], fixed: str) -> Section:
         ]
         for item in judged
     ]
-    header = ["Claim", "Both together", "Best k", fixed.capitalize()]
+    header = [*_TEXT["tables.verdicts.columns"], fixed.capitalize()]
     return Section("verdicts", title, [text], tables=[Table(header, rows, prose=True)])
 
 
@@ -170,13 +142,7 @@ def baselines_section(dataset: xarray.Dataset) -> Section:
     if not rows:
         why = "Nothing to compare: TV or all others are not in this study."
         return Section("baselines", title, missing=why)
-    caption = (
-        "Cells in which a method’s R is smaller or larger than TV’s: paired differences, 5 % false alarms "
-        "for all cells together. “Smallest of all”: R below that of every other method, decided or not. Last "
-        "column: geometric mean over the cells, above 1 where TV is better."
-    )
-    header = ["Method", "spots", "mode", "cells", "smaller", "larger", "not decided", "smallest of all"]
-    return Section("baselines", title, tables=[Table([*header, "R / R of TV"], rows, caption)])
+    return Section("baselines", title, tables=[_TEXT.table("tables.baselines", rows)])
 
 
 def gains_section(dataset: xarray.Dataset) -> Section:
@@ -193,13 +159,8 @@ def gains_section(dataset: xarray.Dataset) -> Section:
     if not rows:
         why = "No configuration of this study has the error 0.15 px within its fluxes."
         return Section("gains", title, missing=why)
-    caption = (
-        "By how many times less flux TV reaches R = 0.15 px than no denoising, with its 95 % interval. "
-        "“Fixed”: both arms keep the same number of pixels. “–”: the error without denoising does not pass "
-        "that level within the study."
-    )
-    header = ["Configuration", *(mode_in_words(mode) for mode in modes)]
-    return Section("gains", title, tables=[Table(header, rows, caption)])
+    table = _TEXT.table("tables.gains", rows, [mode_in_words(mode) for mode in modes])
+    return Section("gains", title, tables=[table])
 
 
 def gains_by_mode(
