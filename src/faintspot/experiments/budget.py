@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
-from faintspot.ao_loop.files import BUDGET_FILE, make_folder
+from faintspot.ao_loop.files import BUDGET_FILE
 from faintspot.ao_loop.simulation import DisabledErrors, simulate_loop
 from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
@@ -20,9 +20,9 @@ from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.loop_arms import ArmKind, Choice
 from faintspot.experiments.loop_results import BudgetResult
-from faintspot.experiments.magnitude import checked_arms, quick_run, scored, tuned_choices
+from faintspot.experiments.magnitude import Experiment, checked_arms
 from faintspot.experiments.running import Advance, WorkerPool
-from faintspot.experiments.search import QUICK, Search
+from faintspot.experiments.search import Search
 
 KIND = "budget"
 DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation))
@@ -114,20 +114,19 @@ def run_budget(
         raise InputError(
             f"control.mode = {configuration.control.mode!r}: expected 'closed' for an error budget"
         )
-    place = WorkerPool() if place is None else place
-    configuration = quick_run(configuration) if quick else configuration
-    search = search or (QUICK if quick else Search())
+    experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
+    configuration, flux = experiment.configuration, configuration.photons
     kinds = checked_arms(DEFAULT_ARMS if arms is None else arms)
-    folder = make_folder(folder)
-    flux = configuration.photons
-    choices = tuned_choices(configuration, kinds, [flux], search, folder, KIND, place, overwrite=overwrite)
-    columns = [
-        (term, lambda kind, term=term: (configuration, choices[kind.name, flux], term)) for term in TERMS
-    ]
-    of = scored(budget_run, kinds, columns, (configuration, search), folder, KIND, place, overwrite=overwrite)
+    choices = experiment.choices(kinds, [flux])
+    of = experiment.scored(
+        budget_run,
+        kinds,
+        {term: term for term in TERMS},
+        lambda kind, term: (configuration, choices[kind.name, flux], term),
+    )
     names, labels = (tuple(getattr(kind, what) for kind in kinds) for what in ("name", "label"))
     result = BudgetResult(names, tuple(TERMS), labels, of("strehl"), of("residual_nm"))
-    result.save(folder / BUDGET_FILE)
+    result.save(experiment.folder / BUDGET_FILE)
     return result
 
 

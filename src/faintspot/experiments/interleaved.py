@@ -22,7 +22,7 @@ from faintspot.estimators.base import Estimator
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.loop_results import InterleavedResult, set_file
-from faintspot.experiments.magnitude import unit_store
+from faintspot.experiments.magnitude import Experiment
 from faintspot.experiments.running import Advance, Unit, WorkerPool, run_units
 from faintspot.experiments.search import FIRST_TUNING_REALISATION
 from faintspot.experiments.store import Arrays
@@ -142,8 +142,9 @@ def run_interleaved(
     """
     place = WorkerPool() if place is None else place
     plan = plan or (QUICK_PLAN if quick else ObservingPlan())
-    folder = make_folder(folder)
-    best = _tuned(configuration, plan, folder, place, overwrite=overwrite)
+    experiment = Experiment(configuration, plan, make_folder(folder), KIND, place, overwrite)
+    folder = experiment.folder
+    best = _tuned(experiment)
     sets = range(len(plan.strengths))
     units = [
         Unit(
@@ -206,15 +207,9 @@ def _kept_pixels(configuration: LoopConfiguration, fraction: float) -> int:
     return max(4, min(pixels - 1, round(fraction * pixels)))
 
 
-def _tuned(
-    configuration: LoopConfiguration,
-    plan: ObservingPlan,
-    folder: Path,
-    place: WorkerPool,
-    *,
-    overwrite: bool,
-) -> dict[float, tuple[float, float]]:
+def _tuned(experiment: Experiment) -> dict[float, tuple[float, float]]:
     """Return kept pixels (as a fraction) and loop gain for each multiplication gain."""
+    configuration, plan = experiment.configuration, experiment.plan
     trials = {
         (fraction, kept, gain): Unit(
             f"{fraction:g}-{kept:g}-{gain:g}",
@@ -226,19 +221,18 @@ def _tuned(
         for gain in plan.gains
     }
     units = list(trials.values())
-    store = unit_store(folder, f"{KIND}-tuning", (configuration, plan), units, overwrite=overwrite)
+    store = experiment.store(units, "-tuning")
     if store.is_empty:  # of another experiment
-        for old in folder.glob("set-*.npz"):
+        for old in experiment.folder.glob("set-*.npz"):
             old.unlink(missing_ok=True)
-    place.say("tuning")
-    tried = run_units(_trial, units, store, place)
-    best: dict[float, tuple[float, float]] = {}
-    highest: dict[float, float] = {}
-    for (fraction, kept, gain), unit in trials.items():
-        strehl = float(tried[unit.key]["strehl"])
-        if strehl > highest.get(fraction, -1.0):
-            highest[fraction], best[fraction] = strehl, (kept, gain)
-    return best
+    experiment.place.say("tuning")
+    tried = run_units(_trial, units, store, experiment.place)
+    strehl = {trial: float(tried[unit.key]["strehl"]) for trial, unit in trials.items()}
+    best = {
+        fraction: max((t for t in trials if t[0] == fraction), key=strehl.__getitem__)
+        for fraction, *_ in trials
+    }
+    return {fraction: (kept, gain) for fraction, (_, kept, gain) in best.items()}
 
 
 def _trial(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -87,20 +87,19 @@ def run_magnitude(
     >>> from faintspot.ao_loop import load_loop
     >>> result = run_magnitude(load_loop("canary"), "magnitude", quick=True)  # doctest: +SKIP
     """
-    place = WorkerPool() if place is None else place
-    configuration = quick_run(configuration) if quick else configuration
-    search = search or (QUICK if quick else Search())
     kinds = checked_arms(arms if arms is not None else _default(configuration, quick))
+    experiment = Experiment.begun(configuration, folder, KIND, quick, search, place, overwrite)
+    configuration = experiment.configuration
     fluxes = _checked_fluxes(
         photons if photons is not None else configuration.run.photons_per_subaperture, quick
     )
-    folder = make_folder(folder)
-    choices = tuned_choices(configuration, kinds, fluxes, search, folder, KIND, place, overwrite=overwrite)
-    columns = [
-        (f"{flux:g}", lambda kind, flux=flux: (with_flux(configuration, flux), choices[kind.name, flux]))
-        for flux in fluxes
-    ]
-    of = scored(scored_run, kinds, columns, (configuration, search), folder, KIND, place, overwrite=overwrite)
+    choices = experiment.choices(kinds, fluxes)
+    of = experiment.scored(
+        scored_run,
+        kinds,
+        {f"{flux:g}": flux for flux in fluxes},
+        lambda kind, flux: (with_flux(configuration, flux), choices[kind.name, flux]),
+    )
     result = MagnitudeResult(
         tuple(kind.name for kind in kinds),
         tuple(kind.label for kind in kinds),
@@ -113,113 +112,122 @@ def run_magnitude(
         of("psf").mean(axis=2),
         configuration.to_text(),
     )
-    result.save(folder / MAGNITUDE_FILE)
+    result.save(experiment.folder / MAGNITUDE_FILE)
     return result
 
 
-def tuned_choices(
-    configuration: LoopConfiguration,
-    kinds: Sequence[ArmKind],
-    fluxes: Sequence[float],
-    search: Search,
-    folder: Path,
-    experiment: str,
-    place: WorkerPool,
-    *,
-    overwrite: bool,
-) -> dict[tuple[str, float], dict[str, Any]]:
-    """Return the tuned values of every arm at every flux, tuned now where they are not stored.
+@dataclass(frozen=True)
+class Experiment:
+    """A closed-loop experiment: what is simulated, and where finished units are remembered."""
 
-    Slopes first, with the integrator, also of arms whose control learns; then what is that control's own.
-    """
-    plain = {kind.name: kind for kind in map(with_integrator, kinds)}
-    learning = {kind.name: kind for kind in kinds if kind.name not in plain}
-    choices: dict[tuple[str, float], dict[str, Any]] = {}
+    configuration: LoopConfiguration
+    plan: Any
+    """How it is done: a `Search`, or a dataclass of the experiment's own."""
+    folder: Path
+    name: str
+    place: WorkerPool
+    overwrite: bool
 
-    def units(kinds: Mapping[str, ArmKind]) -> dict[tuple[str, float], Unit]:
-        return {
-            (name, flux): _tuning_unit(
-                kind, with_flux(configuration, flux), search, choices.get((with_integrator(kind).name, flux))
+    @classmethod
+    def begun(
+        cls,
+        configuration: LoopConfiguration,
+        folder: str | Path,
+        name: str,
+        quick: bool,
+        search: Search | None,
+        place: WorkerPool | None,
+        overwrite: bool,
+    ) -> Experiment:
+        """Return an experiment with a search, in a folder that is made where it is not there."""
+        configuration = quick_run(configuration) if quick else configuration
+        search = search or (QUICK if quick else Search())
+        return cls(configuration, search, make_folder(folder), name, place or WorkerPool(), overwrite)
+
+    def store(self, units: Sequence[Unit], suffix: str = "") -> ZarrStore:
+        """Return where units are kept.
+
+        Raises
+        ------
+        InputError
+            When the folder holds those of another experiment, or it cannot be written.
+        """
+        return ZarrStore(
+            make_folder(self.folder / "units") / f"{self.name}{suffix}.zarr",
+            "closed-loop experiment",
+            fingerprint_of(self.configuration.to_text(), str(asdict(self.plan))),
+            [unit.key for unit in units],
+            attributes={"name": self.configuration.name},
+            overwrite=self.overwrite,
+        )
+
+    def choices(
+        self, kinds: Sequence[ArmKind], fluxes: Sequence[float]
+    ) -> dict[tuple[str, float], dict[str, Any]]:
+        """Return the tuned values of every arm at every flux, tuned now where they are not stored.
+
+        Slopes first, with the integrator, also of arms whose control learns; then what is that control's own.
+        """
+        plain = {kind.name: kind for kind in map(with_integrator, kinds)}
+        learning = {kind.name: kind for kind in kinds if kind.name not in plain}
+        choices: dict[tuple[str, float], dict[str, Any]] = {}
+
+        def units(kinds: Mapping[str, ArmKind]) -> dict[tuple[str, float], Unit]:
+            return {
+                (name, flux): _tuning_unit(
+                    kind,
+                    with_flux(self.configuration, flux),
+                    self.plan,
+                    choices.get((with_integrator(kind).name, flux)),
+                )
+                for name, kind in kinds.items()
+                for flux in fluxes
+            }
+
+        store = self.store([*units(plain).values(), *units(learning).values()], "-tuning")
+        for stage, kinds_now in (("tuning", plain), ("tuning of control", learning)):
+            if now := units(kinds_now):
+                self.place.say(stage)
+                results = run_units(tuning_unit, list(now.values()), store, self.place)
+                choices.update({key: stored_choice(results[unit.key]) for key, unit in now.items()})
+        return choices
+
+    def scored(
+        self,
+        function: Callable[..., Arrays],
+        kinds: Sequence[ArmKind],
+        columns: Mapping[str, Any],
+        arguments: Callable[[ArmKind, Any], tuple[Any, ...]],
+    ) -> Callable[[str], NDArray[Any]]:
+        """Run every arm, column and realisation; return what gathers a variable, (arms, columns, runs).
+
+        `arguments` are those of the function between the arm and the realisation, by arm and column.
+        """
+        run_length = self.configuration.run
+        runs = range(run_length.realisations)
+        units = [
+            Unit(
+                f"{kind.name}-{name}-{run}",
+                (kind, *arguments(kind, value), run),
+                self.configuration.run.frames,
             )
-            for name, kind in kinds.items()
-            for flux in fluxes
-        }
+            for kind in kinds
+            for name, value in columns.items()
+            for run in runs
+        ]
+        self.place.say("scoring")
+        results = run_units(function, units, self.store(units), self.place)
 
-    every = [*units(plain).values(), *units(learning).values()]
-    store = unit_store(folder, f"{experiment}-tuning", (configuration, search), every, overwrite=overwrite)
-    for stage, kinds_now in (("tuning", plain), ("tuning of control", learning)):
-        if now := units(kinds_now):
-            place.say(stage)
-            results = run_units(tuning_unit, list(now.values()), store, place)
-            choices.update({key: stored_choice(results[unit.key]) for key, unit in now.items()})
-    return choices
+        def gathered(variable: str) -> NDArray[Any]:
+            values = np.array([results[unit.key][variable] for unit in units])
+            return values.reshape(len(kinds), len(columns), len(runs), *values.shape[1:])
+
+        return gathered
 
 
 def _tuning_unit(kind: ArmKind, star: LoopConfiguration, search: Search, slopes: Choice | None) -> Unit:
     key = f"{kind.name}-{star.camera.photons_per_subaperture:g}"
     return Unit(key, (kind, star, search, slopes), tuning_frames(kind, star, search))
-
-
-def unit_store(
-    folder: Path,
-    name: str,
-    experiment: tuple[LoopConfiguration, Any],
-    units: Sequence[Unit],
-    *,
-    overwrite: bool,
-) -> ZarrStore:
-    """Return where units of an experiment, a configuration and a plan, are kept in its folder.
-
-    Raises
-    ------
-    InputError
-        When the folder holds those of another experiment, or it cannot be written.
-    """
-    configuration, plan = experiment
-    identity = fingerprint_of(configuration.to_text(), str(asdict(plan)))
-    keys = [unit.key for unit in units]
-    return ZarrStore(
-        make_folder(folder / "units") / f"{name}.zarr",
-        "closed-loop experiment",
-        identity,
-        keys,
-        attributes={"name": configuration.name},
-        overwrite=overwrite,
-    )
-
-
-def scored(
-    function: Callable[..., Arrays],
-    kinds: Sequence[ArmKind],
-    columns: Sequence[tuple[str, Callable[[ArmKind], tuple[Any, ...]]]],
-    experiment: tuple[LoopConfiguration, Any],
-    folder: Path,
-    name: str,
-    place: WorkerPool,
-    *,
-    overwrite: bool,
-) -> Callable[[str], NDArray[Any]]:
-    """Run every arm in every column and realisation; return what gathers a variable, (arms, columns, runs).
-
-    A column is its name and what makes the function's arguments between the arm and the realisation.
-    """
-    configuration, _ = experiment
-    runs = range(configuration.run.realisations)
-    units = [
-        Unit(f"{kind.name}-{column}-{run}", (kind, *arguments(kind), run), configuration.run.frames)
-        for kind in kinds
-        for column, arguments in columns
-        for run in runs
-    ]
-    place.say("scoring")
-    store = unit_store(folder, name, experiment, units, overwrite=overwrite)
-    results = run_units(function, units, store, place)
-
-    def page_state(variable: str) -> NDArray[Any]:
-        values = np.array([results[unit.key][variable] for unit in units])
-        return values.reshape(len(kinds), len(columns), len(runs), *values.shape[1:])
-
-    return page_state
 
 
 def scored_run(

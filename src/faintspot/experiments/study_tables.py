@@ -49,7 +49,7 @@ def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[st
 def parameter_in_words(name: str, value: Any) -> str:
     """Return a cell's parameter with its unit."""
     standard, words = _TEXT["standard_parameters"].get(name, (None, ""))
-    return words if value == standard else _TEXT[f"parameters.{name}"].format(value)
+    return str(words) if value == standard else str(_TEXT[f"parameters.{name}"]).format(value)
 
 
 def table_of_cells(dataset: xarray.Dataset, cells: Sequence[int]) -> tuple[list[str], list[list[Any]]]:
