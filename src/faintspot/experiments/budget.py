@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,48 +25,19 @@ from faintspot.experiments.search import Search
 
 KIND = "budget"
 DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, Smoothed, TotalVariation))
-_NOTHING = "nothing"
 _FASTER = 10.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Term:
-    """Something that spoils the Strehl ratio."""
-
-    name: str
-    meaning: str
-    """What is done to switch it off."""
-    off: DisabledErrors
-    """A loop without it."""
-
-
 TERMS = {
-    term.name: term
-    for term in (
-        Term(_NOTHING, "the loop as it is", DisabledErrors()),
-        Term("photon and read noise", "mean flux in every pixel", DisabledErrors(noiseless=True)),
-        Term(
-            "servo lag",
-            "ten times the frame rate, with the same flux in every frame and the same duration",
-            DisabledErrors(faster=_FASTER),
-        ),
-        Term(
-            "fitting and aliasing",
-            "the wavefront is only what the mirror can make",
-            DisabledErrors(correctable=True),
-        ),
-        Term(
-            "centroid gain error",
-            "slopes are divided by the gain that they had in the run",
-            DisabledErrors(exact_gain=True),
-        ),
-        Term(
-            "slope error", "slopes are the mean gradients of the wavefront", DisabledErrors(true_slopes=True)
-        ),
-        Term("slope error and servo lag", "both", DisabledErrors(true_slopes=True, faster=_FASTER)),
-    )
+    "nothing": DisabledErrors(),
+    "photon and read noise": DisabledErrors(noiseless=True),
+    "servo lag": DisabledErrors(faster=_FASTER),
+    "fitting and aliasing": DisabledErrors(correctable=True),
+    "centroid gain error": DisabledErrors(exact_gain=True),
+    "slope error": DisabledErrors(true_slopes=True),
+    "slope error and servo lag": DisabledErrors(true_slopes=True, faster=_FASTER),
 }
-"""What is switched off, by name; the first is nothing."""
+"""Loops with something switched off that spoils the Strehl ratio, by its name; the first is nothing."""
 
 Floats = NDArray[np.float64]
 
@@ -145,7 +115,7 @@ def budget_run(
     InputError
         For an unknown term.
     """
-    off = TERMS[one_of("term", term, list(TERMS))].off
+    off = TERMS[one_of("term", term, list(TERMS))]
     arm = kind.arm(configuration, choice)
     record = simulate_loop(
         configuration,

@@ -238,7 +238,7 @@ def _budget(result: BudgetResult, results: LoopResults) -> Section:
             change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
             off = "–" if number == 0 else term
             rows.append([name, off, with_error(strehl), with_error(residual, 0), in_words(change)])
-    meanings = "; ".join(f"{term}: {TERMS[term].meaning}" for term in result.terms[1:] if term in TERMS)
+    meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
     table = _TEXT.table("tables.budget", rows, meanings=meanings)
     text = _budget_lines(result)
     return Section("budget", "Error budget", text, [table], [budget_figure(result, label)])

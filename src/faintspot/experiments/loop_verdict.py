@@ -37,6 +37,7 @@ from faintspot.experiments.loop_results import (
     with_error,
 )
 from faintspot.experiments.statistics import Estimate, paired_mean
+from faintspot.report.texts import Texts
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 REFERENCES = (Window.name, BrightestPixels.name)
@@ -245,7 +246,8 @@ def budget_summary(result: BudgetResult) -> str:
         )
         lines.append(term.ljust(width) + "".join(cell.rjust(column) for cell in cells))
     lines += ["Strehl ratio and rms wavefront with their standard errors", ""]
-    meanings = (f"without {term}: {TERMS[term].meaning}" for term in result.terms if term in TERMS)
+    texts = Texts("faintspot.experiments")["terms"]
+    meanings = (f"without {term}: {texts[term]}" for term in result.terms if term in TERMS)
     return "\n".join([*lines, *meanings])
 
 

@@ -209,7 +209,7 @@ class Experiment:
             Unit(
                 f"{kind.name}-{name}-{run}",
                 (kind, *arguments(kind, value), run),
-                self.configuration.run.frames,
+                run_length.frames,
             )
             for kind in kinds
             for name, value in columns.items()

@@ -26,6 +26,7 @@ from faintspot.experiments.store import (
 )
 from faintspot.experiments.sweep import PARAMETERS, RANGES, Cell
 from faintspot.io.locations import one_line
+from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
     import xarray
@@ -36,42 +37,9 @@ try:
 except ImportError:
     raise MissingExtraError("xarray", "study", "A study") from None
 
-_R = "mean of (|dx| + |dy|) / 2 over the scored realisations"
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "error": (("cell", "arm", "mode"), "px", f"slope error R: {_R}"),
-    "error_se": (("cell", "arm", "mode"), "px", "standard error of R"),
-    "error_covariance": (("cell", "mode", "arm", "arm2"), "px2", "covariance of the arms' R"),
-    "chosen_k": (("cell", "arm", "mode"), "px", "number of kept pixels"),
-    "chosen_candidate": (
-        ("cell", "arm", "mode"),
-        "strength, threshold: noise of a mean pixel; smoothing, blur: px; weight: width of the spot",
-        "value of the arm's first option that is chosen",
-    ),
-    "chosen_model_error": (("cell", "arm", "mode"), "1", "model error chosen"),
-    "error_at_k": (("cell", "arm", "k"), "px", "R for every number of kept pixels, candidate as in best"),
-    "error_at_k_se": (("cell", "arm", "k"), "px", "standard error of R for every number of kept pixels"),
-    "invalid_fraction": (("cell", "arm", "mode"), "1", "fraction of positions without flux, taken as 0"),
-    "gain": (("cell", "arm", "mode"), "1", "slope of the estimate against the truth, x and y pooled"),
-    "gain_se": (("cell", "arm", "mode"), "1", "standard error of the gain"),
-    "rms": (("cell", "arm", "mode"), "px", "root of the mean of (dx^2 + dy^2) / 2"),
-    "rms_se": (("cell", "arm", "mode"), "px", "standard error of the rms"),
-    "corrected_rms": (("cell", "arm", "mode"), "px", "rms after offset and gain are taken off"),
-    "corrected_rms_se": (("cell", "arm", "mode"), "px", "standard error of the gain-corrected rms"),
-    "outlier_fraction": (("cell", "arm", "mode"), "1", f"fraction of errors beyond {OUTLIER_PX:g} px"),
-    "outlier_fraction_se": (("cell", "arm", "mode"), "1", "standard error of the fraction of outliers"),
-    "photon_efficiency": (
-        ("cell", "arm", "mode"),
-        "1",
-        "flux at which the Cramer-Rao bound has the arm's R, over the flux",
-    ),
-    "stated_over_actual": (
-        ("cell", "arm"),
-        "1",
-        f"stated over actual rms error of slopes whose error is below {OUTLIER_PX:g} px, mode best",
-    ),
-    "stated_over_actual_all": (("cell", "arm"), "1", "the same for all slopes"),
-    "bound": (("cell",), "px", "R of an estimator at the Cramer-Rao bound, over the cell's positions"),
-    "bound_rms": (("cell",), "px", "rms of the same"),
+    name: (tuple(dimensions.split()), units, description.format(outlier=OUTLIER_PX))
+    for name, (dimensions, units, description) in Texts("faintspot.experiments")["variables"].items()
 }
 """Dimensions, units and description of every variable but `done`."""
 

@@ -23,6 +23,9 @@ from faintspot.recorded.statistics import (
     slope_error,
 )
 from faintspot.report.page import Section, Table
+from faintspot.report.texts import Texts
+
+_TEXT = Texts("faintspot.recorded")
 
 _KNOWN = 0.1  # standard error of a relative gain above which it counts as unknown
 _DIFFERENT = 0.05  # difference of centroid gains that is worth a warning
@@ -59,8 +62,7 @@ class Comparison:
         pairs = list(zip(self.arms, self.gains, strict=True))[:-1]
         name = self.arms[-1].name
         return [
-            f"The centroid gain of {arm.name!r} is {gain:.2f} ± {error:.2f} of that of {name!r}: their "
-            "slopes, noise and jitter are on different scales. Compare the noise at equal gain."
+            _TEXT("numbers.different_gain", name=arm.name, last=name, gain=gain, error=error)
             for arm, (gain, error) in pairs
             if abs(gain - 1) > max(_DIFFERENT, _SURELY * error)
         ]
@@ -71,10 +73,7 @@ class Comparison:
         if len(levels) < 2 or self.arms[0].n_frames < 2:
             return ""
         if not np.isfinite(levels).all():
-            return (
-                "The relative gain is not known: motion and aberrations are too small, or the methods took "
-                "turns. Less noise may be a smaller centroid gain."
-            )
+            return str(_TEXT["numbers.unknown_gain"])
         best, second = np.argsort(levels)[:2]
         difference = self.equal_noise(second) - self.equal_noise(best)
         difference = difference[np.isfinite(difference)]
@@ -82,13 +81,10 @@ class Comparison:
         for place, other in ((best, second), (second, best)):
             gain, gain_error = self.gains[place]
             error = float(np.hypot(error, levels[other] * gain_error / gain))
-        names = self.arms[best].name, self.arms[second].name
+        names = {"best": self.arms[best].name, "second": self.arms[second].name}
         if len(difference) < 2 or size < _SURELY * error:
-            return f"The noise at equal gain of {names[0]!r} and {names[1]!r} does not differ significantly."
-        return (
-            f"{names[0]!r} has the least noise at equal gain: {size:.2g} ± {error:.1g} px less "
-            f"than {names[1]!r}."
-        )
+            return _TEXT("numbers.equal", **names)
+        return _TEXT("numbers.least", **names, size=size, error=error)
 
 
 def key_numbers(
@@ -150,9 +146,7 @@ def _caption(arms: Sequence[MeasuredSlopes], columns: Sequence[str]) -> str:
         "it includes all motion.",
     }
     shown = " ".join(text for name, text in meanings.items() if name in columns)
-    together = (
-        " Noise and jitter are those of the measurements that are valid in every method." if alike else ""
-    )
+    together = _TEXT["numbers.together"] if alike else ""
     return f"One measurement is one sub-aperture in one frame{counted}. {shown}" + together * (len(arms) > 1)
 
 
@@ -193,19 +187,11 @@ def _truth_cells(
         }
         cells.append(own | (_against(arm, last, truth, valid) if len(arms) > 1 else {}))
     shared = "valid" if len(arms) == 1 else "valid in every method"
-    note = (
-        f"The true positions are known; they lie between {truth.min():.2f} and {truth.max():.2f} px. R is "
-        f"the mean of (|dx| + |dy|) / 2 over the {np.count_nonzero(valid)} measurements that are "
-        f"{shared}, ± its standard error. The centroid gain is the slope of the measured on the true "
-        "position: below 1 an estimator shrinks all motion."
+    note = _TEXT(
+        "numbers.truth", low=truth.min(), high=truth.max(), count=np.count_nonzero(valid), shared=shared
     )
     if len(arms) > 1:
-        note += (
-            f" The flux gain says how many times less flux gives the same R as {last.name!r}; it is a "
-            "range, as R falls as 1 / flux where read noise rules (lower end when the arm is better) and as "
-            "1 / √flux where photon noise does. It is worked out from R at this one flux, not measured by "
-            "dimming the flux."
-        )
+        note += _TEXT("numbers.flux_gain", last=last.name)
     return cells, note
 
 

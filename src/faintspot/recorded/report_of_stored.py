@@ -16,8 +16,10 @@ from faintspot.pipeline.slopes import Slopes, Stages
 from faintspot.recorded.page import slopes_report
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.stored_run import StoredRun, open_run
+from faintspot.report.texts import Texts
 from faintspot.wavefront import Wavefront, fit_wavefront
 
+_TEXT = Texts("faintspot.recorded")
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
@@ -106,14 +108,11 @@ def _arms(stores: Sequence[StoredRun]) -> tuple[list[MeasuredSlopes], list[str]]
     notes = []
     counts = [store.stored.n_finished for store in stores]
     if len(set(counts)) > 1:
-        notes.append(
-            f"The files hold {counts[0]} and {counts[1]} frames: the first {min(counts)} are compared."
-        )
+        lengths = {"first": counts[0], "second": counts[1], "fewest": min(counts)}
+        notes.append(_TEXT("stored.other_lengths", **lengths))
     known = [store.sources for store in stores if store.sources]
     if len(known) == 2 and known[0] != known[1]:
-        notes.append(
-            "The two files were made from different sources: differences are not due to settings alone."
-        )
+        notes.append(_TEXT["stored.other_sources"])
     arms = []
     for name, store in zip(_names(stores), stores, strict=True):
         variables = store.stored.variables
@@ -200,11 +199,8 @@ def _disagreement(store: StoredRun, arm: MeasuredSlopes, frame: NDArray[Any], nu
     distance = np.abs(again - np.stack([arm.x[number], arm.y[number]])[:, both])
     if distance.size == 0 or distance.max() <= _SAME_POSITION_PX:
         return []
-    return [
-        f"Measured again for the pictures, frame {number} gives positions that differ from those stored in "
-        f"{store.path.name} by up to {distance.max():.2f} px: the calibration or the frames are "
-        "not those of the run. The crosses show the new measurement."
-    ]
+    names = {"frame": number, "file": store.path.name}
+    return [_TEXT("stored.disagreement", **names, distance=distance.max())]
 
 
 def _range_in_words(store: StoredRun) -> str:

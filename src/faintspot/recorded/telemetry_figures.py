@@ -10,7 +10,9 @@ from faintspot.io.telemetry import Telemetry
 from faintspot.recorded.telemetry_numbers import ArmDifference, arm_names
 from faintspot.report.drawing import ARM_COLOURS, GREY, WIDTH, new_figure, styled
 from faintspot.report.figure_data import FigureWithData
+from faintspot.report.texts import Texts
 
+_TEXT = Texts("faintspot.recorded")
 _BINS = 80
 # Points of the course in time, frames in each, and so many points that they are drawn as dots.
 _MOST_TIMES, _FEWEST_TOGETHER, _FEW_TIMES = 400, 50, 20
@@ -48,12 +50,7 @@ def latency_figure(telemetry: Telemetry) -> FigureWithData:
     right.legend(frameon=False)
     together = len(parts[0])
     course = f"median and longest of stretches of {together} frames" if together > 1 else "every frame"
-    caption = (
-        f"Left: how often each latency occurred. Right: {course}. Look for a second hump and for spikes at "
-        "regular times: another program "
-        "that takes the processor."
-    )
-    return FigureWithData("latency", "Latency", caption, figure, ("arm", "from_us", "to_us", "frames"), rows)
+    return _TEXT.figure("latency", figure, rows, course=course)
 
 
 @styled
@@ -80,6 +77,4 @@ def arms_figure(telemetry: Telemetry, found: Mapping[str, Sequence[ArmDifference
         panel.tick_params(axis="x", labelsize=9)
         panel.locator_params(axis="x", nbins=4)
     first = next(iter(found.values()))[0].arm
-    caption = f"Each arm less {first!r}, with 95 % intervals; the grey line is no difference."
-    header = ("quantity", "arm", "difference", "low", "high", "pieces")
-    return FigureWithData("arms", "Differences of the arms", caption, figure, header, rows)
+    return _TEXT.figure("arms", figure, rows, first=first)

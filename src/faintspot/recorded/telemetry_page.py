@@ -26,9 +26,11 @@ from faintspot.recorded.telemetry_numbers import (
 )
 from faintspot.recorded.wavefront_section import wavefront_sections
 from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
+from faintspot.report.texts import Texts
 from faintspot.sensor.layout import Layout
 from faintspot.wavefront import Wavefront, fit_wavefront
 
+_TEXT = Texts("faintspot.recorded")
 _MOST_GAPS, _MOST_CHANGES = 20, 200
 
 
@@ -102,11 +104,9 @@ def _warnings(telemetry: Telemetry) -> list[str]:
     lost = sum(gap.lost for gap in gaps(telemetry))
     if lost:
         share = 100 * lost / (lost + len(telemetry.frame))
-        lines.append(f"{lost} frames ({share:.2g} %) are not in the record; see Lost frames.")
+        lines.append(_TEXT("telemetry.lost_frames", lost=lost, share=share))
     if telemetry.attributes.get("dropped_changes"):
-        lines.append(
-            "Changes of settings were lost to the record: settings are not known after the last one listed."
-        )
+        lines.append(_TEXT["telemetry.lost_changes"])
     return lines
 
 
@@ -121,10 +121,7 @@ def _timing(telemetry: Telemetry) -> Section:
     table = Table(header, rows, caption="Latency: from a frame's last row to its slopes.")
     rate = "not known: no two frames have consecutive numbers"
     if np.isfinite(found.rate_hz):
-        rate = (
-            f"{found.rate_hz:.5g} frames a second (median interval of consecutive numbers; the longest is "
-            f"{1e3 * found.longest_interval_s:.3g} ms)"
-        )
+        rate = _TEXT("telemetry.rate", rate=found.rate_hz, longest=1e3 * found.longest_interval_s)
     return Section("timing", "Rate and latency", [f"Rate: {rate}."], [table], [latency_figure(telemetry)])
 
 
@@ -143,10 +140,7 @@ def _lost(telemetry: Telemetry) -> Section:
         ["images lost to the record", str(dropped["images"])],
         ["changes of settings lost to the record", str(dropped["changes"])],
     ]
-    text = [
-        "Missing numbers that the recorder did not lose were lost before: by the camera, on the way, or by "
-        "an engine that was too slow."
-    ]
+    text = [_TEXT["telemetry.lost"]]
     tables = [Table(["", "number"], rows)]
     if found:
         listed = [[str(gap.after_frame), str(gap.lost)] for gap in found[:_MOST_GAPS]]
@@ -164,12 +158,7 @@ def _arms(telemetry: Telemetry) -> Section:
             rows.append([name, arm.arm, _with_error(arm.mean), difference])
     first = next(iter(found.values()))[0].arm
     header = ["", "arm", "mean ± standard error", f"less {first!r} (95 %)"]
-    text = [
-        "The arms took turns on the same air. Each turn is compared with the first arm's next to it; "
-        "intervals come from a bootstrap of blocks of ten neighbouring turns, and with several arms all hold "
-        "together. Smaller slopes are better only in a closed loop, and only if both arms have the same "
-        "centroid gain."
-    ]
+    text = [_TEXT["arms.text"]]
     return Section("arms", "Arms in turn", text, [Table(header, rows)], [arms_figure(telemetry, found)])
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from faintspot.report.page import Section, Table
+from faintspot.report.texts import Texts
 from faintspot.sensor.layout import Layout
 from faintspot.wavefront import Wavefront
 from faintspot.wavefront.figure import wavefront_figure
 from faintspot.wavefront.words import mode_table, remarks, rms_table
 
-_ABOUT = (
-    "The path by which light arrives late or early, from Zernike modes fitted to each frame's slopes. Tip "
-    "and tilt are the mean position of all spots; what stays over frames is the optics' own (or the "
-    "layout's), what moves is turbulence, vibration and noise."
-)
+_TEXT = Texts("faintspot.recorded")
 
 
 def wavefront_sections(wavefronts: Mapping[str, Wavefront | str], layout: Layout | None) -> list[Section]:
@@ -22,7 +19,7 @@ def wavefront_sections(wavefronts: Mapping[str, Wavefront | str], layout: Layout
     if layout is None or not wavefronts:
         return []
     tables, figures, missing = [], [], []
-    text = [_ABOUT]
+    text = [_TEXT["wavefront.about"]]
     for number, (name, found) in enumerate(wavefronts.items()):
         if isinstance(found, str):
             missing.append(f"Wavefront of {name!r}: {found}.")
