@@ -46,11 +46,7 @@ class Knowledge(IntEnum):
 
 
 def arm_for_scene(
-    kind: type[Estimator],
-    scene: Scene,
-    *,
-    psf: PSF | None = None,
-    score: Score | None = None,
+    kind: type[Estimator], scene: Scene, *, psf: PSF | None = None, score: Score | None = None
 ) -> Arm:
     """Return an estimator with the options that a scene asks for, before any are tuned.
 

@@ -127,12 +127,7 @@ class Gain:
 
 
 def gain_at_flux(
-    curve: Curve,
-    flux_e: float,
-    rng: np.random.Generator,
-    *,
-    method: str,
-    reference: str,
+    curve: Curve, flux_e: float, rng: np.random.Generator, *, method: str, reference: str
 ) -> Gain | None:
     """Return by how much less flux `method` reaches the R that `reference` has at a flux.
 
@@ -159,12 +154,7 @@ def gain_at_flux(
 
 
 def gain_at_error(
-    curve: Curve,
-    error_px: float,
-    rng: np.random.Generator,
-    *,
-    method: str,
-    reference: str,
+    curve: Curve, error_px: float, rng: np.random.Generator, *, method: str, reference: str
 ) -> Gain | None:
     """Return by how much less flux `method` reaches a given R than `reference`; see `gain_at_flux`.
 

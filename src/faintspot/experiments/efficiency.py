@@ -196,17 +196,11 @@ def _efficiency_section(cells: _Cells) -> list[str]:
 def _calibration_section(cells: _Cells) -> list[str]:
     near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
     kept = [i for i, arm in enumerate(cells.arms) if knows_the_spot(arm)]
-    rows = [
-        "| | " + " | ".join(cells.arms[i] for i in kept) + " |",
-        "|---|" + "---|" * len(kept),
-    ]
+    rows = ["| | " + " | ".join(cells.arms[i] for i in kept) + " |", "|---|" + "---|" * len(kept)]
     for index in cells.order():
         texts = [f"{near[index, i]:.2f} ({whole[index, i]:.2f})" for i in kept]
         rows.append(f"| {cells.words(index)} | " + " | ".join(texts) + " |")
-    return [
-        _TEXT["markdown.calibration"],
-        *rows,
-    ]
+    return [_TEXT["markdown.calibration"], *rows]
 
 
 def _turbulence_section(cells: _Cells, dataset: xarray.Dataset) -> list[str]:

@@ -10,11 +10,7 @@ import numpy as np
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.errors import InputError
 from faintspot.experiments.budget import TERMS
-from faintspot.experiments.loop_analysis import (
-    NO_TV,
-    Measurements,
-    measurements,
-)
+from faintspot.experiments.loop_analysis import NO_TV, Measurements, measurements
 from faintspot.experiments.loop_figures import (
     budget_figure,
     gain_figure,

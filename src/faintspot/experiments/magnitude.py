@@ -206,11 +206,7 @@ class Experiment:
         run_length = self.configuration.run
         runs = range(run_length.realisations)
         units = [
-            Unit(
-                f"{kind.name}-{name}-{run}",
-                (kind, *arguments(kind, value), run),
-                run_length.frames,
-            )
+            Unit(f"{kind.name}-{name}-{run}", (kind, *arguments(kind, value), run), run_length.frames)
             for kind in kinds
             for name, value in columns.items()
             for run in runs
@@ -231,11 +227,7 @@ def _tuning_unit(kind: ArmKind, star: LoopConfiguration, search: Search, slopes:
 
 
 def scored_run(
-    kind: ArmKind,
-    configuration: LoopConfiguration,
-    choice: Choice,
-    realisation: int,
-    advance: Advance,
+    kind: ArmKind, configuration: LoopConfiguration, choice: Choice, realisation: int, advance: Advance
 ) -> dict[str, NDArray[Any]]:
     """Return what one run of a tuned arm gives, as arrays that can be stored."""
     arm = kind.arm(configuration, choice)

@@ -124,11 +124,7 @@ def _stack(name: str, value: Any) -> NDArray[Any]:
 
 
 def _calibration(
-    stack: NDArray[Any],
-    darks: NDArray[Any] | None,
-    layout: Layout,
-    given: dict[str, Any],
-    facts: list[str],
+    stack: NDArray[Any], darks: NDArray[Any] | None, layout: Layout, given: dict[str, Any], facts: list[str]
 ) -> Calibration:
     """Dark, gain and read noise: measured, or given."""
     em_gain = float(given.get("em_gain") or 1.0)
@@ -216,11 +212,7 @@ def _electrons(stack: NDArray[Any], layout: Layout, calibration: Calibration) ->
 
 
 def _fitted(
-    frames: NDArray[Any],
-    layout: Layout,
-    calibration: Calibration,
-    given: dict[str, Any],
-    facts: list[str],
+    frames: NDArray[Any], layout: Layout, calibration: Calibration, given: dict[str, Any], facts: list[str]
 ) -> tuple[LearntPSF, NDArray[Any]]:
     """Fit spots and background in some of the frames, returned as well; learn PSF and range if need be."""
     used = _some(frames, layout)

@@ -207,10 +207,7 @@ def paired_mean(differences: ArrayLike, comparisons: int = 1) -> Estimate:
 
 
 def mean_by_blocks(
-    values: ArrayLike,
-    block_length: int = 1,
-    rng: np.random.Generator | None = None,
-    comparisons: int = 1,
+    values: ArrayLike, block_length: int = 1, rng: np.random.Generator | None = None, comparisons: int = 1
 ) -> Estimate:
     """Return the mean of a series with its interval by a moving-block bootstrap.
 

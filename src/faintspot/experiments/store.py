@@ -274,11 +274,4 @@ def _zarr() -> Any:
     return zarr
 
 
-__all__ = [
-    "FORMAT",
-    "MemoryStore",
-    "UnitStore",
-    "ZarrStore",
-    "fingerprint_of",
-    "kind_of_store",
-]
+__all__ = ["FORMAT", "MemoryStore", "UnitStore", "ZarrStore", "fingerprint_of", "kind_of_store"]

@@ -10,10 +10,7 @@ if TYPE_CHECKING:
     from faintspot.recorded.measuring import Summary as Summary
     from faintspot.recorded.measuring import measure_recorded as measure_recorded
 
-_HOMES = {
-    "Summary": "faintspot.recorded.measuring",
-    "measure_recorded": "faintspot.recorded.measuring",
-}
+_HOMES = {"Summary": "faintspot.recorded.measuring", "measure_recorded": "faintspot.recorded.measuring"}
 
 __all__ = sorted(_HOMES)
 

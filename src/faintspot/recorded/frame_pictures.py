@@ -12,15 +12,7 @@ from numpy.typing import NDArray
 from faintspot.estimators.base import Step
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.pipeline.slopes import Stages
-from faintspot.report.drawing import (
-    FLUX_GREY,
-    TRUTH_COLOUR,
-    WIDTH,
-    colour_bar,
-    limits_of,
-    new_figure,
-    styled,
-)
+from faintspot.report.drawing import FLUX_GREY, TRUTH_COLOUR, WIDTH, colour_bar, limits_of, new_figure, styled
 from faintspot.sensor.layout import Layout
 
 if TYPE_CHECKING:

@@ -83,11 +83,7 @@ def make_run(
 
 def all_sections(run: ReportInputs) -> list[Section]:
     """Return the sections in the order of the page."""
-    makers: list[Callable[[ReportInputs], Section]] = [
-        _key_numbers,
-        _flux,
-        _slopes,
-    ]
+    makers: list[Callable[[ReportInputs], Section]] = [_key_numbers, _flux, _slopes]
     if run.stages or run.why_no_stages:
         makers.insert(1, _frame)
     if any(arm.is_denoised for arm in run.arms):

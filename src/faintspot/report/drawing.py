@@ -93,13 +93,7 @@ def subaperture_shapes(layout: Layout) -> NDArray[np.float64]:
 
 
 def subaperture_map(
-    axes: Axes,
-    layout: Layout,
-    values: NDArray[Any],
-    *,
-    label: str,
-    limits: tuple[float, float],
-    title: str,
+    axes: Axes, layout: Layout, values: NDArray[Any], *, label: str, limits: tuple[float, float], title: str
 ) -> None:
     """Draw one value per sub-aperture at its position; NaN gives an empty outline."""
     shapes = subaperture_shapes(layout)
