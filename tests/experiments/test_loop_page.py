@@ -14,8 +14,9 @@ from tests.experiments.result_cases import (
 
 from faintspot.ao_loop.files import MAGNITUDE_FILE
 from faintspot.base.errors import InputError
-from faintspot.experiments.loop_page import loop_report, loop_sections, loop_warnings, write_loop_report
+from faintspot.experiments.loop_page import loop_page, loop_sections, loop_warnings, write_loop_report
 from faintspot.experiments.loop_verdict import NOWHERE, LoopResults
+from faintspot.report.page import html_of
 
 pytest.importorskip("hcipy")
 
@@ -44,13 +45,13 @@ def test_the_page_holds_everything(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_the_page_says_when_tv_gains_nothing() -> None:
-    page = loop_report(LoopResults(made_up_interleaved(-0.02), made_up_magnitude(-0.3)))
+    page = html_of(loop_page(LoopResults(made_up_interleaved(-0.02), made_up_magnitude(-0.3))))
     assert NOWHERE in page
 
 
 @pytest.mark.usefixtures("undrawn_pictures")
 def test_what_was_not_run_is_said() -> None:
-    page = loop_report(LoopResults(budget=made_up_budget()))
+    page = html_of(loop_page(LoopResults(budget=made_up_budget())))
     assert "Not run: “faintspot loop run” does that." in page
     assert "Not run: “faintspot loop magnitude” does that." in page
     assert "Nothing to compare yet." in page
@@ -64,10 +65,10 @@ def test_unfinished_results_make_a_page() -> None:
     strehl[3] = np.nan
     results = LoopResults(magnitude=dataclasses.replace(whole, strehl=strehl))
     assert "runs are still missing" in loop_warnings(results)[0]
-    page = loop_report(results)
+    page = html_of(loop_page(results))
     assert ">nan" not in page
     nothing = LoopResults(magnitude=dataclasses.replace(whole, strehl=np.full_like(strehl, np.nan)))
-    assert "Not drawn" in loop_report(nothing)
+    assert "Not drawn" in html_of(loop_page(nothing))
 
 
 def test_few_realisations_and_short_measurements_are_warned_of() -> None:

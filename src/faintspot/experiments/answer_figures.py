@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintspot.control.learning import INTEGRATOR
 from faintspot.experiments import answer_text
 from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, SECOND
-from faintspot.report.drawing import FLUX_GREY, GREY, new_figure, plain_ticks, styled
+from faintspot.report.drawing import FLUX_GREY, GREY, axis_above, new_figure, note, plain_ticks, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,8 @@ def tune_figure(answer: Answer) -> Figure:
     _axis_limits(axes, answer, saturated)
     _mark_star(axes, answer)
     _mark_budget(axes, answer)
-    _electrons_above(axes, answer)
+    place_above = answer.magnitudes(answer.flux_e)
+    axis_above(axes, place_above, answer.flux_e, "electrons per sub-aperture and frame")
     plain_ticks(axes.yaxis, _TICKS)
     axes.grid(which="major", color=FLUX_GREY, lw=0.7)
     if answer.promise is not None and answer.promise.contradicted:
@@ -93,13 +94,7 @@ def _axis_limits(axes: Axes, answer: Any, saturated: float) -> None:
 def _mark_star(axes: Axes, answer: Any) -> None:
     where = float(answer.magnitudes(answer.question.star_flux_e))
     axes.axvline(where, color="black", lw=0.8, ls=":", zorder=0)
-    axes.annotate(
-        "the star",
-        (where, 0.015),
-        xycoords=("data", "axes fraction"),
-        xytext=(4, 0),
-        textcoords="offset points",
-    )
+    note(axes, "the star", (where, 0.015), "data, axes fraction", xytext=(4, 0))
 
 
 def _mark_budget(axes: Axes, answer: Any) -> None:
@@ -107,34 +102,14 @@ def _mark_budget(axes: Axes, answer: Any) -> None:
     if budget is None:
         return
     axes.axhline(budget, color="#E69F00", lw=1.4, zorder=0)
-    axes.annotate(
-        f"budget {budget:.3g} px",
-        (0.99, budget),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        ha="right",
-        color="#8a5f00",
-    )
+    words, place = f"budget {budget:.3g} px", (0.99, budget)
+    note(axes, words, place, "axes fraction, data", xytext=(0, 3), ha="right", color="#8a5f00")
     if limit is None or not 0 < limit.value < math.inf:
         return
     where = float(answer.magnitudes(limit.value))
     axes.plot([where], [budget], "o", ms=13, mfc="none", mec="#E69F00", mew=2.5, zorder=5)
-    axes.annotate(
-        f"limit {where:.2f}",
-        (where, budget),
-        xytext=(12, -16),
-        textcoords="offset points",
-        color="#8a5f00",
-        weight="bold",
-    )
-
-
-def _electrons_above(axes: Axes, answer: Any) -> None:
-    """Put an axis of electrons on top, at every flux that was simulated."""
-    top = axes.secondary_xaxis("top")
-    top.set_xticks(answer.magnitudes(answer.flux_e), [f"{float(f'{flux:.3g}'):g}" for flux in answer.flux_e])
-    top.set_xlabel("electrons per sub-aperture and frame")
+    style: dict[str, Any] = {"color": "#8a5f00", "weight": "bold"}
+    note(axes, f"limit {where:.2f}", (where, budget), "data", xytext=(12, -16), **style)
 
 
 _LOOP_WIDTH, _LOOP_HEIGHT = 13.0, 5.6
@@ -191,29 +166,18 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
         name = f"{result.name} (recommended)" if result is answer.best else result.name
         axes.plot([], [], label=name, lw=1.6, ms=6, **drawn)
     axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
-    axes.annotate(
-        f"Strehl {answer.level:.2f}: limiting magnitudes",
-        (0.99, answer.level),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 3),
-        textcoords="offset points",
-        ha="right",
-        color="#666666",
-    )
+    words, place = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.99, answer.level)
+    note(axes, words, place, "axes fraction, data", xytext=(0, 3), ha="right", color="#666666")
     if answer.question.configuration.photons in answer.photons:
         axes.axvline(magnitudes[answer.at_star], color="black", lw=0.8, ls=":", zorder=0)
         where = (magnitudes[answer.at_star], 0.99)
-        axes.annotate(
-            "the star", where, xycoords=("data", "axes fraction"), xytext=(4, -10), textcoords="offset points"
-        )
+        note(axes, "the star", where, "data, axes fraction", xytext=(4, -10))
     axes.set_ylim(0, 1)
     axes.grid(color=FLUX_GREY, lw=0.7)
     loop = answer.question.configuration
     axes.set_xlabel(f"guide star magnitude ({loop.camera.band}); markers are measured, lines interpolated")
     axes.set_ylabel(f"Strehl ratio at {1e6 * loop.science.wavelength_m:.3g} µm")
-    top = axes.secondary_xaxis("top")
-    top.set_xticks(magnitudes, [f"{float(f'{flux:.3g}'):g}" for flux in answer.photons])
-    top.set_xlabel("photo-electrons per sub-aperture and frame")
+    axis_above(axes, magnitudes, answer.photons, "photo-electrons per sub-aperture and frame")
 
 
 def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:

@@ -10,7 +10,9 @@ from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.answer import Answer, ArmResult, settings_in_words
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.statistics import Estimate
+from faintspot.report.texts import Texts
 
+_TEXT = Texts("faintspot.experiments")
 BRIGHTEST, TV = BrightestPixels.name, TotalVariation.name
 
 CONTRADICTED = "THE RECORDING CONTRADICTS THE PROMISE"
@@ -32,10 +34,7 @@ def situation(answer: Answer) -> str:
     kind = f"{question.profile} spots" if question.psf is None else "spots as learnt"
     if question.d_over_r0:
         kind = f"speckled spots (sub-aperture {question.d_over_r0:.2g} r0)"
-    return (
-        f"{star}; {kind} of {question.fwhm_px:.2f} px FWHM in {question.shape[0]} x {question.shape[1]} px, "
-        f"within ±{question.search_range_px:.3g} px; read noise {question.read_noise_photoelectrons:.3g} e-"
-    )
+    return _TEXT("answer.situation", star=star, kind=kind, question=question)
 
 
 def recommendation(answer: Answer) -> list[str]:
@@ -43,33 +42,23 @@ def recommendation(answer: Answer) -> list[str]:
     best = answer.best
     lines = [f"Recommended: {best.arm.label} ({settings_in_words(best.settings)})"]
     if answer.is_hopeless:
-        lines.append(
-            "but the star is too faint: its corrected rms, "
-            f"{best.statistics.corrected_rms.value:.2f} px, is not below "
-            f"that of the spots' own motion, {answer.prior_rms_px:.2f} px"
-        )
+        rms = best.statistics.corrected_rms.value
+        lines.append(_TEXT("answer.too_faint", rms=rms, prior=answer.prior_rms_px))
     if best.arm.name != BRIGHTEST:
-        lines.append(
-            f"saves {gain_in_words(answer, best.over_brightest)} over brightest pixels and "
-            f"{gain_in_words(answer, best.over_thresholded)} over thresholding"
-        )
+        gains = (gain_in_words(answer, gain) for gain in (best.over_brightest, best.over_thresholded))
+        lines.append(_TEXT("answer.saves", **dict(zip(("brightest", "thresholded"), gains, strict=True))))
     others = [answer[name].arm.label for name in answer.equal[1:]]
     if others:
-        lines.append(
-            f"as good within the error: {', '.join(others)}; taken is what has to know less, and of these "
-            "the cheapest"
-        )
+        lines.append(_TEXT("answer.as_good", others=", ".join(others)))
     lines += _about_tv(answer)
     gain = best.statistics.gain.value
     if gain < _LOW_GAIN:
-        lines.append(f"its gain is {gain:.2f} at this flux: divide the slopes by it, or raise the loop gain")
+        lines.append(_TEXT("answer.low_gain", gain=gain))
     alternative = answer.best_without_psf
     if Knowledge.of(best.arm.estimator) == Knowledge.SPOT:
-        lines.append(
-            f"the best that need not know the spot's shape: {alternative.arm.label} "
-            f"({settings_in_words(alternative.settings)}), "
-            f"{gain_in_words(answer, alternative.over_brightest)} over brightest pixels"
-        )
+        words = {"label": alternative.arm.label, "settings": settings_in_words(alternative.settings)}
+        gained = gain_in_words(answer, alternative.over_brightest)
+        lines.append(_TEXT("answer.without_spot", **words, gain=gained))
     return lines + _limiting(answer) + promise_lines(answer)
 
 
@@ -78,30 +67,28 @@ def promise_lines(answer: Answer) -> list[str]:
     promise = answer.promise
     if promise is None:
         return [UNCHECKED] if answer.question.facts else []
-    text = (
-        f"checked on frames kept for it, thinned to {plain_number(promise.flux_e)} electrons: predicted R "
-        f"{_with_error(promise.predicted)}, measured {_with_error(promise.measured)} px; pixels are "
-        f"{promise.noise_ratio:.2f} times as noisy as taken"
+    errors = {"expected": promise.expected_px, "promised": promise.promised_px}
+    text = _TEXT(
+        "answer.checked",
+        flux=plain_number(promise.flux_e),
+        predicted=_with_error(promise.predicted),
+        measured=_with_error(promise.measured),
+        ratio=promise.noise_ratio,
     )
     if math.isfinite(promise.frame_to_frame.value):
-        text += f"; from frame to frame, movement included, {_with_error(promise.frame_to_frame)} px"
+        text += _TEXT("answer.frame_to_frame", error=_with_error(promise.frame_to_frame))
     if not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px:
-        text += (
-            f"; expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px: these spots are "
-            "nearer the middle of the search range, which limits their errors less"
-        )
+        text += _TEXT("answer.placed", **errors)
     lines = [text]
     simulated = min(answer.results, key=lambda result: _rms(result.statistics.corrected_rms.value))
-    if answer.promises[simulated.arm.name].factor > 1 and simulated is not answer.best:
-        lines.append(
-            f"{simulated.arm.label} would be best by simulation alone, but the recording contradicts it: its "
-            f"error is {answer.promises[simulated.arm.name].factor:.2f} times the predicted"
-        )
+    factor = answer.promises[simulated.arm.name].factor
+    if factor > 1 and simulated is not answer.best:
+        lines.append(_TEXT("answer.contradicted_best", label=simulated.arm.label, factor=factor))
     if promise.contradicted:
         why = " (pixels have another noise than was taken)" if promise.noise_differs else ""
-        expected = f"expect R {promise.expected_px:.3g} px, not {promise.promised_px:.3g} px"
+        expected = _TEXT("answer.expect", **errors)
         if promise.factor == 1:
-            expected = f"its noise is below the predicted; R {promise.promised_px:.3g} px is not corrected"
+            expected = _TEXT("answer.not_corrected", **errors)
         lines.append(f"{CONTRADICTED}: {expected}{why}")
     return lines
 
@@ -119,26 +106,13 @@ def foundations(answer: Answer) -> list[str]:
     question = answer.question
     spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
     lines = list(question.facts)
-    if question.psf is None:
-        lines.append(
-            f"{spots} of an assumed profile ({question.profile}, --profile), which matched filter, "
-            "likelihood and trained score know exactly: wrong, it costs them most of their lead; with "
-            "--recording the real spots are learnt"
-        )
-    else:
-        lines.append(f"{spots} with the learnt PSF, which matched filter and likelihood know exactly")
-    lines.append(
-        "positions uniform within the search range, which every arm knows; photon noise and read noise; no "
-        "drifts, no flat-field errors, no scintillation"
-    )
+    kind = "assumed_profile" if question.psf is None else "learnt_psf"
+    lines.append(_TEXT(f"answer.{kind}", spots=spots, profile=question.profile))
+    lines.append(_TEXT["answer.positions"])
     if question.photometry is not None:
-        flux = question.photometry
-        lines.append(
-            f"photometry: {flux.zero_point:.3g} photons/s/m^2 at {flux.band} = 0, throughput "
-            f"{flux.throughput:g}, quantum efficiency {flux.quantum_efficiency:g}"
-        )
+        lines.append(_TEXT("answer.photometry", flux=question.photometry))
     if question.d_over_r0:
-        lines.append("the bound is that of spots without speckles, and of estimators without a prior")
+        lines.append(_TEXT["answer.bound"])
     lines += [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
     return lines
 
@@ -179,11 +153,9 @@ def _about_tv(answer: Answer) -> list[str]:
     else:
         helps = gain.value > max(_HELPS_ABOVE_MAG, 2 * gain.standard_error)
     if not helps:
-        return [f"TV denoising does not help here: {gain_in_words(answer, gain)} over brightest pixels"]
-    return [
-        f"TV denoising saves {gain_in_words(answer, gain)} over brightest pixels, at {times:.1f} times "
-        f"the cost of {best.arm.label}"
-    ]
+        return [_TEXT("answer.tv_does_not", gain=gain_in_words(answer, gain))]
+    saved = gain_in_words(answer, gain)
+    return [_TEXT("answer.tv_saves", gain=saved, times=times, label=best.arm.label)]
 
 
 def _limiting(answer: Answer) -> list[str]:

@@ -27,7 +27,17 @@ from faintspot.experiments.loop_analysis import (
 from faintspot.experiments.loop_arms import CONTROL_SIGN, VARIANTS
 from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.statistics import paired_mean
-from faintspot.report.drawing import FLUX_GREY, GREY, WIDTH, colour_bar, new_figure, plain_ticks, styled
+from faintspot.report.drawing import (
+    FLUX_GREY,
+    GREY,
+    WIDTH,
+    axis_above,
+    colour_bar,
+    new_figure,
+    note,
+    plain_ticks,
+    styled,
+)
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.texts import Texts
 
@@ -74,7 +84,8 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
     left.set_ylim(bottom=0)
     right.set(xlabel="guide-star magnitude", ylabel=f"Strehl less that of {result.labels[reference]}, paired")
     for panel in (left, right):
-        _photon_axis(panel, result)
+        label_above = "photo-electrons of a sub-aperture in a frame"
+        axis_above(panel, result.magnitudes, result.photons, label_above).tick_params(labelsize=10)
     figure.legend(loc="outside lower center", ncols=min(4, len(result.labels)), frameon=False)
     return _TEXT.figure("magnitude", figure, rows)
 
@@ -191,14 +202,6 @@ def _profile(image: NDArray[Any]) -> Floats:
     return profile
 
 
-def _photon_axis(panel: Axes, result: MagnitudeResult) -> None:
-    """Write the photo-electrons along the top."""
-    top = panel.secondary_xaxis("top")
-    top.set_xticks(result.magnitudes, [f"{photons:.3g}" for photons in result.photons])
-    top.set_xlabel("photo-electrons of a sub-aperture in a frame")
-    top.tick_params(labelsize=10)
-
-
 # Okabe & Ito (2008) and a grey; the shape of the marker tells them apart as well.
 _GROUP_STYLES = {NO_TV: ("#0072B2", "o"), TV: ("#767676", "^"), TV_BEST: ("#D55E00", "s")}
 _GAP_S = 2.0  # between sets on the axis of time
@@ -302,8 +305,7 @@ def _name_sets(panel: Axes, table: Measurements, start: Floats) -> None:
     for name, begin, end in zip(table.set_names, start, ends, strict=True):
         if end is not None:
             panel.axvline(end - _GAP_S / 2, color=GREY, lw=1)
-        place: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-        panel.annotate(name, (begin, 1.0), (0, -14), fontsize=10, **place)
+        note(panel, name, (begin, 1.0), "data, axes fraction", xytext=(0, -14), fontsize=10)
 
 
 def _draw_regression(panel: Axes, table: Measurements) -> None:

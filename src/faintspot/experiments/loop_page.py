@@ -44,7 +44,7 @@ from faintspot.experiments.loop_verdict import (
 )
 from faintspot.experiments.statistics import paired_mean
 from faintspot.report.figure_data import FigureWithData
-from faintspot.report.page import POSITIONS, Page, Section, configuration_section, html_of, write_page
+from faintspot.report.page import POSITIONS, Page, Section, configuration_section, write_page
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.experiments")
@@ -285,21 +285,11 @@ def write_loop_report(folder_of_results: str | Path, out_html: str | Path) -> li
     MissingExtraError
         When matplotlib or jinja2 is not installed.
     """
-    return write_page(_page(LoopResults.load(folder_of_results)), out_html)
+    return write_page(loop_page(LoopResults.load(folder_of_results)), out_html)
 
 
-def loop_report(results: LoopResults) -> str:
-    """Return the report page of closed-loop results as HTML: self-contained, without scripts.
-
-    Raises
-    ------
-    MissingExtraError
-        When matplotlib or jinja2 is not installed.
-    """
-    return html_of(_page(results))
-
-
-def _page(results: LoopResults) -> Page:
+def loop_page(results: LoopResults) -> Page:
+    """Return the report page of closed-loop results."""
     configuration = configuration_of(results)
     name = "" if configuration is None else f": “{configuration.name}”"
     return Page(

@@ -9,7 +9,9 @@ from faintspot.experiments.loop_answer import BASELINE, SECOND, Coverage, LoopAn
 from faintspot.experiments.loop_arms import LOOP_GAIN, Choice
 from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, magnitudes_apart
 from faintspot.experiments.statistics import Estimate
+from faintspot.report.texts import Texts
 
+_TEXT = Texts("faintspot.experiments")
 REFERENCES = (BASELINE, SECOND)
 _SMALLEST_ERROR = 0.001
 _SMALLEST_ERROR_MAG = 0.01
@@ -18,14 +20,12 @@ _SMALLEST_ERROR_MAG = 0.01
 def situation(answer: LoopAnswer) -> str:
     """Say which loop and which star it is about."""
     loop = answer.question.configuration
-    camera, flux = loop.camera, answer.at_star
-    noise = camera.read_noise_e / camera.em_gain
-    return (
-        f"{loop.name}: {loop.telescope.diameter_m:g} m, {loop.sensor.subapertures} x "
-        f"{loop.sensor.subapertures} sub-apertures, spots {loop.d_over_r0:.2g} r0 wide, {noise:g} e- of read "
-        f"noise, {loop.control.frame_rate_hz:g} frames/s; star "
-        f"{camera.band} = {answer.magnitudes[flux]:.2f}, "
-        f"{plain_number(answer.photons[flux])} photo-electrons in a sub-aperture and frame"
+    return _TEXT(
+        "loop_answer.situation",
+        loop=loop,
+        noise=loop.camera.read_noise_e / loop.camera.em_gain,
+        magnitude=answer.magnitudes[answer.at_star],
+        photons=plain_number(answer.photons[answer.at_star]),
     )
 
 
@@ -43,15 +43,12 @@ def recommendation(answer: LoopAnswer) -> list[str]:
     flux, best = answer.at_star, answer.best
     same = [name for name in answer.equal(flux) if name != best.name]
     lines = [f"Recommended: {best.name} ({choice_in_words(best.choices[flux])})"]
-    lines.append(
-        f"expected Strehl ratio {_plus_minus(answer.strehl(best.name, flux), _SMALLEST_ERROR)} at "
-        f"{1e6 * answer.question.configuration.science.wavelength_m:.3g} um"
-    )
+    strehl = _plus_minus(answer.strehl(best.name, flux), _SMALLEST_ERROR)
+    wavelength = 1e6 * answer.question.configuration.science.wavelength_m
+    lines.append(_TEXT("loop_answer.expected", strehl=strehl, wavelength_um=wavelength))
     if same:
-        lines.append(
-            f"no winner: the errors do not tell it from {', '.join(same)}; taken is "
-            f"{'the baseline' if best.name == BASELINE else 'what is simplest'}"
-        )
+        taken = "the baseline" if best.name == BASELINE else "what is simplest"
+        lines.append(_TEXT("loop_answer.no_winner", same=", ".join(same), taken=taken))
     lines += [
         f"against {reference}: {difference_in_words(answer, best.name, reference)}"
         for reference in REFERENCES
@@ -108,20 +105,17 @@ def about_the_sky(answer: LoopAnswer) -> list[str]:
     """Say what the table of the sky means, and its errors."""
     radius = answer.question.radius
     if radius is None:
-        return [
-            "sky coverage: not known, as all turbulence is on the ground (--radius-arcsec gives its reach)"
-        ]
+        return [_TEXT["loop_answer.no_sky"]]
     given = "given" if answer.question.radius_arcsec is not None else "the isoplanatic angle of the layers"
     best, parts = answer.best.name, []
     for place in PLACES:
         found = answer.coverage(best, place)
         assert found is not None
         parts.append(f"{plain_number(100 * found.model_error, 2)} ({place})")
+    percent = 100 * MODEL_ERROR
     return [
-        f"percentage of the sky with a star bright enough for a Strehl ratio of {answer.level:.3g} within "
-        f"{radius:.3g} arcsec ({given}; the ratio is that towards the star, a target beside it has less)",
-        "errors in the table: of the limiting magnitude. Star counts are off by about "
-        f"{100 * MODEL_ERROR:.0f} %, for all methods alike: {best} ± {', '.join(parts)}",
+        _TEXT("loop_answer.sky", level=answer.level, radius=radius, given=given),
+        _TEXT("loop_answer.sky_errors", percent=percent, best=best, parts=", ".join(parts)),
     ]
 
 
@@ -129,15 +123,13 @@ def foundations(answer: LoopAnswer) -> list[str]:
     """Say what the answer rests on."""
     step = magnitudes_apart(answer.photons.tolist())
     measured = ", ".join(f"{magnitude:.2f}" for magnitude in answer.magnitudes[::-1])
+    photons = ", ".join(plain_number(flux) for flux in answer.photons[::-1])
+    counts = {"count": answer.realisations, "frames": answer.scored_frames}
     lines = [
-        f"measured at magnitudes {measured} (photo-electrons "
-        f"{', '.join(plain_number(flux) for flux in answer.photons[::-1])}); limiting magnitudes are "
-        f"interpolated between these, up to {step:.2f} apart, with straight lines on a falling curve; how "
-        "far off that may be, by the curves' bends, is part of their errors",
-        f"{answer.realisations} realisations of the air, {answer.scored_frames} scored frames each, the same "
-        "for all candidates; settings tuned coarsely on other air, so a longer search may add to any of them",
-        "differences are paired; their intervals (95 %, Student's t) hold for all candidates together",
-        "frozen layers, a star on axis, no vibrations; control that learns has learnt in the same seeing",
+        _TEXT("loop_answer.measured", magnitudes=measured, photons=photons, step=step),
+        _TEXT("loop_answer.realisations", **counts),
+        _TEXT["loop_answer.paired"],
+        _TEXT["loop_answer.limits"],
     ]
     return lines + [f"{name} was not tried: {reason}" for name, reason in answer.left_out.items()]
 
@@ -163,7 +155,7 @@ def _ends(answer: LoopAnswer) -> str:
         ]
     if not parts:
         return ""
-    return f"at the end of what was tried, so a better value may lie beyond: {', '.join(parts)}"
+    return _TEXT("loop_answer.at_end", parts=", ".join(parts))
 
 
 def _plus_minus(value: Estimate, smallest: float, digits: int = 3) -> str:
