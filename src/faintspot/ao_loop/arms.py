@@ -40,7 +40,7 @@ class Arm:
         Whether slopes are the wavefront's true mean gradients instead of measured ones.
     control : str
         What makes commands of the slopes, see `faintspot.control.learning.CONTROLS`. All but the integrator
-        learn from telemetry of a loop with the integrator, on other air.
+        learn from telemetry of a loop with the integrator, in other turbulence.
     noise_scale : float
         What control multiplies the variance of the slopes' noise by that telemetry shows.
     psf, score : PSF, Score, optional

@@ -34,7 +34,7 @@ _SETTINGS = Settings("brightest", keep_brightest=20)
 def write_engine_files(
     configuration: LoopConfiguration, folder: str | Path, control: str = INTEGRATOR
 ) -> Path:
-    """Write layout, calibration and PSF, and what a controller needs, into a folder.
+    """Write layout, calibration, PSF and the controller's files into a folder.
 
     faintspot.toml (what else is in it stays; without an estimator it gets the 20 brightest pixels);
     interaction_matrix.npy, (2 n, commands) float64, px for a command of 1 nm; reference_slopes.npy, (2 n,)
@@ -48,7 +48,7 @@ def write_engine_files(
         Made where there is none.
     control : str
         Kind of control, see `faintspot.control.learning.CONTROLS`. All but the integrator learn from
-        telemetry of the simulated loop, on other air, which takes up to a minute: control_model.npz.
+        telemetry of the simulated loop, in other turbulence, which takes up to a minute: control_model.npz.
 
     Returns
     -------

@@ -39,7 +39,7 @@ def telemetry_of_recording(
     ----------
     recording : faintspot.io.Telemetry
     control : Control
-        Whose matrix, delay and centroid gain count; and whether the estimator was told what it expects.
+        Source of matrix, delay, centroid gain, and of whether predictions were used.
     prior_std_px : (2 n,) array, optional
         How wide the estimator's prior was. Default: it had none.
 
@@ -99,7 +99,7 @@ def recorded_slopes(
     rows : (frames,) array
         Of the recording; as many frames as the delay before each must be there.
     predicted : bool
-        Whether the estimator was told what to expect; else that is 0.
+        Whether the estimator had the prediction as its prior; else 0.
     what : str
         What errors call the recording.
 

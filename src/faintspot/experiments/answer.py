@@ -50,7 +50,7 @@ class ArmResult:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What `faintspot.experiments.tune` found.
+    """Result of `faintspot.experiments.tune`.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class Answer:
 
     @property
     def at_star(self) -> int:
-        """Which of them is the star's."""
+        """Index of the star's flux."""
         return int(np.argmin(np.abs(np.log(self.flux_e / self.question.star_flux_e))))
 
     @property

@@ -26,7 +26,7 @@ _SMALLEST_ERROR_MAG = 0.01  # that is shown
 
 
 def situation(answer: Answer) -> str:
-    """Say which star and which spots it is about."""
+    """Describe the star and the spots."""
     question = answer.question
     star = f"{plain_number(question.star_flux_e)} electrons per sub-aperture and frame"
     if question.photometry is not None:
@@ -63,7 +63,7 @@ def recommendation(answer: Answer) -> list[str]:
 
 
 def promise_lines(answer: Answer) -> list[str]:
-    """Say what the recording makes of the promised error."""
+    """Describe how the recording compares with the promised error."""
     promise = answer.promise
     if promise is None:
         return [UNCHECKED] if answer.question.facts else []
@@ -102,7 +102,7 @@ def _with_error(value: Estimate) -> str:
 
 
 def foundations(answer: Answer) -> list[str]:
-    """Say what the answer rests on."""
+    """Describe what the answer is based on."""
     question = answer.question
     spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
     lines = list(question.facts)
@@ -142,7 +142,7 @@ def _span(answer: Answer) -> float:
 
 
 def _about_tv(answer: Answer) -> list[str]:
-    """Say whether TV pays, where it is not what is recommended."""
+    """Describe the gain of TV where it is not recommended."""
     tv, best = answer[TV], answer.best
     if tv is best:
         return []

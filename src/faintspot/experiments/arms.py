@@ -31,7 +31,7 @@ from faintspot.spots.shapes import FWHM_OF_SIZE_1_PX
 
 
 class Knowledge(IntEnum):
-    """What an estimator has to know beside the noise; more is larger."""
+    """Knowledge that an estimator needs beside the noise; larger is more."""
 
     NOISE = 0
     WIDTH = 1
@@ -187,7 +187,7 @@ Kind = type[Estimator]
 TV, NO_TV, SMOOTHING = TotalVariation.name, BrightestPixels.name, Smoothed.name
 """The arms that the paper's claims compare, and the simplest rival."""
 TV_OVER_NO_TV = {"method": TV, "reference": NO_TV}
-"""Which curves gains are taken between."""
+"""Curves between which gains are computed."""
 
 _ONLY_HERE: dict[str, Kind] = {kind.name: kind for kind in (BrightestAsTheyAre, MedianFiltered)}
 DEFAULT_ARMS = tuple(
@@ -222,7 +222,7 @@ def style_of(arm: str) -> Style:
 
 
 def knows_the_spot(arm: str) -> bool:
-    """Whether an arm is told more than the noise."""
+    """Return whether a method knows more than the noise."""
     return _is_known(arm) and Knowledge.of(kind_of(arm)) > Knowledge.NOISE
 
 

@@ -35,7 +35,7 @@ from faintspot.spots.bounds import MEAN_ABSOLUTE, cramer_rao, photon_efficiency
 
 @dataclass(frozen=True)
 class Choice:
-    """What an arm chose in a mode."""
+    """Choice of a method in a mode."""
 
     candidate: Candidate
     column: int | None

@@ -41,7 +41,7 @@ _LEAST_FLUX_E = 1e-3  # a mean of noise may be negative
 # In a cell ------------------------------------------------------------------------------------------------
 
 Candidate = tuple[tuple[str, float], ...]
-"""What an arm may choose: options, in the units of the specification."""
+"""Options from which a method may choose, in the units of the specification."""
 
 
 def shown(candidate: Candidate, option: str | None = None) -> float:
@@ -58,14 +58,14 @@ def detector_of(cell: Cell) -> Detector:
 
 
 class CellArms:
-    """The arms of a study in one cell: candidates, estimators, and slopes of images.
+    """Methods of a study in one cell: candidates, estimators, and slopes of images.
 
     Parameters
     ----------
     cell : Cell
     specification : StudySpecification
     flux_e : float, optional
-        Mean electrons of an image as measured, which arms without a table are told. Default: the cell's.
+        Mean electrons of an image as measured, for methods without a table. Default: the cell's.
     """
 
     def __init__(self, cell: Cell, specification: StudySpecification, flux_e: float | None = None) -> None:
@@ -136,7 +136,7 @@ class CellArms:
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """What estimators are told of the cell that tune options of their own."""
+        """Knowledge of the cell that estimators have when they tune their own options."""
         cell = self.cell
         return Scene(
             flux_e=self.flux_e,
@@ -235,7 +235,7 @@ def position_table(
 
 
 def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
-    """Return the images (n, pixels) as the brightest pixels are sought in them."""
+    """Return the images (n, pixels) in which the brightest pixels are found."""
     denoised = estimator.denoised(images)
     assert denoised is not None
     return np.ascontiguousarray(denoised).reshape(len(images), -1)

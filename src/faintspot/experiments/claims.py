@@ -145,7 +145,7 @@ def _where(best: list[_Compared]) -> list[str]:
 
 
 def _with_noise(best: list[_Compared]) -> list[str]:
-    """Say how the gain goes with read noise, by spot profile, for round Nyquist-sampled spots."""
+    """Describe the gain against read noise, by spot profile, for round Nyquist-sampled spots."""
     lines = []
     for profile in sorted({item.configuration.profile for item in best}):
         gains: dict[float, list[float]] = {}
@@ -178,7 +178,7 @@ def _fixed_k(best: list[_Compared], fixed: list[_Compared], mode: str) -> list[s
 def _choosing_k(
     best: dict[Configuration, Curve], fixed: dict[Configuration, Curve], mode: str, rng: np.random.Generator
 ) -> list[str]:
-    """Say what a good k alone is worth, without denoising."""
+    """Describe the gain of a good number of pixels kept, without denoising."""
     ratios = []
     for key, curve in best.items():
         if key in fixed:

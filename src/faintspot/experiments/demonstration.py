@@ -38,7 +38,7 @@ EXCESS_NOISE = 2.0
 
 @dataclass(frozen=True)
 class Scored:
-    """What was chosen at one flux, with its errors on other frames."""
+    """Choice at one flux, with its errors on other frames."""
 
     settings: Settings
     errors: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What a study says of its estimators, in tables and words: how near to the limit, and how well they know."""
+"""Tables and sentences on a study's estimators: photon efficiency and calibration of standard errors."""
 
 from __future__ import annotations
 

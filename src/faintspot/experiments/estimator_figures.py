@@ -62,7 +62,7 @@ class _Group:
 
     @property
     def words(self) -> str:
-        """What the cells have in common."""
+        """Parameters that the cells share."""
         named = [parameter_in_words(key, value) for key, value in self.common.items()]
         return ", ".join(text for text in named if not text.startswith("no "))
 
@@ -208,7 +208,7 @@ def _drawn_arms(dataset: xarray.Dataset) -> list[str]:
 
 
 def _line_of(arm: str) -> dict[str, Any]:
-    """How an arm is drawn: solid where it knows the spot, dashed where it does not."""
+    """Return the style of a method: solid if it knows the spot, else dashed."""
     style = style_of(arm)
     return {
         "label": label_of(arm),

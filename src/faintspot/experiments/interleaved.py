@@ -35,7 +35,7 @@ _TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class ObservingPlan:
-    """How the observations are interleaved.
+    """Schedule of the interleaved observations.
 
     Parameters
     ----------
@@ -109,16 +109,16 @@ def run_interleaved(
 ) -> InterleavedResult:
     """Observe in four sets, two at full and two at 75 % of the multiplication gain, or what is left of them.
 
-    Each set goes through a measurement without denoising, then 8 or 20 with strengths rising from 0 to 2
+    Each set consists of a measurement without denoising, then 8 or 20 with strengths rising from 0 to 2
     electrons, and again, while the loop stays closed and the turbulence drifts. All arms of a set have the
     same number of kept pixels and the same loop gain: those that are best for denoising and none together,
-    on air that is not scored. Without multiplication all sets are the same but for the air.
+    in turbulence that is not scored. Without multiplication all sets are the same but for the air.
 
     Parameters
     ----------
     configuration : LoopConfiguration
     folder : path
-        Where each set is written as it is finished; made where it is not there.
+        Folder for finished sets; created if absent.
     quick : bool
         Fewer and shorter measurements.
     plan : ObservingPlan, optional

@@ -1,4 +1,4 @@
-"""How each claim of Basden et al. 2015 (arXiv:1503.06043) is decided by the numbers of a study.
+"""Verdicts on the claims of Basden et al. 2015 (arXiv:1503.06043) from the results of a study.
 
 All intervals are of 95 %. The two arms are brightest pixels without denoising and TV denoising. Where
 nothing is left of a spot every estimator answers about the centre, so that flux gains mean nothing: they are
@@ -145,7 +145,7 @@ def independent_of_pixels(dataset: xarray.Dataset, mode: str, rng: np.random.Gen
 
 
 def _in_both(tv: tuple[float, float], plain: tuple[float, float]) -> str:
-    """Say two ratios of R from their logarithms and the standard errors of these."""
+    """Format two ratios of R from their logarithms and standard errors."""
     with_tv, without = (f"{np.exp(log):.3f} ± {np.exp(log) * error:.3f}" for log, error in (tv, plain))
     return f"{with_tv} with TV, {without} without"
 

@@ -1,4 +1,4 @@
-"""What interleaved observations, curves against magnitude and recorded telemetry say."""
+"""Analysis of interleaved observations, curves against magnitude and recorded telemetry."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class GroupRow:
     group: str
     mean: float
     standard_deviation: float
-    """Of the measurements; NaN for less than two."""
+    """Standard deviation of the measurements; NaN for fewer than two."""
     count: int
     difference: Estimate | None
     """From the neighbours without TV; None for these themselves."""
@@ -113,7 +113,7 @@ class SetSeeing:
 
     set_name: str
     true_r0_m: float
-    """Of steady air with the mean strength of turbulence."""
+    """Fried parameter of steady turbulence with the mean strength."""
     seeing: Seeing
     """From the slopes about their mean over the pupil."""
     with_tip_tilt: Seeing

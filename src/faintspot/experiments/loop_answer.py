@@ -65,12 +65,12 @@ class LoopArmResult:
 
 @dataclass(frozen=True)
 class Limit:
-    """Where a curve of the Strehl ratio falls below a level, or how far apart two curves are there."""
+    """Magnitude at which a Strehl curve falls below a level, or the distance of two curves there."""
 
     magnitude: Estimate
     """Infinite: above the level with every star that was measured; minus infinite: below it."""
     interpolation_error: float
-    """How far straight lines between what was measured may be off, as the curve bends."""
+    """Bound on the error of linear interpolation, from the curve's bend."""
 
     @property
     def is_known(self) -> bool:
@@ -89,16 +89,16 @@ class Coverage:
 
     fraction: float
     strehl_error: float
-    """What the limiting magnitude's error makes of it."""
+    """Error from that of the limiting magnitude."""
     model_error: float
-    """What the error of the star counts makes of it; the same for all arms."""
+    """Error from that of the star counts; the same for all methods."""
     bound: int
     """1: at least this fraction, as the limit is fainter than all that was measured; -1: at most."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopAnswer:
-    """What `faintspot.experiments.tune_loop` found.
+    """Result of `faintspot.experiments.tune_loop`.
 
     Examples
     --------
@@ -130,7 +130,7 @@ class LoopAnswer:
 
     @property
     def realisations(self) -> int:
-        """Realisations of the air that were scored."""
+        """Realisations of the turbulence that were scored."""
         return int(self.results[0].strehl.shape[1])
 
     @property
@@ -157,7 +157,7 @@ class LoopAnswer:
         return paired_mean(self[name].strehl[flux])
 
     def difference(self, name: str, reference: str, flux: int) -> Estimate:
-        """Return by how much an arm's Strehl ratio is above another's on the same air.
+        """Return the difference of two methods' Strehl ratios in the same turbulence.
 
         Its interval holds for all comparisons with one arm together.
         """
@@ -176,7 +176,7 @@ class LoopAnswer:
 
     @property
     def best(self) -> LoopArmResult:
-        """What is recommended for the star."""
+        """Recommended method for the star."""
         return self[self.equal(self.at_star)[0]]
 
     def limit(self, name: str) -> Limit:

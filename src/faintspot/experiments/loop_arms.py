@@ -52,7 +52,7 @@ class Tunable:
     """Something of an arm that is tuned."""
 
     values: tuple[Any, ...]
-    """What it may be, in their order."""
+    """Allowed values, in order."""
     first: tuple[Any, ...]
     """Those of the first look."""
 
@@ -66,7 +66,7 @@ class Tunable:
 
 @dataclass(frozen=True)
 class Variant:
-    """What a loop does with an estimator beyond the usual."""
+    """Variants of a method's use in a loop."""
 
     label: str
     meaning: str
@@ -100,12 +100,12 @@ class ArmKind:
 
     estimator: type[Estimator]
     variants: tuple[str, ...] = ()
-    """Of `VARIANTS`, in their order there."""
+    """Variants, in the order of `VARIANTS`."""
     control: str = INTEGRATOR
 
     @property
     def name(self) -> str:
-        """What command lines and results call it."""
+        """Name in commands and results."""
         # The Kalman filter always predicts.
         variants = [each for each in self.variants if each != _PREDICTED or self.control != KALMAN]
         slopes = "".join([self.estimator.name, *variants])
@@ -113,12 +113,12 @@ class ArmKind:
 
     @property
     def is_predicted(self) -> bool:
-        """Whether it is told what the loop predicts."""
+        """Whether its prior is the loop's prediction."""
         return _PREDICTED in self.variants
 
     @property
     def label(self) -> str:
-        """What reports call it."""
+        """Name in reports."""
         parts = [self.estimator.label, *(VARIANTS[name].label for name in self.variants)]
         return ", ".join(parts if self.control == INTEGRATOR else [*parts, CONTROLS[self.control]])
 

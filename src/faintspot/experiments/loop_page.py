@@ -241,7 +241,7 @@ def _budget(result: BudgetResult, results: LoopResults) -> Section:
 
 
 def _budget_lines(result: BudgetResult) -> list[str]:
-    """Say of each arm what costs most Strehl, and of arms what becomes of their difference."""
+    """Describe which term costs each method most Strehl, and how differences between methods change."""
     lines = []
     changes = result.strehl - result.strehl[:, :1]
     for arm, name in enumerate(result.labels):

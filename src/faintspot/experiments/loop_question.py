@@ -149,7 +149,7 @@ def _counts(visual: Floats, scale: float, alpha: float, beta: float, power: floa
 
 
 BASELINE, SECOND = "window", "brightest"
-"""What every gain is stated against, first and second: both with the integrator."""
+"""Baselines of every gain, first and second, both with the integrator."""
 _CANDIDATES = (SECOND, BASELINE, "map_predicted", "window+kalman", "map+kalman")
 _FAINTER = 4.0  # than the faintest star of the configuration: limiting magnitudes are there
 _AROUND = (1 / 8, 4.0)  # of the star's flux, where the configuration has no other stars
@@ -273,7 +273,7 @@ class LoopQuestion:
 
     @property
     def radius(self) -> float | None:
-        """How far from the target a star still serves, arcsec; None: all turbulence is on the ground."""
+        """Largest useful distance of a star from the target, arcsec; None: no high turbulence."""
         if self.radius_arcsec is not None:
             return float(self.radius_arcsec)
         if not any(self._layers_above()):

@@ -171,7 +171,7 @@ class RegressionLine:
 
 @dataclass(frozen=True)
 class MagnitudeGain:
-    """How many magnitudes fainter an arm reaches the same Strehl ratio as the reference."""
+    """Magnitudes by which a star may be fainter for the same Strehl ratio as the reference."""
 
     strehl: float
     gain: Estimate

@@ -18,7 +18,7 @@ _SMALLEST_ERROR_MAG = 0.01
 
 
 def situation(answer: LoopAnswer) -> str:
-    """Say which loop and which star it is about."""
+    """Describe the loop and the star."""
     loop = answer.question.configuration
     return _TEXT(
         "loop_answer.situation",
@@ -60,7 +60,7 @@ def recommendation(answer: LoopAnswer) -> list[str]:
 
 
 def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
-    """Say what an arm gains over another, in Strehl ratio at the star and in limiting magnitude."""
+    """Describe the gain of a method over another, in Strehl ratio and limiting magnitude."""
     found = answer.difference(name, reference, answer.at_star)
     verdict = {1: "", 0: ", within its error", -1: ", less beyond its error"}[found.decided]
     text = f"Strehl ratio {_signed(found, 3, _SMALLEST_ERROR)}{verdict}"
@@ -102,7 +102,7 @@ def coverage_in_words(coverage: Coverage) -> str:
 
 
 def about_the_sky(answer: LoopAnswer) -> list[str]:
-    """Say what the table of the sky means, and its errors."""
+    """Explain the table of sky coverage and its errors."""
     radius = answer.question.radius
     if radius is None:
         return [_TEXT["loop_answer.no_sky"]]
@@ -120,7 +120,7 @@ def about_the_sky(answer: LoopAnswer) -> list[str]:
 
 
 def foundations(answer: LoopAnswer) -> list[str]:
-    """Say what the answer rests on."""
+    """Describe what the answer is based on."""
     step = magnitudes_apart(answer.photons.tolist())
     measured = ", ".join(f"{magnitude:.2f}" for magnitude in answer.magnitudes[::-1])
     photons = ", ".join(plain_number(flux) for flux in answer.photons[::-1])
@@ -135,7 +135,7 @@ def foundations(answer: LoopAnswer) -> list[str]:
 
 
 def _along_the_magnitudes(answer: LoopAnswer) -> list[str]:
-    """Say what is recommended for the other stars."""
+    """Describe the recommendation for other stars."""
     parts = []
     for flux in range(len(answer.photons) - 1, -1, -1):
         best, *same = answer.equal(flux)
@@ -145,7 +145,7 @@ def _along_the_magnitudes(answer: LoopAnswer) -> list[str]:
 
 
 def _ends(answer: LoopAnswer) -> str:
-    """Say which values of the recommended and the reference arms are at the end of what was on offer."""
+    """Name tuned values of the recommended and reference methods that are at the end of their range."""
     flux = answer.at_star
     parts = []
     for name in dict.fromkeys((answer.best.name, *REFERENCES)):

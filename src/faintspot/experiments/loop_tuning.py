@@ -27,7 +27,7 @@ _SEARCH = Search(
 
 @dataclass(frozen=True)
 class LoopPlan:
-    """How much is simulated.
+    """Amount of simulation.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class LoopPlan:
     realisations : int
         Realisations of the atmosphere that are scored, the same for all candidates.
     search : Search
-        How settings are sought.
+        Search for the settings.
     """
 
     fluxes: int = 5

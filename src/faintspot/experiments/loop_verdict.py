@@ -1,4 +1,4 @@
-"""What closed-loop results amount to, in sentences and in tables of text."""
+"""Sentences and tables of text on closed-loop results."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ REFERENCES = (Window.name, BrightestPixels.name)
 
 @dataclass(frozen=True, eq=False)
 class LoopResults:
-    """What there is in a folder of results; None: not run."""
+    """Results in a folder; None: not run."""
 
     interleaved: InterleavedResult | None = None
     magnitude: MagnitudeResult | None = None

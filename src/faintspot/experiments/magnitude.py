@@ -53,7 +53,7 @@ def run_magnitude(
 ) -> MagnitudeResult:
     """Measure the Strehl ratio of arms against the star's flux, or what is left of it.
 
-    Each arm is tuned at each flux on air of its own, then scored on the configuration's number of
+    Each method is tuned at each flux in separate turbulence, then scored on the configuration's number of
     realisations, which are the same for all. The result is also written to the folder.
 
     Parameters
@@ -68,7 +68,7 @@ def run_magnitude(
     quick : bool
         Few fluxes, short runs, a coarse search.
     search : Search, optional
-        How settings are sought.
+        Search for the settings.
     place : WorkerPool, optional
         Where the work is done. Default: processes on this machine.
     overwrite : bool
@@ -122,7 +122,7 @@ class Experiment:
 
     configuration: LoopConfiguration
     plan: Any
-    """How it is done: a `Search`, or a dataclass of the experiment's own."""
+    """Plan: a `Search`, or a dataclass of the experiment."""
     folder: Path
     name: str
     place: WorkerPool

@@ -1,4 +1,4 @@
-"""What is promised of slopes, checked on recorded frames that the promise was not learnt from."""
+"""Check of promised slope errors on recorded frames that were not used to learn them."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def default_search_range_px(fwhm_px: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """A camera, its spots and a star; everything that is not known may be left out where it is optional.
+    """Camera, spots and star; unknown optional values may be left out.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class Question:
     relative_flux : (n,) array, optional
         Flux of sub-apertures in units of their mean. Default: all have the same.
     recording : (n_frames, h, w) array, ADU, optional
-        Frames, not used for what is said here, on which to check what is promised; needs `layout` and
+        Frames, not used for the values here, on which promised errors are checked; needs `layout` and
         `calibration`.
     layout : Layout, optional
     calibration : Calibration, optional
@@ -205,7 +205,7 @@ class Question:
         return float(self.read_noise_e / self.em_gain)
 
     def scene(self, flux_e: float) -> Scene:
-        """Return what estimators are told of spots of this flux."""
+        """Return the settings that estimators have for spots of this flux."""
         return Scene(
             flux_e=flux_e,
             read_noise_e=self.read_noise_photoelectrons,
@@ -244,7 +244,7 @@ class Question:
 
     @property
     def flux_is_known(self) -> bool:
-        """Whether estimators are told the star's flux: it is assumed, not that of a recording's spots."""
+        """Whether estimators know the star's flux, because it is assumed and not that of a recording."""
         return self.relative_flux is None and self.psf is None
 
     @property

@@ -175,7 +175,7 @@ def _calibration(
 def _measured(
     stack: NDArray[Any], darks: NDArray[Any] | None, layout: Layout, em_gain: float
 ) -> DetectorMeasurement | None:
-    """What the frames tell of the camera; None where they are too few."""
+    """Camera properties measured in the frames; None where they are too few."""
     usable_darks = None if darks is None or len(darks) < 2 else darks[: max(2, _DARK_PIXELS // darks[0].size)]
     if len(stack) > 1:
         return measure_detector(stack, usable_darks, layout=layout, em_gain=em_gain)
@@ -185,7 +185,7 @@ def _measured(
 
 
 def _measured_on_spots(stack: NDArray[Any], dark: Any, layout: Layout, em_gain: float) -> SpotTransfer | str:
-    """What the noise about fitted spots tells, or why it does not."""
+    """Camera properties from the noise about fitted spots, or the reason why there are none."""
     from faintspot.training.spot_transfer import measure_on_spots
 
     some = _some(stack, layout)

@@ -50,15 +50,15 @@ class Unit:
     """A piece of work that does not depend on any other of the same call."""
 
     key: str
-    """What its result is stored under."""
+    """Key of its result in the store."""
     arguments: tuple[Any, ...]
     size: int = 1
-    """How much work it is, for the progress."""
+    """Amount of work, for the progress bar."""
 
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Where units are run.
+    """Processes or cluster that run the units.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class WorkerPool:
         Processes on this machine; as many as there are processors by default. 0: this process.
     scheduler : str, optional
         Address of a running Dask scheduler instead, such as "tcp://host:8786", whose workers have the same
-        version of faintspot. Whoever reaches a scheduler can run anything as the user of its workers: see
+        version of faintspot. Anyone who can reach it can run anything as the user of its workers: see
         docs/study.md for one that only you reach.
     progress : callable, optional
         Called with how much is done in this run and how much is to be done.
@@ -148,7 +148,7 @@ Finished = Iterator[tuple[Unit, Arrays]]
 
 
 class _Count:
-    """How much is done, in units that are finished and in those that are not."""
+    """Amount of finished work, in finished and unfinished units."""
 
     def __init__(self, units: list[Unit], progress: Progress | None) -> None:
         self._whole = {unit.key: unit.size for unit in units}
@@ -271,7 +271,7 @@ def _in_process(function: Callable[..., Arrays], key: str, arguments: tuple[Any,
 
 
 def _seldom(tell: Advance) -> Advance:
-    """Return a function that passes on what it is told, but not more often than anybody looks."""
+    """Return a function that forwards progress at most a few times a second."""
     told = time.monotonic()
 
     def advance(done: int) -> None:

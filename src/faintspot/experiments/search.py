@@ -23,7 +23,7 @@ from faintspot.experiments.statistics import slope_statistics
 _ROUNDS = 2  # of looking along each axis in turn
 
 Axes = Mapping[str, Sequence[Any]]
-"""What each option may be; the usual value is the first."""
+"""Values of each option; the usual one first."""
 
 
 def coordinate_search(axes: Axes, badness: Callable[[Choice, str, Sequence[Any]], Sequence[float]]) -> Choice:
@@ -64,7 +64,7 @@ FIRST_TUNING_REALISATION = 1000
 
 @dataclass(frozen=True)
 class Search:
-    """How thoroughly settings are sought.
+    """Extent of a search for settings.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ QUICK = Search(coarse_frames=160, frames=160, settle_frames=40, realisations=1, 
 
 @dataclass(frozen=True)
 class Tuned:
-    """What the search found."""
+    """Result of a search."""
 
     choice: Choice
     strehl: float
@@ -131,8 +131,9 @@ def tune(
     All combinations of a few values of each option first, then steps from the best ones to
     neighbouring values of one option at a time, as long as that helps. Where control learns from telemetry,
     which takes much longer than a run, the estimator's options and the gain at which telemetry is taken are
-    those that are best with the integrator, and only what is the control's own is sought with it. All see
-    the same air and noise; realisations are those from `FIRST_TUNING_REALISATION` on, which are not scored.
+    those that are best with the integrator, and only the control's own options are searched. All have the
+    same turbulence and noise; realisations are those from `FIRST_TUNING_REALISATION` on, which are not
+    scored.
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ def tune(
     advance : callable, optional
         Told the number of frames simulated, after every run.
     slopes : mapping, optional
-        For control that learns: what was found for its slopes with the integrator. Default: sought first.
+        For control that learns: settings of its slopes with the integrator. Default: searched first.
     """
     search = Search() if search is None else search
     tuned = kind.tuned(configuration)

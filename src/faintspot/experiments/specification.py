@@ -1,4 +1,4 @@
-"""What a study measures: its sweeps, the arms that are compared, and what each arm may choose from."""
+"""Specification of a study: sweeps, methods, and the options from which each method chooses."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def slope_error(x: ArrayLike, y: ArrayLike, truth: ArrayLike) -> Estimate:
 
 @dataclass(frozen=True)
 class SlopeStatistics:
-    """How good slopes are. R alone flatters an estimator that falls back to the reference."""
+    """Quality of slopes. R alone flatters an estimator that falls back to the reference."""
 
     error: Estimate
     """Slope error R, the mean of (|dx| + |dy|) / 2, px."""

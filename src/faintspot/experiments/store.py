@@ -30,7 +30,7 @@ FORMAT = 2
 DONE = "done"
 _FORMAT, _KIND, _FINGERPRINT, _UNITS = "format", "kind", "fingerprint", "units"
 OWN_ATTRIBUTES = (_FORMAT, _KIND, _UNITS)
-"""What a store notes of itself, beside the attributes that it is given."""
+"""Attributes that a store adds to those that it is given."""
 
 
 def fingerprint_of(*identity: str) -> str:
@@ -40,7 +40,7 @@ def fingerprint_of(*identity: str) -> str:
 
 
 class UnitStore(Protocol):
-    """Where the results of units are, by key."""
+    """Positions of the units' results, by key."""
 
     def done(self, key: str) -> bool:
         """Return whether the result of a unit is there."""
@@ -72,7 +72,7 @@ class MemoryStore:
 
 
 class ZarrStore:
-    """Results of units that have the same variables, in a Zarr store that is made or gone on with.
+    """Results of units that have the same variables, in a Zarr store that is created or continued.
 
     Parameters
     ----------

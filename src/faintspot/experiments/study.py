@@ -123,7 +123,7 @@ def open_study(path: str | Path) -> xarray.Dataset:
 
 
 def stored_units(specification: StudySpecification, path: Path, *, overwrite: bool = False) -> ZarrStore:
-    """Return the store of a study's cells, made or gone on with.
+    """Return the store of a study's cells, created or continued.
 
     Raises
     ------

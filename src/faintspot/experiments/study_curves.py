@@ -251,7 +251,7 @@ def against_tv(dataset: xarray.Dataset, mode: str) -> list[AgainstTV]:
 
 
 class Outcome(StrEnum):
-    """What the numbers say about a claim."""
+    """Verdict on a claim."""
 
     HOLDS = "holds"
     IN_PART = "holds in part"
@@ -277,7 +277,7 @@ class Finding:
 
     @property
     def outcome(self) -> Outcome:
-        """Of all cases together; see `combined`."""
+        """Verdict on all cases together; see `combined`."""
         return combined([case.outcome for case in self.cases])
 
     def in_words(self) -> str:
@@ -306,7 +306,7 @@ class Verdict:
 
     @property
     def outcome(self) -> Outcome:
-        """Of both modes together."""
+        """Verdict on both modes together."""
         measured = [item.outcome for item in (self.best, self.fixed) if item.cases]
         return combined(measured)
 

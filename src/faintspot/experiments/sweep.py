@@ -1,4 +1,4 @@
-"""What is varied in a study: cells, each one set of physical parameters, and sweeps, which list them."""
+"""Cells of a study, each one set of physical parameters, and sweeps, which list them."""
 
 from __future__ import annotations
 

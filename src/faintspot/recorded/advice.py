@@ -1,4 +1,4 @@
-"""What the flags of a run mean, and what to do about what went wrong."""
+"""Meaning of a run's flags, with advice."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Comparison:
 
     arms: Sequence[MeasuredSlopes]
     noise_px: Sequence[Floats]
-    """Of each sub-aperture, from frame to frame; NaN where no two frames follow each other."""
+    """Noise of each sub-aperture from consecutive frames; NaN where there are none."""
     gains: Sequence[tuple[float, float]]
     """Centroid gain relative to the last method, and its standard error; NaN where it is not known."""
 
@@ -68,7 +68,7 @@ class Comparison:
         ]
 
     def verdict(self) -> str:
-        """Say which method has the least noise at equal gain, if that is certain."""
+        """Name the method with the least noise at equal gain, if the errors allow it."""
         levels = [median(self.equal_noise(place)) for place in range(len(self.arms))]
         if len(levels) < 2 or self.arms[0].n_frames < 2:
             return ""

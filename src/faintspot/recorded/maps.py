@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _PANEL_HEIGHT = 5.0
 _HISTOGRAM_BINS = 60
 ARROWS_WHOLE_PERCENT = 98
-"""Of this many slopes in a hundred, arrows are never cut."""
+"""Percentage of slopes whose arrows are never cut."""
 _MOST_SHORT_ARROWS = 400  # of more sub-apertures, arrows within their own could not be seen
 
 

@@ -42,13 +42,13 @@ Progress = Callable[[int, int], None]
 
 @dataclass
 class Summary:
-    """What a run over recorded frames found."""
+    """Summary of a run over recorded frames."""
 
     n_frames: int
     n_subapertures: int
     resumed_at: int = 0
     flag_counts: dict[SubapertureFlag, int] = field(default_factory=dict)
-    """How many slopes of this call carry each flag."""
+    """Number of slopes of this call with each flag."""
     bad_frames: int = 0
     """Frames of this call without a single valid slope."""
     measured: int = 0
@@ -58,7 +58,7 @@ class Summary:
     failure: str = ""
     """Error of the last of them."""
     origin: str = ""
-    """What was taken from a file of telemetry, in words."""
+    """Description of the values taken from a file of telemetry."""
 
     def add(self, slopes: Slopes) -> None:
         """Count the flags of a block."""
@@ -263,7 +263,7 @@ def _check_output(output: str | Path, frames: Sequence[str | Path]) -> None:
 
 
 def _version(path: Path) -> str:
-    """What changes when somebody writes to a file of frames between two calls."""
+    """Return values that change when a file of frames is written to."""
     status = path.stat()
     return "" if path.is_dir() else f"{status.st_size} {status.st_mtime_ns}"
 
@@ -276,7 +276,7 @@ def _attributes(
     key: str | None,
     unit: str,
 ) -> dict[str, Any]:
-    """What the output says about its origin; the fingerprint tells whether a run may be continued."""
+    """Return the attributes of the output; the fingerprint decides whether a run may be continued."""
     text = configuration.to_text(pipeline.layout, pipeline.settings, pipeline.calibration)
     paths = [str(Path(path).resolve()) for path in frames]
     state = hashlib.sha256()
@@ -307,7 +307,7 @@ def _attributes(
 
 
 def _files_of_the_spot(configuration_file: str | Path) -> dict[str, str]:
-    """Where PSF and score are kept, for a report: a file of their own, or the configuration itself."""
+    """Return the files of PSF and score, for a report: their own, or the configuration."""
     path = Path(configuration_file).resolve()
     if not path.exists():  # everything was in a file of telemetry
         return {}

@@ -24,7 +24,7 @@ _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
 _SAME_POSITION_PX = 0.02
 """Recomputed positions differ by less, whatever processor computed the stored ones."""
 _SAID_FIRST = ("calibration", "PSF", "score")
-"""Reasons why the frame is not drawn that are said at the top of the page as well."""
+"""Reasons for not drawing the frame that also stand at the top of the page."""
 
 
 def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path] | None = None) -> str:
@@ -192,7 +192,7 @@ def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -
 
 
 def _disagreement(store: StoredRun, arm: MeasuredSlopes, frame: NDArray[Any], number: int) -> list[str]:
-    """Say so when the example frame, measured again, gives other slopes than are stored."""
+    """Warn if the example frame, measured again, gives other slopes than those stored."""
     slopes = store.pipeline(reference=store.stored.attributes.get("reference"))(frame)
     both = slopes.valid & arm.valid[number]
     again = np.stack([slopes.x, slopes.y])[:, both]

@@ -50,7 +50,7 @@ class ReportInputs:
     summaries: Sequence[SlopesSummary]
     jitters: Sequence[Jitter]
     valid: Sequence[NDArray[np.bool_]]
-    """Which measurements of each arm are compared: those that are valid in every arm of the same frames."""
+    """Mask of the compared measurements of each method: those valid in every method of the same frames."""
     comparison: Comparison
 
 

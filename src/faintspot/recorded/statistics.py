@@ -97,7 +97,7 @@ class MeasuredSlopes:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Which measurements are valid."""
+        """Mask of valid measurements."""
         return (self.flags & int(INVALID)) == 0  # type: ignore[no-any-return]
 
     @property
@@ -154,7 +154,7 @@ class Jitter:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Where there were at least two frames."""
+        """Mask of sub-apertures with at least two frames."""
         return self.n_frames >= 2
 
 

@@ -40,7 +40,7 @@ class StoredRun:
     psf: PSF | None = None
     score: Score | None = None
     lost: list[str] = field(default_factory=list)
-    """What a pipeline may lack: a PSF or a score whose file is gone."""
+    """Optional parts of a pipeline: a PSF or a score, whose file may be missing."""
 
     @property
     def estimator(self) -> Estimator | None:
@@ -135,7 +135,7 @@ def _of_the_spot(
     load: Callable[[str], _Part],
     load_named: Callable[[Path, dict[str, dict[str, Any]]], _Part | None],
 ) -> _Part | None:
-    """Read the PSF or the score of the run from where it was; what is gone is said when it is needed."""
+    """Read the PSF or the score of the run; a missing file is reported when it is needed."""
     attributes = store.stored.attributes
     file, original = (str(attributes.get(key, "")) for key in (f"{name}_file", "configuration_file"))
     try:

@@ -23,7 +23,7 @@ class Timing:
     """When frames came and how long they took."""
 
     rate_hz: float
-    """Of the camera: one over the median interval between frames of consecutive numbers; NaN without."""
+    """Frame rate: one over the median interval between consecutive frames; NaN without any."""
     longest_interval_s: float
     """Between consecutive numbers."""
     latency_s: Floats

@@ -25,7 +25,7 @@ _DEVIATION_FLOOR = 0.02  # of the peak: deviations from the product that wings m
 
 
 class Form(NamedTuple):
-    """How freely a PSF may follow the data."""
+    """Regularisation of a PSF fit."""
 
     rotated: bool
     """Whether the product's axes are the spot's own; else the pixels'."""
@@ -85,7 +85,7 @@ def held_out_loss(sums: Sums, fit: Fit) -> float:
 def choose_form(halves: Sequence[tuple[Sums, Sums]], n_spots: float, radius_px: float) -> Form:
     """Return the form whose fit to one half of the spots predicts the other half best.
 
-    A product is preferred, as it is faster to measure spots with, unless the flux that it leaves out stands
+    A product is preferred, because measuring with it is faster, unless the flux that it leaves out stands
     out of a single spot's noise: being point-symmetric it moves no position by itself, and on real spots the
     slope error was the same with and without it even where it stood out more than that.
     """

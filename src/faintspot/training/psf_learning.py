@@ -55,13 +55,13 @@ class LearntPSF:
     background_e: NDArray[np.float64]
     """Constant flux left in the images, electrons per pixel, for each PSF."""
     positions: NDArray[np.float64]
-    """Of every spot, (n, 2): x and y, px from the image's centre."""
+    """Positions of the spots, (n, 2): x and y, px from the image's centre."""
     flux_e: NDArray[np.float64]
-    """Of every spot, (n,)."""
+    """Fluxes of the spots, (n,)."""
     standard_error_px: NDArray[np.float64]
-    """Of the positions, (n, 2)."""
+    """Standard errors of the positions, (n, 2)."""
     forms: tuple[Form, ...]
-    """How freely the PSFs follow the data, for each batch of PSFs: chosen by what predicts held-out spots."""
+    """Regularisation of each batch of PSFs, chosen by how well it predicts held-out spots."""
 
 
 def learn_psf(
@@ -206,7 +206,7 @@ def learn_psf_from_images(
 
 
 def _within(options: LearningOptions, search_range_px: float | None) -> LearningOptions:
-    """Limit how far from the image's centre spots are sought."""
+    """Return the largest distance from the image's centre at which spots are looked for."""
     if search_range_px is None:
         return options
     search = number_between("search_range_px", search_range_px, 0.0, low_open=True)

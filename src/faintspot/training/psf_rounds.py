@@ -31,7 +31,7 @@ _NARROW, _HOPELESS = 0.8, 0.97  # mean resultant length of the phases: spread of
 
 @dataclass(frozen=True)
 class LearningOptions:
-    """How PSFs are learnt; see `faintspot.training.psf_learning`."""
+    """Options of PSF learning; see `faintspot.training.psf_learning`."""
 
     radius_px: int
     oversampling: int
@@ -150,7 +150,7 @@ def refitted(
     options: LearningOptions,
     rng: np.random.Generator,
 ) -> State:
-    """Return the state with the PSFs fitted to the sums; a PSF with too few spots stays as it is."""
+    """Return the state with the PSFs fitted to the sums; a PSF with too few spots stays unchanged."""
     known = count >= FEWEST_SPOTS
     form = state.form
     if choose and known.any():
@@ -175,7 +175,7 @@ def psf_of(samples: Floats, oversampling: int) -> PSF:
 def check_phases(index: NDArray[np.int64], found: Registered) -> None:
     """Warn when spots lie at too few sub-pixel phases for the PSF between the pixels to be seen.
 
-    Their spread is told from the phases' mean resultant length, with the part of it taken out that errors of
+    Their spread follows from the phases' mean resultant length, with the part of it taken out that errors of
     the registration explain.
 
     Raises

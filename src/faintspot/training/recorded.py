@@ -31,7 +31,7 @@ _MOST_SPLIT_IMAGES = 100_000  # of a kind and class beyond which there is one dr
 
 @dataclass(frozen=True)
 class _Splitter:
-    """How images are split into two parts whose noises are not correlated."""
+    """Splitter of images into two parts with uncorrelated noise."""
 
     fraction: float
     read_variance: float
@@ -88,7 +88,7 @@ class _Splitter:
         return variance
 
     def near(self, shape: tuple[int, ...], reference: Floats) -> NDArray[np.bool_]:
-        """Which pixels count in the centre of gravity: (n, ny, nx)."""
+        """Return the mask of pixels that count in the centre of gravity: (n, ny, nx)."""
         x, y = _distances(shape, reference)
         near: NDArray[np.bool_] = np.hypot(x, y) <= self.target_radius_px
         return near

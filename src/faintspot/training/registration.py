@@ -1,4 +1,4 @@
-"""Where spots are, by maximum likelihood with a given PSF, thousands at a time: what learning a PSF needs."""
+"""Maximum-likelihood positions of thousands of spots at a time with a given PSF, for learning PSFs."""
 
 from __future__ import annotations
 

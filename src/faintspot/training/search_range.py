@@ -1,4 +1,4 @@
-"""How far spots are from their references, estimated from images too faint to measure each spot."""
+"""Estimate of spot displacements from images too faint to measure each spot."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class _Kind:
     angle_deg: float
 
     def symmetry(self) -> str:
-        """Which symmetry of `SplineTables` the spots have."""
+        """Symmetry of the spots, one of `SplineTables`."""
         if self.angle_deg % 90 and (self.elongation > 1 or self.profile == "diffraction"):
             return "point"
         return "round" if self.elongation == 1 and self.shape[0] == self.shape[1] else "aligned"
@@ -103,7 +103,7 @@ class _Kind:
 
 @dataclass(frozen=True)
 class _Training:
-    """What all kinds and classes are trained with."""
+    """Training parameters shared by all kinds and classes."""
 
     camera: Detector
     edges: Floats
@@ -316,7 +316,7 @@ def _turbulence(d_over_r0: Any, profile: str, spot_shapes: Floats) -> float:
 
 
 def _start(start: str | None, kinds: list[_Kind], position_range_px: float) -> dict[str, Any]:
-    """Where the first pass starts, and the smoothing for the peak (of the narrowest spots)."""
+    """Start of the first pass, and the smoothing for the peak (of the narrowest spots)."""
     width = 2 * min(kind.size for kind in kinds)
     near = position_range_px <= _FARTHEST_REFERENCE_START * width and not any(k.natural_tilt for k in kinds)
     chosen = ("reference" if near else "peak") if start is None else one_of("start", start, STARTS)

@@ -27,7 +27,7 @@ _LIT = 0.1  # of the peak
 
 @dataclass(frozen=True)
 class SpotTransfer:
-    """What `measure_on_spots` found; each error is one standard error."""
+    """Result of `measure_on_spots`; each error is one standard error."""
 
     gain_e_per_adu: float
     gain_e_per_adu_error: float
@@ -36,7 +36,7 @@ class SpotTransfer:
     background_adu: float
     """Constant level left in the images."""
     problem: str | None
-    """What keeps the gain from being believed, if anything."""
+    """Reason why the gain is not reliable, or None."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class _Noise:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """What fits to the images leave, (n, ny, nx) each."""
+    """Residuals of fits to the images, (n, ny, nx) each."""
 
     left: Floats
-    """What is left, divided by the root of `share`."""
+    """Residuals, divided by the root of `share`."""
     share: Floats
-    """Of a pixel's variance that the fit leaves."""
+    """Fraction of a pixel's variance that the fit leaves."""
     flux: Floats
     neighbours: Floats
     """(n, ny, nx - 1) product of neighbouring pixels of `left`, less what the fit makes of white noise."""
@@ -71,7 +71,7 @@ class _Residuals:
 def measure_on_spots(
     images: ArrayLike, *, em_gain: float = 1.0, rng: np.random.Generator | None = None
 ) -> SpotTransfer:
-    """Measure gain and read noise on images of single spots, wherever each of them is.
+    """Measure gain and read noise on images of single spots at any positions.
 
     A PSF is learnt from all images and fitted to each, with position, flux and background of its own. What
     is left has, pixel by pixel, the variance read noise^2 + light / gain, less what the fit takes away, so
@@ -80,7 +80,7 @@ def measure_on_spots(
     Parameters
     ----------
     images : (n, ny, nx) array, ADU
-        Less the dark level, as far as it is known.
+        Images less the known dark level.
     em_gain : float
         Mean gain of the multiplication register, 1 without.
     rng : numpy.random.Generator, optional
@@ -175,7 +175,7 @@ def _line(residuals: _Residuals, noise: _Noise) -> _Noise:
 
 
 def _problem(residuals: _Residuals, noise: _Noise, error: float) -> str | None:
-    """Say what keeps the gain from being believed, or None.
+    """Return the reason why the gain is not reliable, or None.
 
     Noise differs from pixel to pixel; what is left of a spot of another shape is alike in neighbours.
     """
@@ -192,7 +192,7 @@ def _problem(residuals: _Residuals, noise: _Noise, error: float) -> str | None:
 
 
 def _illuminated(flux: Floats) -> NDArray[np.bool_]:
-    """Which pixels have a good part of the peak's flux."""
+    """Return the mask of pixels with a good part of the peak's flux."""
     return flux >= _LIT * flux.max(axis=(1, 2), keepdims=True)  # type: ignore[no-any-return]
 
 
