@@ -167,7 +167,7 @@ def test_foreign_directory_is_never_replaced(folder: Path, run: Commands) -> Non
     np.save("a.npy", simulated())
     (folder / "s.zarr").mkdir()
     (folder / "s.zarr" / "precious").touch()
-    run.refused("slopes", "a.npy", "-o", "s.zarr", "--overwrite", naming=("s.zarr", "no slopes"))
+    run.refused("slopes", "a.npy", "-o", "s.zarr", "--overwrite", naming=("s.zarr", "expected slopes"))
     assert (folder / "s.zarr" / "precious").exists()
 
 

@@ -266,7 +266,7 @@ def test_without_the_token_one_may_only_watch(open_page: Any, server: LiveServer
     assert page.locator("#controls").is_hidden()
     page.locator("#token").fill("guess")
     page.locator("#token").press("Enter")
-    page.locator("#token-error").filter(has_text="not the token").wait_for()
+    page.locator("#token-error").filter(has_text="wrong token").wait_for()
     assert page.locator("#controls").is_hidden()
     page.locator("#token").fill(server.access.token)
     page.locator("#token").press("Enter")
