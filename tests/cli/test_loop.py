@@ -23,7 +23,6 @@ def _small_experiments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(faintspot.cli._COMMANDS, "loop", "")
     monkeypatch.setattr(interleaved, "QUICK_PLAN", PLAN)
     monkeypatch.setattr(magnitude, "QUICK", SEARCH)
-    monkeypatch.setattr(budget, "QUICK", SEARCH)
     terms = {name: budget.TERMS[name] for name in ("nothing", "slope error")}
     monkeypatch.setattr(budget, "TERMS", terms)
     monkeypatch.chdir(tmp_path)

@@ -155,7 +155,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, night: Path) -> None:
     made = records(0, 0)
     images = image_type(LAYOUT.frame_shape, N, LAYOUT.window)
     TelemetryStore(empty, made.dtype, images, {"layout": layout_values(LAYOUT), "arms": []})
-    with pytest.raises(InputError, match="expected frames"):
+    with pytest.raises(InputError, match="expected a recording with frames"):
         RecordingSource(empty)
 
 

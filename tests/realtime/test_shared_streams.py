@@ -202,7 +202,7 @@ def test_pyshmem_needs_libatomic_on_other_processors(
     assert pyshmem_module("publishing") is pyshmem
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     if library is None:
-        with pytest.raises(InputError, match="libatomic on aarch64, found none; install it"):
+        with pytest.raises(InputError, match="libatomic on aarch64, found none"):
             pyshmem_module("publishing")
     else:
         assert pyshmem_module("publishing") is pyshmem
