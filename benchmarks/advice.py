@@ -1,9 +1,9 @@
 """Does the loop's own figure of merit see what the science camera would?
 
-Two arms take turns in the simulated loop, which knows the truth. What `faintspot realtime advise --apply`
-would measure, the difference of the residual wavefronts' mean squares without the noise, is set beside the
-true difference, over all that the mirror, its modes and the sensor leave. The plain rms of the slopes is
-there for comparison: it rewards the arm that sees least.
+Two arms take turns in the simulated loop, which knows the truth. The difference of their residual wavefronts'
+mean squares without the noise, as `faintspot realtime advise` measures them, is set beside the true
+difference, over all that the mirror, its modes and the sensor leave. The plain rms of the slopes is there for
+comparison: it rewards the arm that sees least.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import Row, Table
-from faintspot.advice.centroid_gain import calibration_of_electrons, shifted_gain
+from faintspot.advice.centroid_gain import calibration_of_electrons, electrons_of, shifted_gain
+from faintspot.advice.loop_telemetry import LoopTelemetry
 from faintspot.advice.residual import residual_wavefront, wavefront_modes
-from faintspot.advice.simulated import frames_of_record, seen_in_record
-from faintspot.ao_loop import Arm, LoopConfiguration, load_loop, simulate_loop
+from faintspot.ao_loop import Arm, LoopConfiguration, LoopRecord, load_loop, simulate_loop
 from faintspot.ao_loop.calibration import flat_psf, reference_slopes
 from faintspot.ao_loop.camera import camera_calibration
 from faintspot.ao_loop.configuration import ARCSEC
 from faintspot.ao_loop.control import prior_std_px
-from faintspot.ao_loop.telescope_model import prepare
+from faintspot.ao_loop.telescope_model import TelescopeModel, prepare
+from faintspot.control.telemetry import without_prior
 from faintspot.experiments.statistics import paired_mean
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -44,6 +45,38 @@ def _arms(photons: float, width_px: float) -> dict[str, Arm]:
     }
 
 
+def seen_in_record(record: LoopRecord, arms: list[Arm], number: int) -> tuple[LoopTelemetry, np.ndarray]:
+    """Return what the slopes of an arm's scored frames show, and the numbers of these frames."""
+    held = record.commands.astype(np.float64) @ record.interaction_matrix.T
+    later, arm = record.delay_frames - 1, arms[number]
+    expected = np.zeros_like(held)
+    if arm.predict_prior:
+        expected[: len(held) - later] = held[: len(held) - later] - held[later:]
+    rows = np.flatnonzero(
+        record.scored & (record.arm == number) & (np.arange(record.frames) < record.frames - later)
+    )
+    divisor = record.centroid_gain[number] if record.corrected[number] else 1.0
+    slopes, error = (each[rows] / divisor for each in (record.slopes_px, record.standard_error_px))
+    prior = prior_std_px(arm, held.shape[1])
+    alone, _, trust = without_prior(
+        slopes.astype(np.float64), error.astype(np.float64), expected[rows], prior
+    )
+    segment = np.concatenate([[0], np.cumsum(np.diff(rows) != 1)])
+    return LoopTelemetry(segment, alone, trust, held[rows], record.frame_rate_hz), rows
+
+
+def frames_of_record(record: LoopRecord, numbers: list[int]) -> np.ndarray:
+    """Return frames of a simulated loop in electrons, simulated again."""
+    configuration = LoopConfiguration.from_text(record.configuration)
+    telescope_model = TelescopeModel(configuration, record.seed, record.realisation)
+    frames = []
+    for number in numbers:
+        time_s = (number + 0.5) / record.frame_rate_hz
+        _, seen = telescope_model.wavefronts(time_s, record.commands[number].astype(np.float64))
+        frames.append(telescope_model.frame(number, seen))
+    return electrons_of(np.stack(frames), camera_calibration(configuration))
+
+
 def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) -> np.ndarray:
     """Return by how much the second arm has more: the loop's figure, the truth, both nm^2, slopes' px^2."""
     schedule = np.arange(FRAMES) // TURN % 2
@@ -55,7 +88,7 @@ def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) 
         "pixel_scale_arcsec": configuration.pixel_scale_rad / ARCSEC,
     }
     modes, _ = wavefront_modes(replace(sensor.layout, **sizes))
-    gains = []
+    means = []
     for number, arm in enumerate(pair):
         own = [k for k in range(TURN, FRAMES, IMAGES_EVERY) if schedule[k] == number]
         pipeline = SlopePipeline(
@@ -69,14 +102,12 @@ def merits(configuration: LoopConfiguration, pair: list[Arm], realisation: int) 
         prior = prior_std_px(arm, 2 * len(sensor.layout))
         found = shifted_gain(pipeline, frames_of_record(record, own), prior)
         assert found is not None
-        gains.append(found.value)
-    seen = seen_in_record(record, pair)
-    left = residual_wavefront(seen, modes, gains)
-    scored = np.isfinite(left)
-    frames = np.arange(FRAMES)[record.scored][: len(seen)]
-    values = left, record.residual_nm[frames] ** 2, np.square(record.slopes_px[frames]).mean(axis=1)
-    first, second = (scored & (seen.arm == number) for number in (0, 1))
-    return np.array([value[second].mean() - value[first].mean() for value in values])
+        seen, frames = seen_in_record(record, pair, number)
+        left = residual_wavefront(seen, modes, found.value)
+        scored = np.isfinite(left)
+        values = left, record.residual_nm[frames] ** 2, np.square(record.slopes_px[frames]).mean(axis=1)
+        means.append([value[scored].mean() for value in values])
+    return np.subtract(means[1], means[0])
 
 
 def run() -> list[Table]:

@@ -14,19 +14,19 @@ RATE_HZ = 200.0
 
 
 def seen_with_truth(
-    noise_px: tuple[float, float] = (0.1, 0.1),
-    extra_px: tuple[float, float] = (0.0, 0.0),
-    gains: tuple[float, float] = (1.0, 1.0),
+    noise_px: float = 0.1,
+    extra_px: float = 0.0,
+    gain: float = 1.0,
     frames: int = 2400,
-    turn: int = 60,
+    segment: int = 60,
     vibration: tuple[float, float] = (0.0, 0.0),
     seed: int = 1,
 ) -> tuple[LoopTelemetry, np.ndarray]:
-    """Return two arms in turn and the true residual slopes, px.
+    """Return telemetry and the true residual slopes, px.
 
-    The air is a sum of slow waves, the mirror follows it by two frames; arm a has the noise `noise_px[a]`, a
-    residual of `extra_px[a]` beside, which its mirror makes, and shows `gains[a]` of what there is. The
-    vibration has an amplitude in px and a frequency in Hz, along x.
+    The atmosphere is a sum of slow waves, the mirror follows it by two frames and adds a residual of
+    `extra_px`; the slopes have noise and a centroid gain. The vibration along x has an amplitude in px and a
+    frequency in Hz.
     """
     rng = np.random.default_rng(seed)
     m, time = 2 * len(LAYOUT), np.arange(frames) / RATE_HZ
@@ -35,17 +35,12 @@ def seen_with_truth(
     atmosphere = np.sin(2 * np.pi * time[:, None, None] * frequency + phase).sum(axis=1) * 0.2
     amplitude, at = vibration
     atmosphere[:, : m // 2] += (amplitude * np.sin(2 * np.pi * at * time))[:, None]
-    arm = np.arange(frames) // turn % 2
     held = -np.vstack([np.zeros((2, m)), atmosphere[:-2]])
-    held += np.array(extra_px)[arm][:, None] * rng.standard_normal((frames, m))
+    held += extra_px * rng.standard_normal((frames, m))
     residual = atmosphere + held
-    noise = np.array(noise_px)[arm][:, None]
-    measured = np.array(gains)[arm][:, None] * residual + noise * rng.standard_normal((frames, m))
-    variance = np.broadcast_to(noise**2, measured.shape)
-    seen = LoopTelemetry(
-        arm, np.arange(frames) // turn, measured, variance, np.ones_like(measured), held, RATE_HZ
-    )
-    return seen, residual
+    measured = gain * residual + noise_px * rng.standard_normal((frames, m))
+    segments = np.arange(frames) // segment
+    return LoopTelemetry(segments, measured, np.ones_like(measured), held, RATE_HZ), residual
 
 
 def recording(
@@ -59,7 +54,7 @@ def recording(
     when = (np.arange(frames) / RATE_HZ * 1e9).astype(np.int64)
     values: dict[str, Any] = {
         "frame": np.arange(frames),
-        "arm": seen.arm,
+        "arm": np.zeros(frames, np.int64),
         "change": np.zeros(frames, np.int64),
         "last_row_time_ns": when,
         "published_time_ns": when + 1000,

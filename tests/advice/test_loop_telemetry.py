@@ -1,4 +1,4 @@
-"""What a loop has seen: of telemetry with gaps, arms, priors and open loops, the frames that can be used."""
+"""Frames of telemetry with gaps, priors and open loops that can be used."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def control(**options: Any) -> Control:
     return Control(MATRIX, None, ControlOptions(delay_frames=2, **options))
 
 
-def test_slopes_commands_and_turns() -> None:
+def test_slopes_and_commands() -> None:
     found = seen_in_telemetry(recording(SEEN, SENT, 2), control(centroid_gain=0.5))
     assert len(found) == 398
     np.testing.assert_allclose(found.slopes_px, 2 * SEEN.slopes_px[2:], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found.held_px, SENT[:-2] @ MATRIX.T, rtol=1e-5, atol=1e-5)
-    np.testing.assert_array_equal(found.turn, SEEN.turn[2:])
+    assert not found.segment.any()
     assert found.rate_hz == pytest.approx(RATE_HZ, rel=1e-6)
 
 
@@ -41,7 +41,7 @@ def test_lost_frames_and_an_open_loop_are_left_out() -> None:
     loop[100:103] = 1
     found = seen_in_telemetry(recording(SEEN, SENT, 2, frame=frame, loop=loop), control())
     assert len(found) == 400 - 2 - 5 - 2
-    assert len(np.unique(found.turn)) == len(np.unique(SEEN.turn)) + 2
+    assert len(np.unique(found.segment)) == 3
 
 
 def test_a_prior_is_taken_out_around_what_was_expected() -> None:
@@ -49,16 +49,10 @@ def test_a_prior_is_taken_out_around_what_was_expected() -> None:
     prior = np.full(M, 0.2)
     predicted = control(prediction="controller")
     expected = (SENT[:-2] - SENT[1:-1]) @ MATRIX.T
-    found = seen_in_telemetry(recording(SEEN, SENT, 2), predicted, [prior, None])
-    first = SEEN.arm[2:] == 0
-    np.testing.assert_allclose(
-        found.slopes_px[first],
-        (expected + (SEEN.slopes_px[2:] - expected) * 4 / 3)[first],
-        rtol=1e-4,
-        atol=1e-4,
-    )
-    np.testing.assert_allclose(found.trust[first], 0.75, rtol=1e-5)
-    np.testing.assert_allclose(found.slopes_px[~first], SEEN.slopes_px[2:][~first], rtol=1e-5, atol=1e-6)
+    found = seen_in_telemetry(recording(SEEN, SENT, 2), predicted, prior)
+    alone = expected + (SEEN.slopes_px[2:] - expected) * 4 / 3
+    np.testing.assert_allclose(found.slopes_px, alone, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(found.trust, 0.75, rtol=1e-5)
 
 
 def test_refusals() -> None:
@@ -73,4 +67,4 @@ def test_refusals() -> None:
     with pytest.raises(InputError, match="expected standard errors"):
         seen_in_telemetry(replace(whole, standard_error_x=endless, standard_error_y=endless), control())
     with pytest.raises(InputError, match="expected an integrator"):
-        seen_in_telemetry(whole, control(prediction="stream"), [np.full(M, 0.2)])
+        seen_in_telemetry(whole, control(prediction="stream"), np.full(M, 0.2))

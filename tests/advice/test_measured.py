@@ -34,9 +34,9 @@ def test_slopes_tell_r0_and_wind() -> None:
     Two seconds hold few independent wavefronts: r0 to 25 %. Winds three times as fast look so to a factor.
     """
     pytest.importorskip("hcipy")
+    from benchmarks.advice import seen_in_record
     from tests.ao_loop.loop_cases import faint, plain
 
-    from faintspot.advice.simulated import seen_in_record
     from faintspot.ao_loop import simulate_loop
     from faintspot.ao_loop.telescope_model import prepare
 
@@ -45,7 +45,7 @@ def test_slopes_tell_r0_and_wind() -> None:
     speeds = []
     for factor in (1 / 3, 1.0):
         blown = run.replace("atmosphere", wind_speed_m_per_s=tuple(factor * each for each in winds))
-        seen = seen_in_record(simulate_loop(blown, [plain()]), [plain()])
+        seen, _ = seen_in_record(simulate_loop(blown, [plain()]), [plain()], 0)
         layout = replace(
             prepare(run).sensor.layout,
             subaperture_m=run.subaperture_m,
@@ -65,11 +65,11 @@ def test_slopes_tell_r0_and_wind() -> None:
 
 def test_vibrations_stand_out_or_do_not() -> None:
     """Along x, 0.1 px at 40 Hz: rms 0.071; the resolution is 0.4 Hz."""
-    calm, _ = seen_with_truth(frames=2400, turn=2400)
+    calm, _ = seen_with_truth(frames=2400, segment=2400)
     none = [each for each in of_atmosphere(calm, LAYOUT) if each.name.startswith("vibration")]
     assert [each.value for each in none] == [0.0]
     assert "none with an rms above" in none[0].in_words()
-    shaken, _ = seen_with_truth(frames=2400, turn=2400, vibration=(0.1, 40.0))
+    shaken, _ = seen_with_truth(frames=2400, segment=2400, vibration=(0.1, 40.0))
     found = [each for each in of_atmosphere(shaken, LAYOUT) if each.name == "vibration"]
     assert len(found) == 1
     assert found[0].value == pytest.approx(40.0, abs=0.4)

@@ -150,8 +150,8 @@ def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
         raise InputError(f"{loop.name}: expected frames of a closed loop, got none")
     if len(arms) != 1:
         raise InputError(f"telemetry: expected a single method, found {len(arms)} interleaved")
-    layout, number = loop.layout, int(arms[0]) + 1
-    seen = seen_in_telemetry(telemetry, loop.control, [prior_std_px(settings, layout)] * number)
+    layout = loop.layout
+    seen = seen_in_telemetry(telemetry, loop.control, prior_std_px(settings, layout))
     frames = electrons_of(telemetry.raw, loop.calibration)
     shifted = loop.centroid_gain(settings, frames)
     known = of_images(frames, layout, loop.calibration)
@@ -159,10 +159,10 @@ def advise(loop: Loop, telemetry: Telemetry, settings: Settings) -> Advice:
     if shifted is not None:
         remark = "relative to the gain that the control corrects"
         gain_known = Measured("centroid gain", "", shifted.value, shifted.standard_error, remark)
-    gains = [shifted.value if shifted is not None and shifted.value > 0 else 1.0] * number
+    gain = shifted.value if shifted is not None and shifted.value > 0 else 1.0
     modes, unit = wavefront_modes(layout)
-    left = residual_wavefront(seen, modes, gains)
-    return Advice(len(seen), [*known, gain_known, *of_atmosphere(seen, layout, gains), _residual(left, unit)])
+    left = residual_wavefront(seen, modes, gain)
+    return Advice(len(seen), [*known, gain_known, *of_atmosphere(seen, layout, gain), _residual(left, unit)])
 
 
 def recorded_settings(telemetry: Telemetry, gain: float) -> tuple[Telemetry, Settings]:

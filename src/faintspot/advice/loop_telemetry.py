@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,78 +23,56 @@ FEWEST_FRAMES = 200
 
 @dataclass(frozen=True, eq=False)
 class LoopTelemetry:
-    """Consecutive frames of a closed loop, with m slopes; configurations may be interleaved."""
+    """Frames of a closed loop with one configuration and m slopes."""
 
-    arm: NDArray[np.int64]
-    """Number of the configuration, (frames,)."""
-    turn: NDArray[np.int64]
-    """Number of the turn, (frames,): equal for consecutive frames of one configuration without a gap."""
+    segment: NDArray[np.int64]
+    """Number of the segment, (frames,): equal for consecutive frames without a gap."""
     slopes_px: Floats
-    """Slopes of the frame alone, (frames, m), without the estimator's prior, not divided by centroid gains;
-    any finite number if not measured."""
-    variance_px2: Floats
-    """Noise variance of the slopes from the estimator, (frames, m); infinite if not measured."""
+    """Slopes of the frame alone, (frames, m), without the estimator's prior, not divided by the centroid
+    gain; any finite number if not measured."""
     trust: Floats
-    """Weight of each slope, (frames, m); see `faintspot.control.telemetry.Telemetry`."""
+    """Weight of each slope, (frames, m); see `faintspot.control.telemetry.OpenLoopTelemetry`."""
     held_px: Floats
     """Contribution of the mirror to the slopes, (frames, m)."""
     rate_hz: float
 
     def __len__(self) -> int:
-        return len(self.arm)
+        return len(self.segment)
 
     @property
     def since(self) -> NDArray[np.int64]:
-        """Frames since the turn began, (frames,)."""
-        starts = np.flatnonzero(np.concatenate([[True], np.diff(self.turn) != 0]))
+        """Frames since the segment began, (frames,)."""
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(self.segment) != 0]))
         return np.arange(len(self)) - np.repeat(starts, np.diff(np.append(starts, len(self))))
 
-    def chosen(self, rows: NDArray[np.bool_]) -> LoopTelemetry:
-        """Return selected frames; frames separated by others belong to different turns."""
-        gaps = np.flatnonzero(rows[1:] & ~rows[:-1]) + 1
-        turn = self.turn + np.searchsorted(gaps, np.arange(len(self)), "right") * (self.turn.max() + 1)
-        return LoopTelemetry(
-            self.arm[rows],
-            turn[rows],
-            self.slopes_px[rows],
-            self.variance_px2[rows],
-            self.trust[rows],
-            self.held_px[rows],
-            self.rate_hz,
-        )
-
-    def weighted(self, gains: Sequence[float] | None = None) -> tuple[Floats, Floats]:
-        """Return residual and open-loop slopes, (frames, m) px, each with a weight (mean 1 per method).
+    def weighted(self, gain: float = 1.0) -> tuple[Floats, Floats]:
+        """Return residual and open-loop slopes, (frames, m) px, each with a weight of mean 1.
 
         Parameters
         ----------
-        gains : sequence of float, optional
-            Centroid gain of each configuration. Default: 1.
+        gain : float
+            Centroid gain.
         """
-        residual, open_loop = np.empty_like(self.slopes_px), np.empty_like(self.slopes_px)
-        for arm in np.unique(self.arm):
-            rows = self.arm == arm
-            trust = np.minimum(self.trust[rows], _EVEN_TRUST)
-            mean = trust.mean(axis=0)
-            weight = trust / np.where(mean > 0, mean, 1.0)
-            gain = 1.0 if gains is None else gains[arm]
-            residual[rows] = weight * self.slopes_px[rows] / gain
-            open_loop[rows] = residual[rows] - weight * self.held_px[rows]
-        return residual, open_loop
+        trust = np.minimum(self.trust, _EVEN_TRUST)
+        mean = trust.mean(axis=0)
+        weight = trust / np.where(mean > 0, mean, 1.0)
+        residual = weight * self.slopes_px / gain
+        return residual, residual - weight * self.held_px
 
 
 def seen_in_telemetry(
-    telemetry: Telemetry, control: Control, priors_px: Sequence[Floats | None] = (None,)
+    telemetry: Telemetry, control: Control, prior_px: Floats | None = None
 ) -> LoopTelemetry:
     """Return the slopes of an engine's closed loop.
 
     Parameters
     ----------
     telemetry : faintspot.io.Telemetry
+        Telemetry of a single configuration.
     control : Control
         Control of the engine: matrix, delay and centroid gain.
-    priors_px : sequence of (m,) arrays
-        Width of the prior of each configuration's estimator, by its number; None: no prior.
+    prior_px : (m,) array, optional
+        Width of the estimator's prior. Default: no prior.
 
     Raises
     ------
@@ -104,7 +81,7 @@ def seen_in_telemetry(
         estimator whose prior had a mean that is no longer known.
     """
     check_commands(telemetry, control, "telemetry")
-    predicted = control.prediction != NONE and any(prior is not None for prior in priors_px)
+    predicted = control.prediction != NONE and prior_px is not None
     if predicted and (control.options.controller not in (INTEGRATOR, MODAL) or control.prediction == STREAM):
         raise InputError(
             "telemetry: expected an integrator, because the predictions that other controllers or programs "
@@ -114,12 +91,11 @@ def seen_in_telemetry(
     if len(rows) < FEWEST_FRAMES:
         raise InputError(f"telemetry: expected {FEWEST_FRAMES} frames of a closed loop, got {len(rows)}")
     slopes, error, held, expected = recorded_slopes(telemetry, control, rows, predicted, "telemetry")
-    frame, arm = telemetry.frame[rows], telemetry.arm[rows]
-    alone = without_priors(slopes, error, expected, arm, priors_px)
-    times = telemetry.last_row_time_ns[rows]
+    alone, _, trust = without_prior(slopes, error, expected, prior_px)
+    frame, times = telemetry.frame[rows], telemetry.last_row_time_ns[rows]
     rate = (frame[-1] - frame[0]) / max(float(times[-1] - times[0]) / 1e9, 1e-9)
-    apart = (np.diff(arm) != 0) | (np.diff(frame) != 1)
-    return LoopTelemetry(arm, np.concatenate([[0], np.cumsum(apart)]), *alone, held, float(rate))
+    segment = np.concatenate([[0], np.cumsum(np.diff(frame) != 1)])
+    return LoopTelemetry(segment, alone, trust, held, float(rate))
 
 
 def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
@@ -129,21 +105,3 @@ def _usable(telemetry: Telemetry, delay: int) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
     whole = (frame[delay:] - frame[:-delay] == delay) & closed[delay:] & closed[:-delay]
     return np.flatnonzero(whole) + delay
-
-
-def without_priors(
-    slopes: Floats,
-    error: Floats,
-    expected: Floats,
-    arm: NDArray[np.int64],
-    priors_px: Sequence[Floats | None],
-) -> tuple[Floats, Floats, Floats]:
-    """Return slopes without the prior of each configuration's estimator, their variances, and trust."""
-    found = np.empty_like(slopes), np.empty_like(slopes), np.empty_like(slopes)
-    for number in np.unique(arm):
-        rows = arm == number
-        prior = priors_px[number] if number < len(priors_px) else None
-        parts = without_prior(slopes[rows], error[rows], expected[rows], prior)
-        for whole, part in zip(found, parts, strict=True):
-            whole[rows] = part
-    return found

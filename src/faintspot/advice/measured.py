@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,11 +93,9 @@ def of_images(frames_e: NDArray[np.float32], layout: Layout, calibration: Calibr
     return [*found, Measured(*width, float(psf.fwhm_px.mean()))]
 
 
-def of_atmosphere(
-    seen: LoopTelemetry, layout: Layout, gains: Sequence[float] | None = None
-) -> list[Measured]:
+def of_atmosphere(seen: LoopTelemetry, layout: Layout, gain: float = 1.0) -> list[Measured]:
     """Return r0, the wind and vibrations, from slopes without the mirror's contribution."""
-    _, atmosphere = seen.weighted(gains)
+    _, atmosphere = seen.weighted(gain)
     r0, wind = ("r0 at 500 nm", "m"), ("wind", "m/s")
     side = layout.subaperture_m
     if side is None and layout.diameter_m is not None:
@@ -135,7 +132,7 @@ def _r0(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout,
             subaperture_m=side,
             pixel_scale_rad=(layout.pixel_scale_arcsec or 1.0) * ARCSEC,
             outer_scale_m=OUTER_SCALE_M,
-            segment=seen.turn[rows],
+            segment=seen.segment[rows],
             static_px=atmosphere.mean(axis=0),
         ).r0_m
 
@@ -161,7 +158,7 @@ def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layou
     theory = np.array([_without_tilt(anywhere.covariance_px2(each)) for each in metres]) / still
 
     def speed(rows: NDArray[np.int64]) -> float:
-        slopes, turn = _without_mean(atmosphere[rows] - atmosphere.mean(axis=0)), seen.turn[rows]
+        slopes, turn = _without_mean(atmosphere[rows] - atmosphere.mean(axis=0)), seen.segment[rows]
 
         def lagged(lag: int) -> float:
             together = turn[lag:] == turn[:-lag]
@@ -201,7 +198,7 @@ def _vibrations(seen: LoopTelemetry, atmosphere: Floats) -> list[Measured]:
     from scipy.stats import chi2
 
     name, unit = "vibrations", "Hz"
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(seen.turn) != 0, [True]]))
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(seen.segment) != 0, [True]]))
     longest = int(np.argmax(np.diff(starts)))
     rows = slice(starts[longest], starts[longest + 1])
     length = rows.stop - rows.start

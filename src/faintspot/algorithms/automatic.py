@@ -19,7 +19,7 @@ the centre of the window; if the noise exceeds the range of positions, the image
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Required, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,17 +38,28 @@ _SMALLEST_VARIANCE = 1e-4  # e-^2, if there is neither read noise nor background
 _AREA_OF_SQUARED_FWHM = {"diffraction": 2.866, "gaussian": 2.25}
 
 
+class Conditions(TypedDict, total=False):
+    """Window, spot and camera, for which settings are computed."""
+
+    pixels: Required[ArrayLike]
+    """Number of pixels of the window (256 for 16 x 16), which is assumed to be square."""
+    spot_fwhm_px: Required[ArrayLike]
+    """Full width at half maximum of the optical spot (without the blur of the pixels) [px], at least 0.05;
+    for an elongated spot the geometric mean of both axes."""
+    elongation: ArrayLike
+    """Ratio of the widths along the long and the short axis, at least 1 [default: 1]."""
+    excess_noise: ArrayLike
+    """Factor on the variance of the photon noise: 2 for an EMCCD at high gain [default: 1]."""
+    background_e: ArrayLike
+    """Background per pixel [photo-electrons] [default: 0]; its mean is subtracted, its noise remains."""
+    position_range_px: ArrayLike
+    """Maximum distance of positions from the centre of the window on each axis [default: 1]."""
+    profile: str
+    """Spot with the wings of a square lenslet's sinc^2, "diffraction" (default), or without, "gaussian"."""
+
+
 def automatic_strength(
-    flux_e: ArrayLike,
-    read_noise_e: ArrayLike,
-    *,
-    pixels: ArrayLike,
-    spot_fwhm_px: ArrayLike,
-    elongation: ArrayLike = 1.0,
-    excess_noise: ArrayLike = 1.0,
-    background_e: ArrayLike = 0.0,
-    position_range_px: ArrayLike = 1.0,
-    profile: str = "diffraction",
+    flux_e: ArrayLike, read_noise_e: ArrayLike, **conditions: Unpack[Conditions]
 ) -> NDArray[np.float64]:
     """Return the strength of TV denoising (`noise_std`), e-; 0 where denoising does not help.
 
@@ -64,21 +75,8 @@ def automatic_strength(
         Photo-electrons of one spot within its window in one frame.
     read_noise_e : float or array
         Standard deviation of the read noise in photo-electrons (for an EMCCD: divided by its gain).
-    pixels : int or array
-        Number of pixels of the window (256 for 16 x 16), which is assumed to be square.
-    spot_fwhm_px : float or array
-        Full width at half maximum of the optical spot (without the blur of the pixels) [px], at least 0.05;
-        for an elongated spot the geometric mean of both axes.
-    elongation : float or array
-        Ratio of the widths along the long and the short axis, at least 1.
-    excess_noise : float or array
-        Factor on the variance of the photon noise: 2 for an EMCCD at high gain.
-    background_e : float or array
-        Background per pixel [photo-electrons], whose mean is subtracted and whose noise remains.
-    position_range_px : float or array
-        Maximum distance of positions from the centre of the window on each axis.
-    profile : {"diffraction", "gaussian"}
-        Spot with the wings of a square lenslet's sinc^2, or Gaussian spot without wings.
+    **conditions
+        Values of `Conditions`, of which `pixels` and `spot_fwhm_px` are required.
 
     Returns
     -------
@@ -95,17 +93,7 @@ def automatic_strength(
     Source: authors' Monte-Carlo study, docs/automatic.md; the form follows A. G. Basden et al. 2015 (MNRAS;
     arXiv:1503.06043), where the strength is the noise of the image.
     """
-    sensor = _sensor(
-        flux_e,
-        read_noise_e,
-        pixels,
-        spot_fwhm_px,
-        elongation,
-        excess_noise,
-        background_e,
-        position_range_px,
-        profile,
-    )
+    sensor = _sensor(flux_e, read_noise_e, **conditions)
     lost, off = _lost_and_off(sensor, KEPT["tv"])
     gain = STRENGTH.gaussian if sensor.gaussian else STRENGTH.diffraction
     wings = 0.0 if sensor.gaussian else STRENGTH.wings
@@ -125,16 +113,7 @@ def automatic_strength(
 
 
 def automatic_smoothing(
-    flux_e: ArrayLike,
-    read_noise_e: ArrayLike,
-    *,
-    pixels: ArrayLike,
-    spot_fwhm_px: ArrayLike,
-    elongation: ArrayLike = 1.0,
-    excess_noise: ArrayLike = 1.0,
-    background_e: ArrayLike = 0.0,
-    position_range_px: ArrayLike = 1.0,
-    profile: str = "diffraction",
+    flux_e: ArrayLike, read_noise_e: ArrayLike, **conditions: Unpack[Conditions]
 ) -> NDArray[np.float64]:
     """Return the standard deviation of Gaussian smoothing [px]; 0 where smoothing does not help.
 
@@ -152,17 +131,7 @@ def automatic_smoothing(
     -----
     Source: authors' Monte-Carlo study, docs/automatic.md.
     """
-    sensor = _sensor(
-        flux_e,
-        read_noise_e,
-        pixels,
-        spot_fwhm_px,
-        elongation,
-        excess_noise,
-        background_e,
-        position_range_px,
-        profile,
-    )
+    sensor = _sensor(flux_e, read_noise_e, **conditions)
     lost, off = _lost_and_off(sensor, KEPT["smoothed"])
     base, exponent = SMOOTHING.diffraction, SMOOTHING.photons_diffraction
     if sensor.gaussian:
@@ -177,17 +146,7 @@ def automatic_smoothing(
 
 
 def automatic_kept_pixels(
-    flux_e: ArrayLike,
-    read_noise_e: ArrayLike,
-    *,
-    pixels: ArrayLike,
-    spot_fwhm_px: ArrayLike,
-    elongation: ArrayLike = 1.0,
-    excess_noise: ArrayLike = 1.0,
-    background_e: ArrayLike = 0.0,
-    position_range_px: ArrayLike = 1.0,
-    profile: str = "diffraction",
-    method: str = "tv",
+    flux_e: ArrayLike, read_noise_e: ArrayLike, *, method: str = "tv", **conditions: Unpack[Conditions]
 ) -> NDArray[np.int64]:
     """Return the number of brightest pixels to keep (`keep_brightest`, rule "subtract_next").
 
@@ -214,17 +173,7 @@ def automatic_kept_pixels(
     Source: authors' Monte-Carlo study, docs/automatic.md.
     """
     one_of("method", method, METHODS)
-    sensor = _sensor(
-        flux_e,
-        read_noise_e,
-        pixels,
-        spot_fwhm_px,
-        elongation,
-        excess_noise,
-        background_e,
-        position_range_px,
-        profile,
-    )
+    sensor = _sensor(flux_e, read_noise_e, **conditions)
     if method == "none":
         return _whole(_kept_without_denoising(sensor), sensor)
     constants = KEPT[method]
@@ -288,15 +237,16 @@ def _checked(name: str, value: Any, low: float, low_open: bool = False) -> Any:
 
 
 def _sensor(
-    flux_e: Any,
-    read_noise_e: Any,
-    pixels: Any,
-    spot_fwhm_px: Any,
-    elongation: Any,
-    excess_noise: Any,
-    background_e: Any,
-    position_range_px: Any,
-    profile: str,
+    flux_e: ArrayLike,
+    read_noise_e: ArrayLike,
+    *,
+    pixels: ArrayLike,
+    spot_fwhm_px: ArrayLike,
+    elongation: ArrayLike = 1.0,
+    excess_noise: ArrayLike = 1.0,
+    background_e: ArrayLike = 0.0,
+    position_range_px: ArrayLike = 1.0,
+    profile: str = "diffraction",
 ) -> _Sensor:
     """Check the arguments and convert them to electrons and pixels."""
     one_of("profile", profile, PROFILES)
