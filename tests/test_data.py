@@ -22,5 +22,5 @@ def test_the_frame_has_the_lenslets_of_its_sensor() -> None:
 
 def test_its_licence_is_beside_it() -> None:
     text = (files("faintspot.data") / "LICENSE_mmtwfs.rst").read_text(encoding="utf-8")
-    assert "MMT TelescopeModel" in text
+    assert "MMT Observatory" in text
     assert "Redistribution" in text

@@ -40,7 +40,7 @@ def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[
     _, ny, nx = shape
     hot = np.zeros((ny, nx), np.float32)
     hot[rng.integers(ny), rng.integers(nx)] = 1e6
-    latest_messages = np.indices((ny, nx)).sum(axis=0) % 2
+    chequered = np.indices((ny, nx)).sum(axis=0) % 2
     noise = rng.normal(0.0, 1.0, (ny, nx))
     kinds = [
         np.zeros((ny, nx)),
@@ -53,8 +53,8 @@ def hostile_images(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[
         3e38 * np.clip(noise, -1, 1),
         hot,
         -hot,
-        1e4 * latest_messages,
-        np.where(latest_messages, np.nan, 5.0),
+        1e4 * chequered,
+        np.where(chequered, np.nan, 5.0),
         np.full((ny, nx), np.nan),
         np.full((ny, nx), np.inf),
         np.where(rng.random((ny, nx)) < 0.2, -np.inf, noise),

@@ -20,10 +20,10 @@ _boards: NDArray[np.float32] = np.zeros((2, 32), np.float32)
 def _exchange(value: Any) -> NDArray[np.float32]:
     """Return the values of all threads of the warp."""
     thread: Any = threading.current_thread()
-    thread.turn = latest_messages = 1 - getattr(thread, "turn", 0)
-    _boards[latest_messages, cuda.threadIdx.x] = value
+    thread.turn = board = 1 - getattr(thread, "turn", 0)
+    _boards[board, cuda.threadIdx.x] = value
     cuda.syncthreads()
-    values: NDArray[np.float32] = _boards[latest_messages]
+    values: NDArray[np.float32] = _boards[board]
     return values
 
 

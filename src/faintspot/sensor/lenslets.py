@@ -367,8 +367,8 @@ def _too_many(fit: _Fit) -> str:
     if count <= _PART_ELSEWHERE * illuminated:
         return ""
     return (
-        f"{count} spots as bright as those of the {illuminated} lit lenslets belong to none of them, so the "
-        "explains only a part of the flux; its pitch or geometry may be wrong, give pitch_px or geometry"
+        f"{count} spots as bright as those of the {illuminated} lit lenslets belong to none of them, so that "
+        "the lattice explains only a part of the flux; its pitch or geometry may be wrong, give one of them"
     )
 
 

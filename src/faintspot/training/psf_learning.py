@@ -356,7 +356,7 @@ def _learn(
             raise InputError(f"index: expected spots for each PSF, got none for {batch[0]} to {batch[-1]}")
         part = _batch(state, batch, spots)
         learnt.append((spots, learn(stack.part(spots), index[spots] - batch[0], part, options, rng, advance)))
-    return _page_state(learnt, index, options)
+    return _joined(learnt, index, options)
 
 
 def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> State:
@@ -367,7 +367,7 @@ def _batch(state: State, batch: NDArray[np.int64], spots: NDArray[np.int64]) -> 
     return State(psf, state.background_e[which], state.form, found)
 
 
-def _page_state(
+def _joined(
     learnt: list[tuple[NDArray[np.int64], State]], index: NDArray[np.int64], options: LearningOptions
 ) -> LearntPSF:
     """Put the batches together."""
