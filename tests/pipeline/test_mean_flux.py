@@ -75,5 +75,5 @@ def test_the_same_pipeline_while_the_flux_is_steady() -> None:
 
 
 def test_flux_of_another_sensor_is_refused() -> None:
-    with pytest.raises(fs.InputError, match="light: expected one number or 6"):
+    with pytest.raises(fs.InputError, match="mean_flux: expected one number or 6"):
         window_pipeline().with_flux(np.ones(5))
