@@ -16,6 +16,10 @@ PAGES = Path(__file__).resolve().parents[1] / "docs/reference/modules"
 ROOMS = ["faintspot", *(f"faintspot.{page.stem}" for page in sorted(PAGES.glob("*.md")))]
 WITHOUT_EXAMPLE = {
     "faintspot.SubapertureFlag": "in that of Slopes",
+    "faintspot.Wavefront": "in that of fit_wavefront",
+    "faintspot.io.StoredSlopes": "in that of read_slopes",
+    "faintspot.training.CentroidGain": "in that of measure_centroid_gain",
+    "faintspot.wavefront.Discrepancy": "in that of slope_discrepancy",
     "faintspot.estimators.Sensor": "made by a pipeline, in that of Estimator",
 }
 NEEDED = {

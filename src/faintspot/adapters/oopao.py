@@ -9,9 +9,9 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import AdapterOptions, ToolSlopes
+from faintspot.adapters.base import ToolSlopes
 from faintspot.adapters.checks import check_version
-from faintspot.adapters.spots import Spots
+from faintspot.adapters.spots import SpotOptions, Spots
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
@@ -24,9 +24,7 @@ def attach(
     wfs: Any,
     settings: Settings,
     calibration: Calibration | None = None,
-    *,
-    predict: Any = None,
-    **options: Unpack[AdapterOptions],
+    **options: Unpack[SpotOptions],
 ) -> Attached:
     """Make an OOPAO `ShackHartmann` measure its slopes with faintspot, and recalibrate it.
 
@@ -57,19 +55,14 @@ def attach(
     InputError
         When the sensor is of another kind, geometric or has a weighting map, or as for `ToolSlopes`.
     """
-    return Attached(wfs, settings, calibration, predict, options)
+    return Attached(wfs, settings, calibration, options)
 
 
 class Attached:
     """faintspot in an OOPAO sensor; see `attach`."""
 
     def __init__(
-        self,
-        wfs: Any,
-        settings: Settings,
-        calibration: Calibration | None,
-        predict: Any,
-        options: AdapterOptions,
+        self, wfs: Any, settings: Settings, calibration: Calibration | None, options: SpotOptions
     ) -> None:
         if getattr(wfs, "tag", None) != "shackHartmann":
             raise InputError(f"wfs: expected OOPAO's ShackHartmann, got {type(wfs).__name__}")
@@ -82,12 +75,12 @@ class Attached:
             raise InputError(
                 'wfs: expected no weighting map, got one; leave it out and use the estimator "window"'
             )
-        several = len(sources) > 1
+        predict, several = options.get("predict"), len(sources) > 1
         predicts = list(predict) if several and predict is not None else [predict] * len(sources)
         if len(predicts) != len(sources):
             raise InputError(f"predict: expected one for each of {len(sources)} sources, got {len(predicts)}")
         self._sources = [
-            _Source(wfs, source, settings, calibration, each, options)
+            _Source(wfs, source, settings, calibration, {**options, "predict": each})
             for source, each in zip(sources, predicts, strict=True)
         ]
         self._current = self._sources[0]
@@ -140,20 +133,12 @@ class _Source:
     """Sub-apertures of one source."""
 
     def __init__(
-        self,
-        wfs: Any,
-        data: Any,
-        settings: Settings,
-        calibration: Calibration | None,
-        predict: Any,
-        options: AdapterOptions,
+        self, wfs: Any, data: Any, settings: Settings, calibration: Calibration | None, options: SpotOptions
     ) -> None:
         self.wfs, self.data = wfs, data
         self._n, side = int(data.nValidSubaperture), int(wfs.n_pix_subap)
         self._first = 0.5 * (side - 1)
-        self._spots = Spots(
-            "OOPAO", self._n, side, settings, calibration, predict, rows_first=True, **options
-        )
+        self._spots = Spots("OOPAO", self._n, side, settings, calibration, rows_first=True, **options)
 
     @property
     def slopes(self) -> ToolSlopes:

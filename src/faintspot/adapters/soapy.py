@@ -8,9 +8,9 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.adapters.base import AdapterOptions, ToolSlopes
+from faintspot.adapters.base import ToolSlopes
 from faintspot.adapters.checks import check_version
-from faintspot.adapters.spots import Spots
+from faintspot.adapters.spots import SpotOptions, Spots
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
@@ -22,9 +22,7 @@ def attach(
     wfs: Any,
     settings: Settings,
     calibration: Calibration | None = None,
-    *,
-    predict: Any = None,
-    **options: Unpack[AdapterOptions],
+    **options: Unpack[SpotOptions],
 ) -> Attached:
     """Make a soapy `ShackHartmann` measure its slopes with faintspot, and remake its static slopes.
 
@@ -54,19 +52,14 @@ def attach(
     InputError
         When the sensor is of another kind, or as for `ToolSlopes`.
     """
-    return Attached(wfs, settings, calibration, predict, options)
+    return Attached(wfs, settings, calibration, options)
 
 
 class Attached:
     """faintspot in a soapy sensor; see `attach`."""
 
     def __init__(
-        self,
-        wfs: Any,
-        settings: Settings,
-        calibration: Calibration | None,
-        predict: Any,
-        options: AdapterOptions,
+        self, wfs: Any, settings: Settings, calibration: Calibration | None, options: SpotOptions
     ) -> None:
         centroiders = getattr(sys.modules.get(type(wfs).__module__), "centroiders", None)
         if centroiders is None or not hasattr(wfs, "centSubapArrays"):
@@ -75,7 +68,7 @@ class Attached:
         self.wfs, self._centroiders = wfs, centroiders
         self._n, side = int(wfs.n_subaps), int(wfs.nx_subap_pixels)
         self._first = 0.5 * (side - 1)
-        self._spots = Spots("soapy", self._n, side, settings, calibration, predict, **options)
+        self._spots = Spots("soapy", self._n, side, settings, calibration, **options)
         self._former = wfs.config.centMethod
         # soapy looks its centroiders up by name in their module.
         self._name = f"faintspot_{id(self)}"

@@ -15,6 +15,12 @@ from faintspot.pipeline.settings import Settings
 from faintspot.sensor.layout import Layout
 
 
+class SpotOptions(AdapterOptions, total=False):
+    """Options of adapters for tools that cut out the windows themselves."""
+
+    predict: Any
+
+
 class Spots:
     """Spot positions in a tool's windows, with the tool's references and predictions.
 
@@ -41,8 +47,8 @@ class Spots:
         side: int,
         settings: Settings,
         calibration: Calibration | None,
-        predict: Any,
         *,
+        predict: Any = None,
         rows_first: bool = False,
         **options: Unpack[AdapterOptions],
     ) -> None:

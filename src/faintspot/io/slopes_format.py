@@ -71,19 +71,6 @@ class StoredSlopes:
         Whether all frames of the run are present.
     n_finished : int
         Number of frames present.
-
-    Examples
-    --------
-    >>> import numpy as np, faintspot as fs
-    >>> from faintspot.io import read_slopes
-    >>> from faintspot.recorded import measure_recorded
-    >>> fs.Layout.grid((4, 4), pixels=8).save("faintspot.toml")
-    >>> fs.Settings("centroid").save("faintspot.toml")
-    >>> np.save("frames.npy", np.ones((5, 32, 32)))
-    >>> _ = measure_recorded(["frames.npy"], "faintspot.toml", "slopes.npz")
-    >>> stored = read_slopes("slopes.npz")
-    >>> stored.n_finished, stored.attributes["unit"], sorted(stored.coordinates)
-    (5, 'px', ['centre_x', 'centre_y', 'column', 'row'])
     """
 
     variables: Mapping[str, NDArray[Any]]

@@ -93,28 +93,35 @@ def _measure(
 
 
 @allocating
-def positions_of_every_k(
-    images: Any,
-    side: Any,
-    rule: Any,
-    floor: Any,
-    reach: Any,
-    start: Any,
-    stop: Any,
-    positions: Any,
-    valid: Any,
-) -> None:
-    """Write x and y (n, K, 2) and validity (n, K) of images `start` to `stop` for k = 1 to K = pixels - 1."""
-    pixels = side * side
+def _scratch(pixels: Any) -> Any:
+    """Return counts, keys, order, x and y, for one image at a time."""
     counts = np.empty((_PASSES, _DIGITS), np.int32)
     keys, order = np.empty((2, pixels), np.uint32), np.empty((2, pixels), np.int32)
-    x, y = np.empty(pixels - 1), np.empty(pixels - 1)
+    return counts, keys, order, np.empty(pixels - 1), np.empty(pixels - 1)
+
+
+@compiled
+def _sort_and_measure(
+    image: Any, side: Any, rule: Any, floor: Any, reach: Any, scratch: Any, valid: Any
+) -> None:
+    """Write the positions of an image into the scratch, and their validity."""
+    counts, keys, order, x, y = scratch
+    row = _sort_brightest_first(image.view(np.uint32), side * side, counts, keys, order)
+    _measure(image, side, order[row], rule, floor, reach, x, y, valid)
+
+
+@allocating
+def positions_of_every_k(
+    images: Any, side: Any, rule: Any, floor: Any, reach: Any, start: Any, stop: Any, found: Any, valid: Any
+) -> None:
+    """Write x and y (n, K, 2) and validity (n, K) of images `start` to `stop` for k = 1 to K = pixels - 1."""
+    scratch = _scratch(side * side)
+    x, y = scratch[3], scratch[4]
     for i in range(start, stop):
-        row = _sort_brightest_first(images[i].view(np.uint32), pixels, counts, keys, order)
-        _measure(images[i], side, order[row], rule, floor, reach, x, y, valid[i])
-        for k in range(pixels - 1):
-            positions[i, k, 0] = x[k]
-            positions[i, k, 1] = y[k]
+        _sort_and_measure(images[i], side, rule, floor, reach, scratch, valid[i])
+        for k in range(side * side - 1):
+            found[i, k, 0] = x[k]
+            found[i, k, 1] = y[k]
 
 
 @allocating
@@ -131,13 +138,10 @@ def errors_of_every_k(
     valid: Any,
 ) -> None:
     """Write (|dx| + |dy|) / 2 (n, K) and validity (n, K), as `positions_of_every_k`."""
-    pixels = side * side
-    counts = np.empty((_PASSES, _DIGITS), np.int32)
-    keys, order = np.empty((2, pixels), np.uint32), np.empty((2, pixels), np.int32)
-    x, y = np.empty(pixels - 1), np.empty(pixels - 1)
+    scratch = _scratch(side * side)
+    x, y = scratch[3], scratch[4]
     for i in range(start, stop):
-        row = _sort_brightest_first(images[i].view(np.uint32), pixels, counts, keys, order)
-        _measure(images[i], side, order[row], rule, floor, reach, x, y, valid[i])
+        _sort_and_measure(images[i], side, rule, floor, reach, scratch, valid[i])
         true_x, true_y = truth[i, 0], truth[i, 1]
-        for k in range(pixels - 1):
+        for k in range(side * side - 1):
             errors[i, k] = 0.5 * (abs(x[k] - true_x) + abs(y[k] - true_y))

@@ -20,18 +20,7 @@ _FEWEST_FRAMES = 2 * _BLOCKS
 
 @dataclass(frozen=True)
 class CentroidGain:
-    """Slope per pixel of displacement, along x and y.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from faintspot.training import measure_centroid_gain
-    >>> dither = 0.1 * np.sin(2 * np.pi * 0.13 * np.arange(400))[:, None] * [1.0, 1.0]
-    >>> noise = np.random.default_rng(1).normal(0.0, 0.02, (400, 6))
-    >>> found = measure_centroid_gain(0.7 * np.repeat(dither, 3, axis=1) + noise, dither)
-    >>> found.gain.shape, bool((abs(found.gain - 0.7) < 4 * found.standard_error).all())
-    ((3, 2), True)
-    """
+    """Slope per pixel of displacement, along x and y."""
 
     gain: Floats
     """(n, 2)"""

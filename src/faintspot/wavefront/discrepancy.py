@@ -18,23 +18,7 @@ _NEGLIGIBLE = 1e-9  # of the largest singular value
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """Part of the slopes that is not the gradient of any wavefront.
-
-    Examples
-    --------
-    >>> import numpy as np, faintspot as fs
-    >>> from faintspot.wavefront import slope_discrepancy
-    >>> rng = np.random.default_rng(1)
-    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5)
-    >>> frames, _ = fs.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 200, position_range_px=0.0, rng=rng
-    ... )
-    >>> settings = fs.Settings("window", flux_e=100.0, spot_fwhm_px=1.8)
-    >>> slopes = fs.SlopePipeline(layout, settings, fs.Calibration(read_noise_e=0.1))(frames)
-    >>> discrepancy = slope_discrepancy(slopes, layout)
-    >>> discrepancy.rms_px.shape, discrepancy.degrees_of_freedom
-    ((200,), 24)
-    """
+    """Part of the slopes that is not the gradient of any wavefront."""
 
     rms_px: Floats
     """Rms per slope that can be compared, (n_frames,): equals the noise's rms if there is only noise."""

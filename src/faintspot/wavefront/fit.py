@@ -31,21 +31,6 @@ class Wavefront:
     The wavefront is the optical path difference minus its mean; it increases in the direction of the spots'
     displacement. All values refer to the whole disk of the pupil: a central obscuration has no modes of its
     own.
-
-    Examples
-    --------
-    >>> import numpy as np, faintspot as fs
-    >>> layout = fs.Layout.grid((7, 7), pixels=8, outer_radius=3.5, pixel_scale_arcsec=0.5, subaperture_m=0.6)
-    >>> frames, _ = fs.simulate.sensor_frames(
-    ...     layout.corners, layout.window, layout.frame_shape, 5, flux_e=1000.0,
-    ...     positions=np.tile([0.3, 0.0], (len(layout), 1)), rng=np.random.default_rng(1),
-    ... )
-    >>> slopes = fs.SlopePipeline(layout, fs.Settings("brightest", keep_brightest=30))(frames)
-    >>> wavefront = fs.fit_wavefront(slopes, layout, modes=5)
-    >>> wavefront.modes.tolist(), wavefront.coefficients.shape
-    ([2, 3, 4, 5, 6], (5, 5))
-    >>> print(f"tip {wavefront.mean[0]:.0f} {wavefront.unit}")
-    tip 774 nm
     """
 
     modes: NDArray[np.int64]
