@@ -13,13 +13,14 @@ from tests.experiments.study_cases import cells, dataset, power_law
 from tests.shared_data import shared_file
 
 from faintspot.experiments import built_in_studies as estimators
-from faintspot.experiments.efficiency import compares_estimators, enough_photons, findings, markdown
+from faintspot.experiments.efficiency import compares_estimators, enough_photons, findings, result_sections
 from faintspot.experiments.estimator_figures import estimator_figures
 from faintspot.experiments.study_page import write_study_report
 from faintspot.experiments.sweep import Cell
 from faintspot.report import drawing
 
 ARMS = ("brightest", "tv", "ml", "map", "weighted")
+KINDS = ("error", "photon-efficiency", "gain", "outlier-fraction")
 
 
 def error(cell: dict[str, Any], arm: str, mode: str) -> float:
@@ -58,13 +59,12 @@ def test_cost_is_bounded() -> None:
 
 def test_figures() -> None:
     made = {figure.name: figure for figure in estimator_figures(study())}
-    kinds = ("error", "efficiency", "gain")
     spots = ("diffraction", "diffraction-elongation3")
-    assert set(made) == {f"{kind}-{spot}" for kind in kinds for spot in spots} | {"turbulence-diffraction"}
+    assert set(made) == {f"{kind}-{spot}" for kind in KINDS for spot in spots} | {"corrected-rms-diffraction"}
     first = made["error-diffraction"].figure
     assert [axes.get_title() for axes in first.axes] == ["0.1 e- read noise", "3 e- read noise"]
     assert len(first.axes[0].containers) == len(ARMS)
-    turbulence = made["turbulence-diffraction"].figure
+    turbulence = made["corrected-rms-diffraction"].figure
     assert [axes.get_title() for axes in turbulence.axes] == [
         "0.1 e- read noise, 50 e- signal",
         "0.1 e- read noise, 200 e- signal",
@@ -77,7 +77,7 @@ def test_figures() -> None:
 def test_unfinished_studies_are_drawn_as_far_as_they_are() -> None:
     assert list(estimator_figures(study(unfinished=range(21)))) == []
     names = [figure.name for figure in estimator_figures(study(unfinished=range(3, 21)))]
-    assert names == ["error-diffraction", "efficiency-diffraction", "gain-diffraction"]
+    assert names == [f"{kind}-diffraction" for kind in KINDS]
 
 
 def test_enough_photons() -> None:
@@ -105,11 +105,15 @@ def test_findings_count_cells() -> None:
 
 
 def test_tables() -> None:
-    text = markdown(study(), "faintspot study estimators --table x.md")
-    assert "`faintspot study estimators --table x.md`" in text
-    assert text.count("| 10 e-, diffraction spot of size 1, 0.1 e- read noise, 16 × 16 px, ±1 px |") == 2
-    assert "| 1.00 (1.10) |" in text
-    assert text.count("d/r0 3 |") == 2
+    efficiency, calibration, speckled = (each.tables[0] for each in result_sections(study()))
+    assert [len(table.rows) for table in (efficiency, calibration, speckled)] == [15, 15, 6]
+    assert efficiency.header[2:] == speckled.header[3:] == list(ARMS)
+    assert calibration.header[1:] == ["ml", "map", "weighted"]
+    assert set(calibration.rows[0][1:]) == {"1.00 (1.10)"}
+    assert "d/r0 3" in str(speckled.rows[-1][0])
+    assert speckled.rows[-1][2] == "ml"
+    assert list(speckled.rows[-1][3:]) == ["22", "22", "0", "0", "22"]  # sqrt(1.5): 1.5 times the flux
+    assert result_sections(study(unfinished=range(21))) == []
 
 
 def test_other_studies_do_not_compare_estimators() -> None:
@@ -126,8 +130,8 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = dataset(few, error, arms=ARMS)
     data.attrs["specification"] = specification.to_text()
     written = write_study_report(data, tmp_path / "study.html")
-    assert (tmp_path / "study-figures" / "turbulence-diffraction.csv") in written
+    assert (tmp_path / "study-figures" / "corrected-rms-diffraction.csv") in written
     html = written[0].read_text(encoding="utf-8")
     assert "What was found" in html
     assert 'id="verdicts"' not in html
-    assert html.count("<figcaption>") == 4
+    assert html.count("<figcaption>") == 5

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from faintspot.base.files import derived, write_atomically
+from faintspot.base.files import derived
 from faintspot.cli.commands import Group, option
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
@@ -146,12 +146,10 @@ def paper(
     help="Where results go; the report beside it.",
     show_default="estimators.zarr, or estimators-quick.zarr",
 )
-@option("--table", metavar="MD", help="Also write the tables as a Markdown file.")
 @_run_options
 def estimators(
     quick: bool,
     output: str | None,
-    table: str | None,
     scheduler: str | None,
     workers: int | None,
     overwrite: bool,
@@ -164,10 +162,9 @@ def estimators(
     \b
     Examples:
       faintspot study estimators --quick
-      faintspot study estimators -o estimators.zarr --table efficiency.md
+      faintspot study estimators -o estimators.zarr
     """
     from faintspot.experiments.built_in_studies import estimators_study
-    from faintspot.experiments.efficiency import markdown
     from faintspot.experiments.study_page import write_study_report
 
     described = estimators_study(quick)
@@ -176,11 +173,6 @@ def estimators(
     page = derived(target, ".html")
     write_study_report(results, page)
     click.echo(f"{page}: open it in a browser")
-    if table is not None:
-        options = " --quick" if quick else ""
-        made_by = f"faintspot study estimators{options} --table {shlex.quote(table)}"
-        write_atomically(table, markdown(results, made_by))
-        click.echo(f"{table}: tables")
 
 
 def _measure(described: StudySpecification, target: str, **options: Any) -> xarray.Dataset:

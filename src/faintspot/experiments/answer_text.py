@@ -106,8 +106,13 @@ def foundations(answer: Answer) -> list[str]:
     question = answer.question
     spots = f"{answer.realisations} simulated spots at each of {len(answer.flux_e)} fluxes"
     lines = list(question.facts)
-    kind = "assumed_profile" if question.psf is None else "learnt_psf"
-    lines.append(_TEXT(f"answer.{kind}", spots=spots, profile=question.profile))
+    lines.append(
+        _TEXT(
+            "answer.assumed_profile" if question.psf is None else "answer.learnt_psf",
+            spots=spots,
+            profile=question.profile,
+        )
+    )
     lines.append(_TEXT["answer.positions"])
     if question.photometry is not None:
         lines.append(_TEXT("answer.photometry", flux=question.photometry))

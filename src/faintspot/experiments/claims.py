@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faintspot.experiments import judges
-from faintspot.experiments.arms import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV, label_of
+from faintspot.experiments.arms import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_error
 from faintspot.experiments.judges import LEVEL_PX
+from faintspot.experiments.statistics import magnitudes
 from faintspot.experiments.study_curves import (
-    AgainstTV,
     Configuration,
     Finding,
     Verdict,
-    against_tv,
     study_curves,
 )
 from faintspot.report.texts import Texts
@@ -91,13 +90,15 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
     curves = study_curves(dataset, BEST_MODE)
     best = _compared(curves, rng, SMOOTHING in arms)
     if not best:
-        return [_TEXT("guidance.no_gains", level=LEVEL_PX), *_against_baselines(dataset)]
-    paragraphs = [_best_k(best), *_where(best)]
+        return [_TEXT("guidance.no_gains", level=LEVEL_PX)]
+    paragraphs = [_flux_gains("brightest pixels alone", [item.gain for item in best])]
+    over_gaussian = [item.over_gaussian for item in best if item.over_gaussian is not None]
+    if over_gaussian:
+        paragraphs.append(_flux_gains("Gaussian smoothing of the best width", over_gaussian))
     fixed = fixed_mode(dataset)
     if fixed in dataset["mode"].values:
-        paragraphs += _fixed_k(best, _compared(study_curves(dataset, fixed), rng, False), fixed)
-        paragraphs += _choosing_k(curves, study_curves(dataset, fixed), fixed, rng)
-    return [*paragraphs, *_against_gaussian(best), *_against_baselines(dataset), _recommendation(best)]
+        paragraphs += _choosing_k(curves, study_curves(dataset, fixed), fixed)
+    return [*paragraphs, _recommendation(best)]
 
 
 def _compared(
@@ -114,70 +115,22 @@ def _compared(
     return found
 
 
-def _best_k(best: list[_Compared]) -> str:
-    better = sum(item.gain.low > 1 for item in best)
-    worse = sum(item.gain.high < 1 for item in best)
-    factors = np.array([item.gain.factor for item in best])
+def _flux_gains(reference: str, gains: list[Gain]) -> str:
+    """Return in how many configurations TV needs less flux than a reference, and the median gain."""
+    better, worse = sum(gain.low > 1 for gain in gains), sum(gain.high < 1 for gain in gains)
+    factors = np.array([gain.factor for gain in gains])
     median = float(np.median(factors))
-    return _TEXT(
-        "guidance.best_k",
-        level=LEVEL_PX,
-        better=better,
-        all=len(best),
-        worse=worse,
-        undecided=len(best) - better - worse,
-        least=factors.min(),
-        most=factors.max(),
-        median=median,
-        magnitudes=2.5 * np.log10(median),
-    )
+    counts = {"better": better, "worse": worse, "all": len(gains), "undecided": len(gains) - better - worse}
+    values = {
+        "least": factors.min(),
+        "most": factors.max(),
+        "median": median,
+        "magnitudes": magnitudes(median),
+    }
+    return _TEXT("guidance.flux_gains", level=LEVEL_PX, reference=reference, **counts, **values)
 
 
-def _where(best: list[_Compared]) -> list[str]:
-    most = sorted(best, key=lambda item: -item.gain.low)
-    worth = [item for item in most if item.gain.low > _WORTH_IT]
-    costs = [item for item in reversed(most) if item.gain.high < 1]
-    found = "worth" if worth else "not_worth"
-    paragraphs = [_TEXT(f"guidance.{found}", worth=_WORTH_IT, count=len(worth), listed=_listed(worth))]
-    if costs:
-        paragraphs.append(_TEXT("guidance.costs", count=len(costs), listed=_listed(costs)))
-    return [*paragraphs, *_with_noise(best)]
-
-
-def _with_noise(best: list[_Compared]) -> list[str]:
-    """Describe the gain against read noise, by spot profile, for round Nyquist-sampled spots."""
-    lines = []
-    for profile in sorted({item.configuration.profile for item in best}):
-        gains: dict[float, list[float]] = {}
-        for item in best:
-            key = item.configuration
-            if (key.profile, key.size, key.elongation) == (profile, 1.0, 1.0):
-                gains.setdefault(key.read_noise_e, []).append(item.gain.factor)
-        if gains:
-            values = "; ".join(f"{noise:g} e- {np.median(gains[noise]):.2f}" for noise in sorted(gains))
-            lines.append(f"{profile} spots: {values}")
-    if not lines:
-        return []
-    return [_TEXT("guidance.with_noise", profiles=". ".join(lines))]
-
-
-def _fixed_k(best: list[_Compared], fixed: list[_Compared], mode: str) -> list[str]:
-    of_best = {item.configuration: item.gain for item in best}
-    pairs = [(of_best[item.configuration], item.gain) for item in fixed if item.configuration in of_best]
-    if not pairs:
-        return []
-    larger = sum(other.low > own.high for own, other in pairs)
-    smaller = sum(other.high < own.low for own, other in pairs)
-    own, other = (float(np.median([pair[i].factor for pair in pairs])) for i in (0, 1))
-    conclusion = _TEXT["guidance.fixed_k_flatters" if larger > smaller else "guidance.fixed_k_does_not"]
-    counts = {"pairs": len(pairs), "larger": larger, "smaller": smaller, "own": own, "other": other}
-    k = mode.removeprefix("fixed")
-    return [_TEXT("guidance.fixed_k", k=k, **counts, conclusion=conclusion)]
-
-
-def _choosing_k(
-    best: dict[Configuration, Curve], fixed: dict[Configuration, Curve], mode: str, rng: np.random.Generator
-) -> list[str]:
+def _choosing_k(best: dict[Configuration, Curve], fixed: dict[Configuration, Curve], mode: str) -> list[str]:
     """Describe the gain of a good number of pixels kept, without denoising."""
     ratios = []
     for key, curve in best.items():
@@ -188,67 +141,18 @@ def _choosing_k(
     if not ratios:
         return []
     k = mode.removeprefix("fixed")
-    median = float(np.median(ratios))
-    conclusion = _TEXT("guidance.tune_k" if median > 1.02 else "guidance.k_is_good", k=k)
-    return [_TEXT("guidance.choosing_k", k=k, median=median, most=max(ratios), conclusion=conclusion)]
-
-
-def _against_gaussian(best: list[_Compared]) -> list[str]:
-    known = [(item, item.over_gaussian) for item in best if item.over_gaussian is not None]
-    if not known:
-        return []
-    tv, gaussian = sum(over.low > 1 for _, over in known), sum(over.high < 1 for _, over in known)
-    median = float(np.median([over.factor for _, over in known]))
-    verdict = {1: "tv_is_better", -1: "gaussian_is_better", 0: "neither"}[np.sign(tv - gaussian)]
-    counts = {"tv": tv, "all": len(known), "gaussian": gaussian, "median": median}
-    return [_TEXT("guidance.gaussian", level=LEVEL_PX, **counts, conclusion=_TEXT[f"guidance.{verdict}"])]
-
-
-def _against_baselines(dataset: xarray.Dataset) -> list[str]:
-    lines = []
-    for profile, rows in _by_profile(against_tv(dataset, BEST_MODE)).items():
-        ahead = [
-            f"{label_of(row.arm)} ({row.smaller} to {row.larger})" for row in rows if row.smaller > row.larger
-        ]
-        verdict = (
-            f"ahead of TV more often than behind: {', '.join(ahead)}"
-            if ahead
-            else "nothing is ahead of TV more often than behind"
-        )
-        lines.append(f"{profile} spots ({rows[0].cells} cells): {verdict}")
-    if not lines:
-        return []
-    return [_TEXT("guidance.baselines", lines="; ".join(lines))]
+    return [_TEXT("guidance.choosing_k", k=k, median=np.median(ratios), most=max(ratios))]
 
 
 def _recommendation(best: list[_Compared]) -> str:
-    use = [
-        item
-        for item in best
-        if item.gain.low > _WORTH_IT and (item.over_gaussian is None or item.over_gaussian.low > 1)
-    ]
-    worth = sum(item.gain.low > _WORTH_IT for item in best)
+    worth = [item for item in best if item.gain.low > _WORTH_IT]
+    use = [item for item in worth if item.over_gaussian is None or item.over_gaussian.low > 1]
     counts = {"worth": _WORTH_IT, "all": len(best)}
-    if not worth:
-        return _TEXT("guidance.advice_against", **counts)
     if not use:
-        return _TEXT("guidance.advice_smoothing", **counts, count=worth)
-    where = sorted(use, key=lambda item: -item.gain.low)
-    left = len(best) - len(use)
-    rest = _TEXT("guidance.rest", count=left) if left else ""
-    also = " and beats Gaussian smoothing" if any(item.over_gaussian for item in use) else ""
-    listed = _listed(where)
-    return _TEXT("guidance.advice_for", **counts, count=len(use), also=also, listed=listed, rest=rest)
-
-
-def _listed(items: list[_Compared]) -> str:
-    shown = [f"{item.configuration.in_words()}: {item.gain.in_words()}" for item in items[:_MOST_LISTED]]
-    more = f"; and {len(items) - _MOST_LISTED} more" if len(items) > _MOST_LISTED else ""
-    return "; ".join(shown) + more + "."
-
-
-def _by_profile(rows: list[AgainstTV]) -> dict[str, list[AgainstTV]]:
-    found: dict[str, list[AgainstTV]] = {}
-    for row in rows:
-        found.setdefault(row.profile, []).append(row)
-    return found
+        advice = _TEXT["guidance.advice_smoothing" if worth else "guidance.advice_against"]
+        return str(advice.format(**counts, count=len(worth)))
+    use.sort(key=lambda item: -item.gain.low)
+    listed = [f"{item.configuration.in_words()}: {item.gain.in_words()}" for item in use[:_MOST_LISTED]]
+    if len(use) > _MOST_LISTED:
+        listed.append(f"and {len(use) - _MOST_LISTED} more")
+    return _TEXT("guidance.advice_for", **counts, count=len(use), listed="; ".join(listed))

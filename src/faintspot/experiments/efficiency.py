@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,10 +10,10 @@ from numpy.typing import NDArray
 from faintspot.estimators.maximum_a_posteriori import MaximumAPosteriori
 from faintspot.estimators.maximum_likelihood import MaximumLikelihood
 from faintspot.estimators.weighted import Weighted
-from faintspot.estimators.window import Window
 from faintspot.experiments.arms import knows_the_spot
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_curves import Configuration
+from faintspot.report.page import Section
 from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
@@ -137,8 +136,7 @@ def _outlier_dominated(cells: _Cells) -> list[str]:
 
 
 def _near_the_best(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
-    mode = CORRECTED if CORRECTED in dataset["mode"].values else BEST
-    ratio = _ratio_to_best(cells.values("corrected_rms", mode))
+    ratio = _ratio_to_best(cells.values("corrected_rms", _corrected_mode(dataset)))
     d_over_r0 = cells.coordinate("d_over_r0")
     found = []
     for words, part in (("all", d_over_r0 > 0), ("d/r0 up to 1", d_over_r0 <= 1), ("above 1", d_over_r0 > 1)):
@@ -160,75 +158,39 @@ def _ratio_to_best(values: Floats) -> Floats:
     return ratio
 
 
-def markdown(dataset: xarray.Dataset, command: str) -> str:
-    """Return the tables of a study as a Markdown page.
-
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-    command : str
-        That makes the page.
-    """
-    parts = [
-        _TEXT("markdown.head", command=command, n=dataset.attrs["n"], seed=dataset.attrs["seed"]),
-        *([_TEXT["markdown.windows"]] if Window.name in dataset["arm"].values else []),
-        "## What it says\n",
-        *(f"- {line}" for line in findings(dataset)),
-        "",
-    ]
+def result_sections(dataset: xarray.Dataset) -> list[Section]:
+    """Return the tables of a study: efficiency, calibration of the stated errors, speckled spots."""
+    sections = []
     cells, speckled = _Cells(dataset, speckled=False), _Cells(dataset, speckled=True)
     if cells.count:
-        parts += _efficiency_section(cells) + _calibration_section(cells)
+        efficiency, bound = cells.values("photon_efficiency", BEST), cells.coordinate("bound")
+        rows = [[f"{bound[i]:.4f}", *map(_number, efficiency[i])] for i in cells.order()]
+        sections.append(_section(cells, "efficiency", rows, cells.arms))
+        near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
+        kept = [i for i, arm in enumerate(cells.arms) if knows_the_spot(arm)]
+        rows = [[f"{_number(near[i, j])} ({_number(whole[i, j])})" for j in kept] for i in cells.order()]
+        sections.append(_section(cells, "calibration", rows, [cells.arms[j] for j in kept]))
     if speckled.count:
-        parts += _turbulence_section(speckled, dataset)
-    return "\n".join(parts) + "\n"
+        values = speckled.values("corrected_rms", _corrected_mode(dataset))
+        best, excess = np.nanargmin(values, axis=1), 100 * (_ratio_to_best(values) - 1)
+        rows = [
+            [f"{values[i, best[i]]:.4f}", speckled.arms[best[i]], *(_number(each, 0) for each in excess[i])]
+            for i in speckled.order()
+        ]
+        sections.append(_section(speckled, "speckled", rows, speckled.arms))
+    return sections
 
 
-def _efficiency_section(cells: _Cells) -> list[str]:
-    values = cells.values("photon_efficiency", BEST)
-    bound = cells.coordinate("bound")
-    return [
-        _TEXT["markdown.efficiency"],
-        *_table(cells, ["R at the bound, px"], lambda i: [f"{bound[i]:.4f}"], lambda i: _numbers(values[i])),
-    ]
+def _section(cells: _Cells, name: str, rows: list[list[str]], arms: list[str]) -> Section:
+    """Return the section of a table with a row for each cell."""
+    named = [[cells.words(index), *row] for index, row in zip(cells.order(), rows, strict=True)]
+    table = _TEXT.table(f"estimator_tables.{name}", named, arms)
+    return Section(f"{name}-table", _TEXT[f"estimator_tables.{name}.title"], tables=[table])
 
 
-def _calibration_section(cells: _Cells) -> list[str]:
-    near, whole = (cells.values(f"stated_over_actual{part}") for part in ("", "_all"))
-    kept = [i for i, arm in enumerate(cells.arms) if knows_the_spot(arm)]
-    rows = ["| | " + " | ".join(cells.arms[i] for i in kept) + " |", "|---|" + "---|" * len(kept)]
-    for index in cells.order():
-        texts = [f"{near[index, i]:.2f} ({whole[index, i]:.2f})" for i in kept]
-        rows.append(f"| {cells.words(index)} | " + " | ".join(texts) + " |")
-    return [_TEXT["markdown.calibration"], *rows]
+def _corrected_mode(dataset: xarray.Dataset) -> str:
+    return CORRECTED if CORRECTED in dataset["mode"].values else BEST
 
 
-def _turbulence_section(cells: _Cells, dataset: xarray.Dataset) -> list[str]:
-    mode = CORRECTED if CORRECTED in dataset["mode"].values else BEST
-    values = cells.values("corrected_rms", mode)
-    excess = 100 * (_ratio_to_best(values) - 1)
-    best = np.nanargmin(values, axis=1)
-    return [
-        _TEXT["markdown.turbulence"],
-        *_table(
-            cells,
-            ["best, px", "by"],
-            lambda i: [f"{values[i, best[i]]:.4f}", cells.arms[best[i]]],
-            lambda i: [f"{value:.0f}" if np.isfinite(value) else "–" for value in excess[i]],
-        ),
-    ]
-
-
-def _numbers(values: Sequence[float] | Floats) -> list[str]:
-    return [f"{value:.2f}" if np.isfinite(value) else "–" for value in values]
-
-
-def _table(
-    cells: _Cells, names: list[str], first: Callable[[int], list[str]], rest: Callable[[int], list[str]]
-) -> list[str]:
-    """A table of all cells: some columns, then one for each arm."""
-    header = ["", *names, *cells.arms]
-    rows = ["| " + " | ".join(header) + " |", "|---" * len(header) + "|"]
-    for index in cells.order():
-        rows.append("| " + " | ".join([cells.words(index), *first(index), *rest(index)]) + " |")
-    return rows
+def _number(value: float, digits: int = 2) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "–"

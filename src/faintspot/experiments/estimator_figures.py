@@ -10,6 +10,7 @@ import numpy as np
 
 from faintspot.experiments.arms import is_estimator, knows_the_spot, label_of, style_of
 from faintspot.experiments.specification import BEST, CORRECTED
+from faintspot.experiments.study_figures import label_axes
 from faintspot.experiments.study_tables import parameter_in_words, parameters_of, table_of_cells
 from faintspot.experiments.sweep import PARAMETERS
 from faintspot.report.drawing import GREY, WIDTH, new_figure, plain_ticks, styled
@@ -19,13 +20,13 @@ from faintspot.report.texts import Texts
 if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 _TEXT = Texts("faintspot.experiments")
 _ROW_HEIGHT = 4.4
 _COLUMNS = 2
 _FEWEST_POINTS = 3
+_BOUND: dict[str, Any] = {"color": "black", "lw": 3, "alpha": 0.35}
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,10 @@ def estimator_figures(dataset: xarray.Dataset) -> Iterator[FigureWithData]:
     Cells that differ in flux (or, speckled ones, in d/r0) alone are a line, where there are at least three.
     """
     for group in _groups(dataset, "flux_e", ("read_noise_e",), speckled=False):
-        yield _error_figure(dataset, group)
-        yield _efficiency_figure(dataset, group)
-        yield _gain_figure(dataset, group)
+        for kind in ("error", "photon_efficiency", "gain", "outlier_fraction"):
+            yield _figure(dataset, group, kind, "flux_e")
     for group in _groups(dataset, "d_over_r0", ("read_noise_e", "flux_e"), speckled=True):
-        yield _turbulence_figure(dataset, group)
+        yield _figure(dataset, group, "corrected_rms", "d_over_r0")
 
 
 def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: bool) -> Iterator[_Group]:
@@ -104,103 +104,78 @@ def _groups(dataset: xarray.Dataset, axis: str, by: Sequence[str], *, speckled: 
 
 
 @styled
-def _error_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
-    figure, axes = _grid(group)
-    for panel, part in zip(axes, group.panels, strict=False):
-        _lines(panel, dataset, part, "error", BEST, "flux_e")
-        flux = dataset["flux_e"].values[part.cells]
-        panel.plot(flux, dataset["bound"].values[part.cells], color="black", lw=3, alpha=0.35, zorder=1)
-        panel.axhline(group.common["position_range_px"] / 2, color=GREY, lw=1, ls=":")
-        panel.set_yscale("log")
-        plain_ticks(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
-    _label(axes, group, "slope error R (px)")
-    _legend(figure, dataset, bound=True)
-    return _with_data(figure, dataset, group, "error")
+def _figure(dataset: xarray.Dataset, group: _Group, kind: str, axis: str) -> FigureWithData:
+    """Draw a variable of every arm along an axis, one panel for each camera, two in a row."""
+    from matplotlib.lines import Line2D
 
-
-@styled
-def _efficiency_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
-    figure, axes = _grid(group)
-    for panel, part in zip(axes, group.panels, strict=False):
-        _lines(panel, dataset, part, "photon_efficiency", BEST, "flux_e")
-        panel.axhline(1.0, color="black", lw=3, alpha=0.35, zorder=1)
-        panel.set_ylim(0, 1.35)
-    _label(axes, group, "photon efficiency")
-    _legend(figure, dataset, bound=True)
-    return _with_data(figure, dataset, group, "efficiency")
-
-
-@styled
-def _gain_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
-    columns = len(group.panels)
-    figure = new_figure(WIDTH * max(1.0, columns / 3), 2 * _ROW_HEIGHT + 0.9)
-    axes = figure.subplots(2, columns, squeeze=False, sharex="col", sharey="row")
-    for (upper, lower), part in zip(axes.T, group.panels, strict=True):
-        _lines(upper, dataset, part, "gain", BEST, "flux_e")
-        upper.axhline(1.0, color="black", lw=3, alpha=0.35, zorder=1)
-        upper.set_title(part.title)
-        _lines(lower, dataset, part, "outlier_fraction", BEST, "flux_e")
-        lower.set_yscale("symlog", linthresh=1e-3)
-        plain_ticks(lower.yaxis, (0, 1e-3, 1e-2, 0.1, 0.5))
-        _flux_axis(lower)
-    drawn = dataset["outlier_fraction"].sel(mode=BEST).isel(cell=group.cells).values
-    axes[1, 0].set_ylim(-1e-4, max(2e-3, min(1.0, 1.5 * float(np.nanmax(drawn)))))
-    axes[0, 0].set_ylabel("gain")
-    axes[1, 0].set_ylabel("fraction of errors beyond 1 px")
-    _legend(figure, dataset, bound=False)
-    return _with_data(figure, dataset, group, "gain")
-
-
-@styled
-def _turbulence_figure(dataset: xarray.Dataset, group: _Group) -> FigureWithData:
-    mode = CORRECTED if CORRECTED in dataset["mode"].values else BEST
-    figure, axes = _grid(group)
-    for panel, part in zip(axes, group.panels, strict=False):
-        _lines(panel, dataset, part, "corrected_rms", mode, "d_over_r0")
-        values = dataset["corrected_rms"].sel(mode=mode).isel(cell=part.cells)
-        drawn = values.sel(arm=_drawn_arms(dataset))
-        best = drawn.min("arm").values
-        x = dataset["d_over_r0"].values[part.cells]
-        panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
-        panel.set_yscale("log")
-        panel.set_xscale("log")
-        plain_ticks(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))
-        plain_ticks(panel.yaxis, (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2))
-        panel.set_ylim(0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(drawn.values))))
-    _label(axes, group, "gain-corrected rms (px)", flux=False)
-    _legend(figure, dataset, bound=False)
-    return _with_data(figure, dataset, group, "turbulence")
-
-
-def _with_data(figure: Figure, dataset: xarray.Dataset, group: _Group, kind: str) -> FigureWithData:
-    """Return a figure with its title and the numbers of the group's cells."""
-    subject, caption = (_TEXT[f"estimators.{kind}.{part}"] for part in ("title", "caption"))
-    title = f"{subject}: {group.words}"
-    figure.suptitle(title, fontsize=14)
-    return FigureWithData(
-        f"{kind}-{group.name}", title, caption, figure, *table_of_cells(dataset, group.cells)
-    )
-
-
-def _grid(group: _Group) -> tuple[Figure, list[Axes]]:
-    """Return a figure and axes, one for each panel, two in a row."""
+    own_mode = kind == "corrected_rms" and CORRECTED in dataset["mode"].values
+    mode = CORRECTED if own_mode else BEST
     columns = min(_COLUMNS, len(group.panels))
     rows = -(-len(group.panels) // columns)
     figure = new_figure(WIDTH, _ROW_HEIGHT * rows + 0.9)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
-    for unused in axes[len(group.panels) :]:
+    panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for index, (panel, part) in enumerate(zip(panels, group.panels, strict=False)):
+        found = dataset.isel(cell=part.cells).sel(arm=_drawn_arms(dataset), mode=mode)
+        x = found[axis].values
+        for arm in found["arm"].values:
+            chosen = found.sel(arm=arm)
+            se = chosen[f"{kind}_se"].values if f"{kind}_se" in found else None
+            panel.errorbar(x, chosen[kind].values, se, elinewidth=1, zorder=3, **_line_of(str(arm)))
+        label_axes(panel, axis, log_y=False)
+        _SCALES[kind](panel, found, x, found[kind].values)
+        panel.set_title(part.title)
+        if index % columns == 0:
+            panel.set_ylabel(_TEXT[f"estimators.{kind}.axis"])
+    for unused in panels[len(group.panels) :]:
         unused.set_axis_off()
-    return figure, axes[: len(group.panels)]
+    handles = [Line2D([], [], **_line_of(arm)) for arm in _drawn_arms(dataset)]
+    if kind in ("error", "photon_efficiency"):
+        handles.append(Line2D([], [], label="Cramer-Rao bound", **_BOUND))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    title = f"{_TEXT[f'estimators.{kind}.title']}: {group.words}"
+    figure.suptitle(title, fontsize=14)
+    name, caption = f"{kind.replace('_', '-')}-{group.name}", _TEXT[f"estimators.{kind}.caption"]
+    return FigureWithData(name, title, caption, figure, *table_of_cells(dataset, group.cells))
 
 
-def _lines(panel: Axes, dataset: xarray.Dataset, part: _Panel, name: str, mode: str, axis: str) -> None:
-    """Draw a variable of every arm."""
-    x = dataset[axis].values[part.cells]
-    for arm in _drawn_arms(dataset):
-        chosen = dataset.sel(arm=arm, mode=mode).isel(cell=part.cells)
-        se_name = f"{name}_se"
-        se = chosen[se_name].values if se_name in dataset else None
-        panel.errorbar(x, chosen[name].values, se, elinewidth=1, zorder=3, **_line_of(arm))
+def _error_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+    panel.plot(x, found["bound"].values, zorder=1, **_BOUND)
+    panel.axhline(float(found["position_range_px"][0]) / 2, color=GREY, lw=1, ls=":")
+    panel.set_yscale("log")
+    plain_ticks(panel.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
+
+
+def _efficiency_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+    panel.axhline(1.0, zorder=1, **_BOUND)
+    panel.set_ylim(0, 1.35)
+
+
+def _gain_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+    panel.axhline(1.0, zorder=1, **_BOUND)
+
+
+def _outlier_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+    panel.set_yscale("symlog", linthresh=1e-3)
+    plain_ticks(panel.yaxis, (0, 1e-3, 1e-2, 0.1, 0.5))
+    panel.set_ylim(-1e-4, max(2e-3, min(1.0, 1.5 * float(np.nanmax(values)))))
+
+
+def _rms_scale(panel: Axes, found: xarray.Dataset, x: Any, values: Any) -> None:
+    best = found["corrected_rms"].min("arm").values
+    panel.plot(x, best, "o", ms=15, mfc="none", mec="black", mew=1.4, zorder=4)
+    panel.set(xscale="log", yscale="log")
+    plain_ticks(panel.xaxis, (0.3, 0.5, 1, 2, 3, 5, 10))
+    plain_ticks(panel.yaxis, (0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 2))
+    panel.set_ylim(0.85 * best.min(), min(4.0, 1.2 * float(np.nanmax(values))))
+
+
+_SCALES = {
+    "error": _error_scale,
+    "photon_efficiency": _efficiency_scale,
+    "gain": _gain_scale,
+    "outlier_fraction": _outlier_scale,
+    "corrected_rms": _rms_scale,
+}
 
 
 def _drawn_arms(dataset: xarray.Dataset) -> list[str]:
@@ -210,36 +185,5 @@ def _drawn_arms(dataset: xarray.Dataset) -> list[str]:
 def _line_of(arm: str) -> dict[str, Any]:
     """Return the style of a method: solid if it knows the spot, else dashed."""
     style = style_of(arm)
-    return {
-        "label": label_of(arm),
-        "color": style.colour,
-        "marker": style.marker,
-        "ms": 8 if style.marker == "*" else 5.5,
-        "lw": 1.8,
-        "ls": "-" if knows_the_spot(arm) else "--",
-    }
-
-
-def _label(axes: list[Axes], group: _Group, y: str, *, flux: bool = True) -> None:
-    for index, (panel, part) in enumerate(zip(axes, group.panels, strict=True)):
-        panel.set_title(part.title)
-        panel.set_xlabel("side of the sub-aperture over r0")
-        if index % _COLUMNS == 0:
-            panel.set_ylabel(y)
-        if flux:
-            _flux_axis(panel)
-
-
-def _flux_axis(panel: Axes) -> None:
-    panel.set_xscale("log")
-    plain_ticks(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))
-    panel.set_xlabel("signal (photo-electrons per spot)")
-
-
-def _legend(figure: Figure, dataset: xarray.Dataset, *, bound: bool) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], **_line_of(arm)) for arm in _drawn_arms(dataset)]
-    if bound:
-        handles.append(Line2D([], [], color="black", lw=3, alpha=0.35, label="Cramer-Rao bound"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    line = {"label": label_of(arm), "color": style.colour, "marker": style.marker, "lw": 1.8}
+    return {**line, "ms": 8 if style.marker == "*" else 5.5, "ls": "-" if knows_the_spot(arm) else "--"}

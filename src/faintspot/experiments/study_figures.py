@@ -83,7 +83,7 @@ def sweep_figure(dataset: xarray.Dataset, cells: Sequence[int], name: str, title
             _draw_lines(panel, dataset, lines, mode, styles)
             panel.set_title(f"{mode_in_words(mode)}: {profile} spots, positions within ±{reach:g} px")
             panel.axhline(reach / 2, color=GREY, lw=1, ls=":")
-            _label(panel, axis)
+            label_axes(panel, axis)
         panels[0].set_ylabel(ERROR_AXIS)
     _legend(figure, styles)
     fixed = [parameter_in_words(key, table[0][key]) for key in PARAMETERS if key not in (*varied, axis)]
@@ -147,7 +147,7 @@ def baselines_figure(dataset: xarray.Dataset, profile: str) -> FigureWithData | 
                 bars = {"color": style.colour, "marker": style.marker, "ms": 5, "lw": 2, "elinewidth": 1}
                 panel.errorbar(flux, ratio, se, label=label_of(arm), ls=style.line, **bars)
             panel.set_title(f"{mode_in_words(mode)}: {noise:g} e- read noise")
-            _label(panel, "flux_e", log_y=False)
+            label_axes(panel, "flux_e", log_y=False)
         panels[0].set_ylim(lowest, _LARGEST_RATIO)
         panels[0].set_ylabel("R / R without denoising")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -222,7 +222,8 @@ def _limit(panel: Axes, axis: str, values: Any) -> None:
         panel.set_xlim(low - margin, high + margin)
 
 
-def _label(panel: Axes, axis: str, *, log_y: bool = True) -> None:
+def label_axes(panel: Axes, axis: str, *, log_y: bool = True) -> None:
+    """Label the axis of a parameter; the flux's is logarithmic."""
     if axis == "flux_e":
         panel.set_xscale("log")
         plain_ticks(panel.xaxis, (10, 30, 100, 300, 1000, 3000, 10000))

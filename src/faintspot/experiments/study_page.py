@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.claims import fixed_mode, guidance, verdicts
-from faintspot.experiments.efficiency import compares_estimators, findings
+from faintspot.experiments.efficiency import compares_estimators, findings, result_sections
 from faintspot.experiments.estimator_figures import estimator_figures
 from faintspot.experiments.specification import StudySpecification
 from faintspot.experiments.study_figures import (
@@ -181,6 +181,7 @@ def _of_estimators(dataset: xarray.Dataset) -> list[Section]:
     return [
         Section("findings", "What was found", points=found, missing=missing),
         *_figure_sections(dataset),
+        *result_sections(dataset),
         baselines_section(dataset),
     ]
 
