@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import builtins
 import re
 import shutil
 import subprocess
+import symtable
 import sys
 import tomllib
 from pathlib import Path
@@ -85,8 +87,6 @@ def assumed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
         "layout": layout,
         "calibration": calibration,
         "frames": frames,
-        "frame": frames[0],
-        "first_frames": frames[:10],
         "images": images,
         "positions": positions,
         "truth": truth,
@@ -145,6 +145,28 @@ def test_blocks_run(page: Path, names: dict[str, Any]) -> None:
         compiled = compile(code, f"{page.name}, block {number}", "exec")  # also what is not run is Python
         if not any(mark in code for mark in NOT_RUN):
             exec(compiled, names)
+
+
+@pytest.mark.parametrize("page", blocks())
+def test_blocks_name_what_they_need(page: Path) -> None:
+    """A comment of the block names every variable that neither it nor an earlier block of the page makes."""
+    made, unnamed = set(dir(builtins)), []
+    for code in BLOCK.findall(page.read_text(encoding="utf-8")):
+        needed, made_here = variables(symtable.symtable(code, page.name, "exec"))
+        comments = " ".join(re.findall("#.*", code))
+        unnamed += [name for name in needed - made - made_here if not re.search(rf"\b{name}\b", comments)]
+        made |= made_here | needed
+    assert unnamed == []
+
+
+def variables(table: symtable.SymbolTable) -> tuple[set[str], set[str]]:
+    """Return the global names that code reads, and those that it makes."""
+    symbols, top = table.get_symbols(), table.get_type() == "module"
+    read = {symbol.get_name() for symbol in symbols if symbol.is_referenced() and (top or symbol.is_global())}
+    made = {symbol.get_name() for symbol in symbols if top and (symbol.is_assigned() or symbol.is_imported())}
+    for child in table.get_children():
+        read |= variables(child)[0]
+    return read, made
 
 
 def test_names_are_there_after_the_import() -> None:
