@@ -147,7 +147,7 @@ def test_spots_are_predicted_without_the_noise_of_their_positions() -> None:
 
     def scatter(error_px: float) -> float:
         error, psf = np.full((360, 2), error_px), PSF.analytic(radius_px=8)
-        fitted = LearntPSF(psf, np.zeros(1), positions, np.full(360, 100.0), error, ())
+        fitted = LearntPSF(psf, np.zeros(1), positions, np.full(360, 100.0), error)
         return float(_places(question, fitted).std(axis=0).max())
 
     assert scatter(0.5) < 0.5 * scatter(0.01)

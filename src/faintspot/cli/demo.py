@@ -25,7 +25,7 @@ from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 
 if TYPE_CHECKING:
-    from faintspot.recorded.statistics import Arm
+    from faintspot.recorded.statistics import MeasuredSlopes
 
 
 @click.command(short_help="Simulate a faint star, measure it with and without denoising, and write a report.")
@@ -108,7 +108,7 @@ def write_files(
     folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Write new frames at one flux, measure them in both arms with what was chosen; return what it shows."""
-    from faintspot.recorded.statistics import Arm
+    from faintspot.recorded.statistics import MeasuredSlopes
 
     layout = demonstration.demonstration_layout()
     shown = demonstration.FLUXES_E.index(demonstration.SHOWN_FLUX_E)
@@ -125,12 +125,12 @@ def write_files(
         with progress_bar(f"slopes, {name}") as advance:
             measure_recorded([folder / "frames.npy"], config, output, overwrite=True, progress=advance)
         stored = read_slopes(output).variables
-        arms.append(Arm(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations"))))
+        arms.append(MeasuredSlopes(name, *(stored[key] for key in ("x", "y", "flux", "flags", "iterations"))))
         stages[name] = SlopePipeline.from_file(config).explain(frames[0])
     return {"arms": arms, "layout": layout, "stages": stages, "truth": truth}
 
 
-def write_page(folder: Path, arms: list[Arm], **shown: Any) -> None:
+def write_page(folder: Path, arms: list[MeasuredSlopes], **shown: Any) -> None:
     """Make the report."""
     from faintspot.recorded.page import slopes_report
     from faintspot.report.page import write_report

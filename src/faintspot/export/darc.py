@@ -204,9 +204,7 @@ def _frame_of(pipeline: SlopePipeline, windows: Floats) -> NDArray[np.float32]:
     """Return a map of the whole frame, row by row, from maps of each window."""
     layout = pipeline.layout
     frame = np.zeros(layout.frame_shape)
-    rows = layout.corners[:, 0, None, None] + np.arange(layout.window[0])[:, None]
-    columns = layout.corners[:, 1, None, None] + np.arange(layout.window[1])
-    frame[rows, columns] = windows
+    frame[layout.window_pixels] = windows
     return _map(frame)
 
 

@@ -194,9 +194,8 @@ def assembled(layout: Layout, images: NDArray[Any]) -> Floats:
     start = layout.corners.min(axis=0)
     height, width = layout.corners.max(axis=0) - start + np.array(layout.window)
     sheet = np.full((height, width), np.nan)
-    rows = (layout.corners[:, 0] - start[0])[:, None, None] + np.arange(layout.window[0])[:, None]
-    columns = (layout.corners[:, 1] - start[1])[:, None, None] + np.arange(layout.window[1])
-    sheet[rows, columns] = images
+    rows, columns = layout.window_pixels
+    sheet[rows - start[0], columns - start[1]] = images
     return sheet
 
 

@@ -179,11 +179,11 @@ def _truth_cells(
     cells = []
     last = arms[-1]
     for arm in arms:
-        error = slope_error(arm, truth, valid)
+        error, gain = slope_error(arm, truth, valid)
         own = {
-            "slope error R (px)": f"{number_text(error.mean_px, '', 4)} ± "
-            + number_text(error.standard_error_px, "", 2),
-            "centroid gain": number_text(error.gain, "", 3),
+            "slope error R (px)": f"{number_text(error.value, '', 4)} ± "
+            + number_text(error.standard_error, "", 2),
+            "centroid gain": number_text(gain, "", 3),
         }
         cells.append(own | (_against(arm, last, truth, valid) if len(arms) > 1 else {}))
     shared = "valid" if len(arms) == 1 else "valid in every method"

@@ -11,14 +11,13 @@ from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError
 from faintspot.estimators.base import Step
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.pipeline.slopes import Stages
+from faintspot.pipeline.slopes import Slopes, Stages
 from faintspot.recorded.advice import warnings_in_words
 from faintspot.recorded.sections import all_sections, make_run
 from faintspot.recorded.statistics import MeasuredSlopes
 from faintspot.recorded.wavefront_section import wavefront_sections
 from faintspot.report.page import POSITIONS, Page, configuration_section, html_of
 from faintspot.sensor.layout import Layout
-from faintspot.wavefront import Wavefront
 
 
 def slopes_report(
@@ -34,7 +33,7 @@ def slopes_report(
     warnings: Sequence[str] = (),
     why_no_stages: str = "Not drawn: no frame was given.",
     steps: Sequence[Step] = TotalVariation.steps_shown,
-    wavefronts: Mapping[str, Wavefront | str] | None = None,
+    slopes: Mapping[str, Slopes] | None = None,
 ) -> str:
     """Return the report page of a slopes run as HTML: self-contained, without scripts.
 
@@ -61,8 +60,8 @@ def slopes_report(
         What the page says in place of the frame.
     steps : sequence of Step
         Which pictures of the frame are drawn.
-    wavefronts : mapping, optional
-        Wavefronts fitted to the slopes, by arm, or why there is none. Default: no section of them.
+    slopes : mapping of Slopes, optional
+        Slopes by arm, whose wavefronts are shown. Default: no wavefronts.
 
     Raises
     ------
@@ -84,7 +83,7 @@ def slopes_report(
             facts={**facts, "Frames": str(shape[0]), "Sub-apertures": _sensor_in_words(shape[1], layout)},
             sections=[
                 *all_sections(run),
-                *wavefront_sections(wavefronts or {}, layout),
+                *wavefront_sections(slopes or {}, layout),
                 *(configuration_section(text, name) for name, text in configurations.items()),
             ],
             warnings=[*warnings, *run.comparison.warnings(), *warnings_in_words(run.arms, run.summaries)],

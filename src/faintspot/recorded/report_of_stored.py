@@ -17,7 +17,6 @@ from faintspot.recorded.page import slopes_report
 from faintspot.recorded.statistics import ARRAYS, MeasuredSlopes
 from faintspot.recorded.stored_run import StoredRun, open_run
 from faintspot.report.texts import Texts
-from faintspot.wavefront import Wavefront, fit_wavefront
 
 _TEXT = Texts("faintspot.recorded")
 _SAME_PLACE_PX = 1e-4  # the text of a configuration is rounded
@@ -71,7 +70,10 @@ def report_of_stored(paths: Sequence[str | Path], *, frames: Sequence[str | Path
         steps=(first.estimator or TotalVariation).steps_shown,
         warnings=list(dict.fromkeys([*_labelled_notes(stores, arms), *notes])),
         why_no_stages=reason,
-        wavefronts=_wavefronts(stores, arms),
+        slopes={
+            arm.name: Slopes.from_variables(store.stored.variables, arm.n_frames)
+            for store, arm in zip(stores, arms, strict=True)
+        },
     )
 
 
@@ -164,22 +166,6 @@ def _example(
     except InputError as error:
         return None, f"Not drawn: {error}."
     return stages, ""
-
-
-def _wavefronts(stores: Sequence[StoredRun], arms: Sequence[MeasuredSlopes]) -> dict[str, Wavefront | str]:
-    """Fit the wavefronts of every arm, or return why that cannot be done."""
-    layout = stores[0].layout
-    if layout is None:
-        return {}
-    found: dict[str, Wavefront | str] = {}
-    for store, arm in zip(stores, arms, strict=True):
-        try:
-            found[arm.name] = fit_wavefront(
-                Slopes.from_variables(store.stored.variables, arm.n_frames), layout
-            )
-        except InputError as error:
-            found[arm.name] = str(error)
-    return found
 
 
 def _frame(store: StoredRun, number: int, frames: Sequence[str | Path] | None) -> NDArray[Any]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from faintspot.base.checks import finite_array
 from faintspot.base.errors import InputError
 from faintspot.base.flags import INVALID, SubapertureFlag
+from faintspot.experiments.statistics import Estimate, absolute_errors, slope_statistics
 
 Floats = NDArray[np.float64]
 
@@ -112,9 +113,6 @@ class MeasuredSlopes:
         return int(np.count_nonzero((self.flags & int(flag)) == int(flag)))
 
 
-Arm = MeasuredSlopes  # its name in `faintspot.report`
-
-
 @dataclass(frozen=True)
 class SlopesSummary:
     """Slopes in numbers: of the whole run, and per sub-aperture, (n_subapertures,), over its valid frames."""
@@ -123,8 +121,6 @@ class SlopesSummary:
     median_flux_e: float
     """Over all valid measurements; NaN when there is none."""
     median_iterations: float
-    limit_fraction: float
-    """Fraction of the valid measurements that reached the iteration limit."""
     valid_frames: NDArray[np.int64]
     flux_e: Floats
     """Median."""
@@ -158,21 +154,6 @@ class Jitter:
         return self.n_frames >= 2
 
 
-@dataclass(frozen=True)
-class SlopeError:
-    """Distance of an arm's positions from the truth."""
-
-    mean_px: float
-    """R: mean of (|dx| + |dy|) / 2."""
-    standard_error_px: float
-    """NaN from a single measurement."""
-    gain: float
-    """Centroid gain: slope of the estimate on the truth, x and y pooled; NaN where the truth stands
-    still."""
-    n: int
-    """Number of measurements."""
-
-
 def summarise(arm: MeasuredSlopes) -> SlopesSummary:
     """Return the numbers of one arm."""
     valid = arm.valid
@@ -184,12 +165,10 @@ def summarise(arm: MeasuredSlopes) -> SlopesSummary:
             parts[name].append(mean_over_valid(getattr(arm, name)[:, block], kept))
     flux, x, y, iterations = (np.concatenate(part) for part in parts.values())
     some = bool(valid.any())
-    limit = (arm.flags & int(SubapertureFlag.NOT_CONVERGED)) != 0
     return SlopesSummary(
         valid_fraction=float(valid.mean()),
         median_flux_e=float(np.median(arm.flux[valid])) if some else np.nan,
         median_iterations=float(np.median(arm.iterations[valid])) if some else np.nan,
-        limit_fraction=float(limit[valid].mean()) if some else np.nan,
         valid_frames=valid.sum(axis=0),
         flux_e=flux,
         x_px=x,
@@ -272,25 +251,20 @@ def median(values: Floats) -> float:
     return float(np.median(kept)) if kept.size else np.nan
 
 
-def slope_error(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> SlopeError:
-    """Return the slope error R of an arm against the truth (n_frames, n_subapertures, 2), px."""
-    n = int(np.count_nonzero(valid))
-    if n == 0:
-        return SlopeError(np.nan, np.nan, np.nan, 0)
-    errors = absolute_errors(arm, truth)
-    return SlopeError(
-        mean_px=float(errors[valid].mean()),
-        standard_error_px=standard_error(errors, valid),
-        gain=_gain(arm, truth, valid),
-        n=n,
-    )
+def slope_error(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> tuple[Estimate, float]:
+    """Return the slope error R of the selected measurements [px], and their centroid gain."""
+    if not valid.any():
+        return Estimate(np.nan), np.nan
+    found = slope_statistics(arm.x[valid], arm.y[valid], truth[valid])
+    error = standard_error(absolute_errors(arm.x, arm.y, truth), valid)
+    return Estimate(found.error.value, error), found.gain.value
 
 
 def error_ratio(
     arm: MeasuredSlopes, reference: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]
 ) -> tuple[float, float]:
     """Return R of `reference` over R of `arm`, and the ratio's standard error, from paired measurements."""
-    own, other = absolute_errors(arm, truth), absolute_errors(reference, truth)
+    own, other = (absolute_errors(each.x, each.y, truth) for each in (arm, reference))
     own_mean = own[valid].mean() if valid.any() else 0.0
     if own_mean == 0:
         return np.nan, np.nan
@@ -305,12 +279,6 @@ def flux_gain(ratio: float) -> tuple[float, float]:
     less flux means a gain in flux between the ratio and its square.
     """
     return min(ratio, ratio**2), max(ratio, ratio**2)
-
-
-def absolute_errors(arm: MeasuredSlopes, truth: Floats) -> Floats:
-    """Return (|dx| + |dy|) / 2 of every measurement, px."""
-    errors: Floats = (np.abs(arm.x - truth[..., 0]) + np.abs(arm.y - truth[..., 1])) / 2
-    return errors
 
 
 def standard_error(values: Floats, valid: NDArray[np.bool_]) -> float:
@@ -371,14 +339,3 @@ def robust_std_over_valid(values: NDArray[Any], valid: NDArray[np.bool_]) -> Flo
 def _divide(sums: Floats, counts: NDArray[np.int64]) -> Floats:
     quotient: Floats = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
     return quotient
-
-
-def _gain(arm: MeasuredSlopes, truth: Floats, valid: NDArray[np.bool_]) -> float:
-    products, squares = 0.0, 0.0
-    for axis, values in enumerate((arm.x, arm.y)):
-        true = truth[..., axis][valid]
-        true = true - true.mean()
-        products += float(np.sum(true * values[valid]))
-        squares += float(np.sum(true**2))
-    # Below 1e-6 px the truth stands still, whatever its round-off.
-    return products / squares if squares > 1e-12 * np.count_nonzero(valid) else np.nan

@@ -28,7 +28,6 @@ from faintspot.recorded.wavefront_section import wavefront_sections
 from faintspot.report.page import POSITIONS, Page, Section, Table, configuration_section, html_of
 from faintspot.report.texts import Texts
 from faintspot.sensor.layout import Layout
-from faintspot.wavefront import Wavefront, fit_wavefront
 
 _TEXT = Texts("faintspot.recorded")
 _MOST_GAPS, _MOST_CHANGES = 20, 200
@@ -52,7 +51,7 @@ def report_of_telemetry(path: str | Path) -> str:
     sections = [_timing(telemetry), _lost(telemetry)]
     if len(arm_names(telemetry)) > 1:
         sections.append(_arms(telemetry))
-    sections += [_changes(telemetry), *all_sections(run), *wavefront_sections(_wavefronts(telemetry), layout)]
+    sections += [_changes(telemetry), *all_sections(run), *wavefront_sections(_slopes(telemetry), layout)]
     settings = str(telemetry.attributes.get("settings", ""))
     return html_of(
         Page(
@@ -190,16 +189,11 @@ def _changes(telemetry: Telemetry) -> Section:
     return Section("changes", title, tables=[table])
 
 
-def _wavefronts(telemetry: Telemetry) -> dict[str, Wavefront | str]:
-    """Fit the wavefronts of every arm, or return why that cannot be done."""
-    layout = Layout(**telemetry.attributes["layout"])
+def _slopes(telemetry: Telemetry) -> dict[str, Slopes]:
+    """Return the slopes of every arm."""
     names = ("x", "y", "flux", "flags", "iterations", "standard_error_x", "standard_error_y")
-    found: dict[str, Wavefront | str] = {}
+    found = {}
     for arm, name in zip(np.unique(telemetry.arm), arm_names(telemetry), strict=True):
         own = {of: getattr(telemetry, of)[telemetry.arm == arm] for of in names}
-        slopes = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
-        try:
-            found[name] = fit_wavefront(slopes, layout)
-        except InputError as error:
-            found[name] = str(error)
+        found[name] = Slopes(**own, bad_pixels=np.zeros(own["x"].shape, np.int32))
     return found

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from faintspot.base.errors import InputError
+from faintspot.pipeline.slopes import Slopes
 from faintspot.report.page import Section, Table
 from faintspot.report.texts import Texts
 from faintspot.sensor.layout import Layout
-from faintspot.wavefront import Wavefront
+from faintspot.wavefront import fit_wavefront
 from faintspot.wavefront.figure import wavefront_figure
 from faintspot.wavefront.words import mode_table, remarks, rms_table
 
 _TEXT = Texts("faintspot.recorded")
 
 
-def wavefront_sections(wavefronts: Mapping[str, Wavefront | str], layout: Layout | None) -> list[Section]:
-    """Return the section, none without wavefronts; a text in place of one says why it is missing."""
-    if layout is None or not wavefronts:
+def wavefront_sections(slopes: Mapping[str, Slopes], layout: Layout | None) -> list[Section]:
+    """Return the section with the wavefronts fitted to the slopes of each arm; none without a layout."""
+    if layout is None or not slopes:
         return []
     tables, figures, missing = [], [], []
     text = [_TEXT["wavefront.about"]]
-    for number, (name, found) in enumerate(wavefronts.items()):
-        if isinstance(found, str):
-            missing.append(f"Wavefront of {name!r}: {found}.")
+    for number, (name, own) in enumerate(slopes.items()):
+        try:
+            found = fit_wavefront(own, layout)
+        except InputError as error:
+            missing.append(f"Wavefront of {name!r}: {error}.")
             continue
         text += [line for line in remarks(found) if line not in text]
         header, rows = rms_table(found)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from faintspot.sensor.lattice import Lattice
+from faintspot.sensor.neighbours import as_rows, as_tree, links_of
 from faintspot.sensor.nodes import REACH
 
 # In pitches: largest distance of a spot from its node where the matching starts, largest difference between
@@ -43,7 +43,7 @@ class FollowedDrift:
 
     def __call__(self, nodes: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the displacements of spots with nodes at x + 1j * y."""
-        distance, near = _tree(self.nodes).query(_xy(nodes), min(_FITTED, len(self.nodes)))
+        distance, near = as_tree(self.nodes).query(as_rows(nodes), min(_FITTED, len(self.nodes)))
         distance, near = distance.reshape(len(nodes), -1) / self.pitch_px, near.reshape(len(nodes), -1)
         weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / _REACH**2)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -91,8 +91,8 @@ def _matched(spots: NDArray[np.complex128], lattice: Lattice, cells: NDArray[np.
     """Return the index of the spot of each node, -1 if there is none."""
     nodes = lattice.positions(cells)
     neighbours = lattice.neighbours(cells)
-    tree = _tree(spots)
-    distance, nearest = tree.query(_xy(nodes))
+    tree = as_tree(spots)
+    distance, nearest = tree.query(as_rows(nodes))
     matched = np.where(distance < _START * lattice.pitch_px, nearest, -1)
     matched = _agreeing(spots[matched] - nodes, matched, neighbours, _AGREE * lattice.pitch_px)
     for _ in range(_ROUNDS):
@@ -101,7 +101,7 @@ def _matched(spots: NDArray[np.complex128], lattice: Lattice, cells: NDArray[np.
             break
         drift = FollowedDrift(nodes[used], spots[matched[used]] - nodes[used], lattice.pitch_px)
         reached = used | np.append(used, False)[neighbours].any(axis=1)
-        distance, nearest = tree.query(_xy(nodes + drift(nodes)))
+        distance, nearest = tree.query(as_rows(nodes + drift(nodes)))
         near = reached & (distance < _NEAR * lattice.pitch_px)
         before, matched = matched, _each_once(np.where(near, nearest, -1), distance)
         if np.array_equal(before, matched):
@@ -117,9 +117,7 @@ def _agreeing(
 ) -> NDArray[np.int64]:
     """Keep the matches of the largest part of the lattice in which neighbouring displacements agree."""
     count = len(matched)
-    first = np.repeat(np.arange(count), neighbours.shape[1])
-    second = neighbours.ravel()
-    first, second = first[second < count], second[second < count]
+    first, second = links_of(neighbours).T
     alike = (matched[first] >= 0) & (matched[second] >= 0)
     alike &= np.abs(shifts[first] - shifts[second]) < tolerance_px
     links = coo_matrix((np.ones(alike.sum()), (first[alike], second[alike])), shape=(count, count))
@@ -133,11 +131,3 @@ def _each_once(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> NDA
     again = np.zeros(len(matched), dtype=bool)
     again[order[1:]] = matched[order[1:]] == matched[order[:-1]]
     return np.where(again, -1, matched)
-
-
-def _tree(at: NDArray[np.complex128]) -> cKDTree:
-    return cKDTree(_xy(at))
-
-
-def _xy(at: NDArray[np.complex128]) -> NDArray[np.float64]:
-    return np.column_stack([at.real, at.imag])

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from faintspot.sensor.lattice import Lattice
+from faintspot.sensor.neighbours import links_of
 from faintspot.sensor.nodes import SEARCH, NodeFlux
 
 # Signal-to-noise ratio at which a spot is as likely as not: the highest of the 10 to 20 independent noise
@@ -127,7 +128,7 @@ class _Chooser:
     def illuminated(self, reference: float, fraction: float, scatter: float) -> NDArray[np.bool_]:
         """Return the illuminated nodes for a dividing flux that is a fraction of the reference."""
         neighbours = self.lattice.neighbours(self.spots.cells)
-        links = _links(neighbours)
+        links = links_of(neighbours)
         relative = np.maximum(self.spots.flux / reference, 1e-6)
         noise = np.minimum(self.spots.flux_noise / reference / relative, 1.0)
         evidence = np.minimum(np.log(relative / fraction) / np.hypot(scatter, noise), self.detected)
@@ -175,14 +176,6 @@ def _log_scatter(flux: NDArray[np.float64]) -> float:
     """Return the robust standard deviation of the logarithm of the flux, limited to plausible values."""
     logs = np.log(np.maximum(flux, 1e-300))
     return float(np.clip(1.4826 * np.median(np.abs(logs - np.median(logs))), *_SCATTER))
-
-
-def _links(neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the pairs (m, 2) of neighbouring nodes, each once."""
-    count = len(neighbours)
-    first = np.repeat(np.arange(count), neighbours.shape[1])
-    pairs = np.column_stack([first, neighbours.ravel()])
-    return np.asarray(pairs[(pairs[:, 0] < pairs[:, 1]) & (pairs[:, 1] < count)])
 
 
 def _least_cost(evidence: NDArray[np.float64], links: NDArray[np.int64], cost: float) -> NDArray[np.bool_]:

@@ -378,9 +378,13 @@ class Layout:
         array = np.asarray(frame)
         if array.shape[-2:] != self.frame_shape:
             raise InputError(f"frame: expected (height, width) = {self.frame_shape}, got {array.shape[-2:]}")
+        return array[(..., *self.window_pixels)]
+
+    @property
+    def window_pixels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows (n, ny, 1) and columns (n, 1, nx) of the windows' pixels in the frame."""
         rows = self.corners[:, 0, None, None] + np.arange(self.window[0])[:, None]
-        columns = self.corners[:, 1, None, None] + np.arange(self.window[1])
-        return array[..., rows, columns]
+        return rows, self.corners[:, 1, None, None] + np.arange(self.window[1])
 
 
 def _index(chosen: Any, length: int) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from faintspot.base.checks import finite_array, number_between, one_of, real_array
 from faintspot.base.errors import InputError
@@ -16,6 +15,7 @@ from faintspot.sensor.following import follow
 from faintspot.sensor.illumination import Illumination, find_illumination
 from faintspot.sensor.kin import best_kin
 from faintspot.sensor.lattice import RATIOS, SMALLEST_PITCH_PX, Lattice, find_lattice, robust_std
+from faintspot.sensor.neighbours import as_rows, as_tree
 from faintspot.sensor.nodes import (
     Drift,
     NodeFlux,
@@ -171,19 +171,14 @@ def find_lenslets(
         pitch_px=lattice.pitch_px,
         angle_deg=lattice.angle_deg,
         cells=cells - cells.min(axis=0),
-        centres=_rows(at),
+        centres=as_rows(at),
         flux=spots.flux[illuminated.nodes],
-        drifts=_rows(spots.drifts[illuminated.nodes]),
-        spots=_rows(spots.positions[illuminated.nodes] + corner),
+        drifts=as_rows(spots.drifts[illuminated.nodes]),
+        spots=as_rows(spots.positions[illuminated.nodes] + corner),
         spot_px=fit.width_px,
-        elsewhere=_rows(fit.elsewhere + corner),
+        elsewhere=as_rows(fit.elsewhere + corner),
         doubt=illuminated.doubt,
     )
-
-
-def _rows(at: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return complex positions as rows of x, y."""
-    return np.column_stack([at.real, at.imag])
 
 
 def _pitch_range(pitch_px: float | None, shape: tuple[int, ...]) -> tuple[float, float]:
@@ -387,7 +382,7 @@ def _illuminated_of(
     if illuminated.nodes.any():
         likeness = float(np.median(spots.likeness[illuminated.nodes]))
         bright = everywhere.positions[_bright(everywhere, illuminated, likeness)]
-        distance = cKDTree(_rows(spots.positions[illuminated.nodes])).query(_rows(bright))[0]
+        distance = as_tree(spots.positions[illuminated.nodes]).query(as_rows(bright))[0]
         elsewhere = bright[distance > _ELSEWHERE * lattice.pitch_px]
     return _Fit(lattice, width_px, spots, illuminated, bright, elsewhere)
 

@@ -15,7 +15,6 @@ from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.spots.psf import PSF
-from faintspot.training.psf_fit import Form
 from faintspot.training.psf_rounds import (
     LearningOptions,
     State,
@@ -60,8 +59,6 @@ class LearntPSF:
     """Fluxes of the spots, (n,)."""
     standard_error_px: NDArray[np.float64]
     """Standard errors of the positions, (n, 2)."""
-    forms: tuple[Form, ...]
-    """Regularisation of each batch of PSFs, chosen by how well it predicts held-out spots."""
 
 
 def learn_psf(
@@ -252,7 +249,7 @@ def fit_spots(
         wings = known.images(state.found.positions, shape, state.found.flux_e)
     found = state.found
     assert found is not None
-    return LearntPSF(known, state.background_e, found.positions, found.flux_e, found.error_px, (state.form,))
+    return LearntPSF(known, state.background_e, found.positions, found.flux_e, found.error_px)
 
 
 def frame_stack(frames: ArrayLike, layout: Layout, calibration: Calibration) -> Stack:
@@ -382,7 +379,6 @@ def _joined(
         found.positions,
         found.flux_e,
         found.error_px,
-        tuple(state.form for _, state in learnt),
     )
 
 

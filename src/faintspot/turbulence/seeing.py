@@ -35,8 +35,6 @@ class Seeing:
     r0_y_m: float
     r0_kolmogorov_m: float
     """Fried parameter from the same slopes with an infinite outer scale."""
-    slope_std_px: float
-    """Standard deviation of a slope without noise, used for the estimate."""
     noise_std_px: float
     """Standard deviation of the slope noise."""
     frames: int
@@ -191,7 +189,6 @@ def estimate_r0(
         _r0(measured[0], theory[0]),
         _r0(measured[1], theory[1]),
         _r0(measured.sum(), kolmogorov.sum()),
-        math.sqrt(max(0.0, signal.mean())),
         math.sqrt(max(0.0, (total - signal).mean())),
         len(slopes),
     )
