@@ -45,7 +45,9 @@ def test_recorded_telemetry_is_analysed_without_a_simulation() -> None:
 def test_the_example_of_the_manual_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small_interleaved().save(tmp_path / "canary")
     monkeypatch.chdir(tmp_path)
-    text = (Path(__file__).resolve().parents[2] / "docs" / "loop.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "closed_loop.md").read_text(
+        encoding="utf-8"
+    )
     script = re.search(r"```python\n(.*?analyse_telemetry.*?)```", text, re.DOTALL)
     assert script is not None
     names: dict[str, Any] = {}

@@ -46,7 +46,7 @@ def test_frames_that_have_moved(measured: Path, run: Commands) -> None:
 def test_bad_stores(measured: Path, run: Commands) -> None:
     run.refused("report", "nix.zarr", naming=("nix.zarr", "no such file"))
     run.refused("report", "a.npy", naming=("a.npy",))
-    run.refused("report", ".", naming=(".: ", "not a Zarr store"))
+    run.refused("report", ".", naming=(".: ", "Zarr store of slopes"))
     run.refused("report", "slopes.zarr", "plain.npz", "plain.npz", naming=("one file or two", "3"))
     (measured / "text.npz").write_text("nothing")
     run.refused("report", "text.npz", naming=("text.npz", "slopes"))

@@ -15,6 +15,7 @@ BRIGHTEST = arm_kind("brightest")
 KEPT = BRIGHTEST.tuned(small())["keep_brightest"]
 BEST = KEPT.values[2]
 GAINS = BRIGHTEST.tuned(small())[LOOP_GAIN]
+TOP = GAINS.values[-4]
 
 
 class _Record:
@@ -27,13 +28,13 @@ class _Record:
 
 @pytest.fixture
 def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """A loop whose Strehl ratio is highest at gain 0.6 and the best number of pixels; realisations used."""
+    """A loop whose Strehl ratio is highest at the gain TOP and the best number of pixels; realisations used."""
     used: list[int] = []
 
     def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
         used.append(realisation)
         kept = arms[0].settings.keep_brightest
-        return _Record(1 - (arms[0].gain - 0.6) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
+        return _Record(1 - (arms[0].gain - TOP) ** 2 - 0.1 * np.log(kept / BEST) ** 2)
 
     monkeypatch.setattr(tuning, "simulate_loop", simulate)
     return used
@@ -42,22 +43,28 @@ def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_finds_the_top(hill: list[int]) -> None:
     told: list[int] = []
     found = tune(BRIGHTEST, small(), Search(rounds=9), told.append)
-    assert found.choice == {LOOP_GAIN: 0.6, "keep_brightest": BEST}
+    assert found.choice == {LOOP_GAIN: TOP, "keep_brightest": BEST}
     assert found.strehl == pytest.approx(1)
     assert min(hill) >= FIRST_TUNING_REALISATION
     assert told == sorted(told)
 
 
 def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    heights = dict(zip(GAINS.values, (0.0, 0.1, 0.45, 0.6, 0.49, 0.3, 0.4, 0.5, 0.4, 0.3), strict=True))
+    low, middle, high = (GAINS.values.index(gain) for gain in GAINS.first)
+    assert low > 0 and middle - low >= 3  # a top that no first choice is at
+    heights = np.zeros(len(GAINS.values))
+    heights[low - 1 : low + 2] = 0.6, 0.45, 0.3
+    heights[middle], heights[high] = 0.4, 0.5
 
     def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
         kept = arms[0].settings.keep_brightest
-        return _Record(heights[arms[0].gain] - (kept != KEPT.first[0]))
+        return _Record(heights[GAINS.values.index(arms[0].gain)] - (kept != KEPT.first[0]))
 
     monkeypatch.setattr(tuning, "simulate_loop", simulate)
-    assert tune(BRIGHTEST, small(), Search(climbs=1)).choice[LOOP_GAIN] == 0.7  # the best of the coarse ones
-    assert tune(BRIGHTEST, small(), Search()).choice[LOOP_GAIN] == 0.3
+    assert (
+        tune(BRIGHTEST, small(), Search(climbs=1)).choice[LOOP_GAIN] == GAINS.values[high]
+    )  # the best of the coarse ones
+    assert tune(BRIGHTEST, small(), Search()).choice[LOOP_GAIN] == GAINS.values[low - 1]
 
 
 def test_looks_at_no_choice_twice(hill: list[int]) -> None:
@@ -70,7 +77,7 @@ def test_looks_at_no_choice_twice(hill: list[int]) -> None:
 def test_without_rounds_the_best_coarse_choice(hill: list[int]) -> None:
     found = tune(BRIGHTEST, small(), tuning.QUICK)
     nearest = min(KEPT.first, key=lambda kept: abs(np.log(kept / BEST)))
-    assert found.choice == {LOOP_GAIN: 0.7, "keep_brightest": nearest}
+    assert found.choice == {LOOP_GAIN: GAINS.first[-1], "keep_brightest": nearest}
     assert found.tried == 9
 
 

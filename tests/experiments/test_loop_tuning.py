@@ -83,10 +83,10 @@ def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> No
 def test_values_at_the_end_of_what_was_on_offer() -> None:
     kind, loop = arm_kind("window"), small()
     tuned_values = {name: each.values for name, each in kind.tuned(loop).items()}
-    widths = tuned_values["window_fwhm_px"]
-    inside = {LOOP_GAIN: 0.4, "window_fwhm_px": widths[2]}
+    widths, gains = tuned_values["window_fwhm_px"], tuned_values[LOOP_GAIN]
+    inside = {LOOP_GAIN: gains[3], "window_fwhm_px": widths[2]}
     assert values_at_end(kind, loop, inside) == ()
-    assert values_at_end(kind, loop, {**inside, LOOP_GAIN: 0.9}) == (LOOP_GAIN,)
+    assert values_at_end(kind, loop, {**inside, LOOP_GAIN: gains[-1]}) == (LOOP_GAIN,)
     assert values_at_end(kind, loop, {**inside, "window_fwhm_px": widths[0]}) == ("window_fwhm_px",)
 
 

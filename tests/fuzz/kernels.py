@@ -182,6 +182,7 @@ def _measured(
     rows = STAGE_ROWS * int(rng.integers(2))
     stages = guard(np.empty((rows, n_frames, n, pipeline.layout.pixels), np.float32))
     plan.kernel(frames)(source, task, 0, groups, scratch, results, stages)
+    pipeline.flag_doubtful(results)
     return Slopes(*results)
 
 
@@ -194,6 +195,7 @@ def _streamed(pipeline: fs.SlopePipeline, frames: NDArray[Any], at_end: bool) ->
         groups._work = [guarded_tree(work, at_end) for work in groups._work]
         groups._last_rows = guarded(groups._last_rows, at_end)
     assert path.measure(0)
+    path.flag_doubtful()
     return path.slopes
 
 

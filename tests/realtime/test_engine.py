@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from uuid import uuid4
 
@@ -152,9 +153,11 @@ def test_it_is_ready_before_it_waits() -> None:
     assert ended.returncode == 0
 
 
-def test_frames_that_came_before_the_engine_was_there_count(bench: Bench) -> None:
-    """It waited for them: those that are overwritten meanwhile are lost, the others are measured."""
-    data = simulated(10)
+def test_frames_of_a_ring_that_was_waited_for_count(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that are overwritten before the engine attaches are lost; the others are measured."""
+    data, waits, wait = simulated(10), threading.Event(), bench.engine._await_ring
+    monkeypatch.setattr(bench.engine, "_await_ring", lambda: (waits.set(), wait()))
+    assert waits.wait(LIMIT_S)
     with bench.ring() as ring:
         for number, frame in enumerate(data):
             ring.publish(frame, number)
