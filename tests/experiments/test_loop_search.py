@@ -28,7 +28,7 @@ class _Record:
 
 @pytest.fixture
 def hill(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """A loop whose Strehl ratio is highest at the gain TOP and the best number of pixels; realisations used."""
+    """A loop whose Strehl ratio is highest at TOP and the best number of pixels; realisations used."""
     used: list[int] = []
 
     def simulate(configuration: Any, arms: Any, *, realisation: int) -> _Record:
@@ -51,7 +51,8 @@ def test_finds_the_top(hill: list[int]) -> None:
 
 def test_climbs_the_second_hill_too(monkeypatch: pytest.MonkeyPatch) -> None:
     low, middle, high = (GAINS.values.index(gain) for gain in GAINS.first)
-    assert low > 0 and middle - low >= 3  # a top that no first choice is at
+    assert low > 0
+    assert middle - low >= 3  # a top that no first choice is at
     heights = np.zeros(len(GAINS.values))
     heights[low - 1 : low + 2] = 0.6, 0.45, 0.3
     heights[middle], heights[high] = 0.4, 0.5

@@ -156,7 +156,12 @@ def test_it_is_ready_before_it_waits() -> None:
 def test_frames_of_a_ring_that_was_waited_for_count(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames that are overwritten before the engine attaches are lost; the others are measured."""
     data, waits, wait = simulated(10), threading.Event(), bench.engine._await_ring
-    monkeypatch.setattr(bench.engine, "_await_ring", lambda: (waits.set(), wait()))
+
+    def await_ring() -> None:
+        waits.set()
+        wait()
+
+    monkeypatch.setattr(bench.engine, "_await_ring", await_ring)
     assert waits.wait(LIMIT_S)
     with bench.ring() as ring:
         for number, frame in enumerate(data):
