@@ -32,7 +32,6 @@ _ORDER = (
     "live_page",
     "latency",
     "realtime_sustained",
-    "closed_loop_long",
     "pyrtc",
     "pyrtc_loop",
     "loop",
@@ -42,8 +41,8 @@ _ORDER = (
     "gpu",
 )
 NAMES = tuple(name for name in _ORDER if importlib.util.find_spec(f"benchmarks.{name}"))
-LONG = {"realtime_sustained", "closed_loop_long"}
-"""Run only when named, or with --full: 12 and 40 minutes."""
+LONG = {"realtime_sustained"}
+"""Run only when named, or with --full: 12 minutes."""
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _FOLDER = click.option(
     "--folder",

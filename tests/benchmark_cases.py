@@ -23,34 +23,13 @@ def rivals_table(ratio: float = 20.0, spread: float = 0.01) -> Table:
 
 
 def scale_table() -> Table:
-    rows = [
-        Row(
-            f"{n} of {side} x {side}",
-            {
-                "sub-apertures": float(n),
-                "1 core: us per frame": 0.01 * n * side**2,
-                "2 cores: us per frame": 0.006 * n * side**2,
-            },
-        )
-        for side in (8, 16)
-        for n in (36, 1208, 4616)
-    ]
+    rows = [Row(f"{n} of 8 x 8", {"1 core: us per frame": 0.6 * n}) for n in (36, 1208, 4616)]
     return Table("scale", "Scale", rows)
-
-
-def latency_table() -> Table:
-    row = Row("36, 1 thread", {"p50": 110.0, "p99.9/p50": 36.4}, spread={"p99.9/p50": 0.2}, better="lower")
-    return Table("latency", "Latency", [row])
-
-
-def roofline_table() -> Table:
-    row = Row("W = 16", {"bound ns": 4.0, "sweep ns": 5.0, "fraction": 0.8}, ">= 0.75", True)
-    return Table("roofline", "Roofline", [row])
 
 
 def results(
     tables: Sequence[Table] = (), *, started: str = "2026-01-02T03:04:05", machine: dict[str, str] = MACHINE
 ) -> Results:
-    chosen = tables or [rivals_table(), scale_table(), latency_table(), roofline_table()]
+    chosen = tables or [rivals_table(), scale_table()]
     found = [Benchmark(table.name, 1.5, "0.1, 0.2, 0.3", [table]) for table in chosen]
     return Results(started, machine, {"numpy": "2.0"}, found)

@@ -62,13 +62,6 @@ def test_the_spread_of_either_run_widens_the_noise() -> None:
     assert change.noise == pytest.approx(3 * np.sqrt(0.001**2 + 0.1**2 + 2 * 0.02**2))
 
 
-def test_without_a_direction_or_a_spread_nothing_is_judged() -> None:
-    silent = one_row(1.0, 0.01)
-    without = cases.results([Table("table", "Table", [Row("row", {"ratio": 1.0}, ">= 1", True)])])
-    assert not compare.figures(silent)
-    assert not compare.figures(without)
-
-
 def invoke(folder: Path, *arguments: str) -> tuple[int, str]:
     answer = CliRunner().invoke(command.compare_runs, [*arguments, "--folder", str(folder)])
     return answer.exit_code, answer.output
@@ -86,16 +79,6 @@ def test_the_exit_status_says_whether_something_got_worse(tmp_path: Path, ratio:
     code, output = invoke(tmp_path)
     assert code == status
     assert "within noise" in output
-
-
-def test_by_default_it_takes_the_newest_two_of_one_machine(tmp_path: Path) -> None:
-    store(tmp_path, 1, 20.0)
-    store(tmp_path, 2, 90.0, OTHER)
-    store(tmp_path, 3, 15.0)
-    code, output = invoke(tmp_path)
-    assert code == 1
-    assert "2026-01-01" in output
-    assert "2026-01-02" not in output
 
 
 def test_different_machines_are_refused_in_one_line(tmp_path: Path) -> None:
@@ -119,14 +102,6 @@ def test_nothing_to_compare_is_said(tmp_path: Path) -> None:
     assert "no figure is in both" in output
 
 
-def test_what_only_one_run_has_is_counted(tmp_path: Path) -> None:
-    old, new = cases.results([cases.rivals_table()]), cases.results()
-    paths = [results.write(old, tmp_path / "old"), results.write(new, tmp_path / "new")]
-    found, notes = compare.compare(*paths)
-    assert len(found) == 3
-    assert any("0 figures of the old run alone, 1 of the new one" in note for note in notes)
-
-
 def test_spread_is_the_standard_error() -> None:
     rng = np.random.default_rng(1)
     times = {"a": np.exp(rng.normal(0.0, 0.1, 4000)), "b": np.ones(4000)}
@@ -139,19 +114,6 @@ def test_one_disturbed_turn_does_not_widen_the_spread() -> None:
     times = {"a": np.full(100, 2.0), "b": np.ones(100)}
     times["a"][7] = 50.0
     assert set(measuring.ratio(times, "a", "b").spread.values()) == {0.0}
-
-
-def test_what_noise_makes_negative_is_not_judged(tmp_path: Path) -> None:
-    times = {"a": np.array([1.0, 2.0]), "b": np.array([0.5, 3.0])}
-    spread = measuring.spread(times, lambda part: float((part["a"] - part["b"]).min()))
-    assert spread == np.inf
-    stored = results.read(results.write(one_row(1.0, spread, better="higher"), tmp_path))
-    assert not compare.figures(stored)
-
-
-def test_spread_needs_two_turns() -> None:
-    with pytest.raises(ValueError, match="two turns"):
-        measuring.spread({"a": np.ones(1)}, lambda times: 1.0)
 
 
 def test_a_ratio_tells_its_smaller_and_larger_value() -> None:

@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from benchmarks import __main__ as command
-from benchmarks import machine, results, showing
+from benchmarks import machine, results
 from benchmarks.measuring import Row, Table
 from click.testing import CliRunner
 from tests import benchmark_cases as cases
@@ -42,33 +42,6 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path, text: str) -> None:
         results.read(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_newest_come_first_whatever_the_machine(tmp_path: Path) -> None:
-    for day, name in ((1, "z"), (3, "a"), (2, "k")):
-        found = cases.results(started=f"2026-01-0{day}T00:00:00", machine={"processor": name})
-        results.write(found, tmp_path)
-    assert [path.name[:10] for path in results.newest_first(tmp_path)] == [
-        "2026-01-03",
-        "2026-01-02",
-        "2026-01-01",
-    ]
-
-
-def test_the_fingerprint_tells_machines_apart() -> None:
-    found = machine.fingerprint()
-    assert {"processor", "processors", "SIMD lanes (float32)", "kernel", "python", "numba", "numpy"} == set(
-        found
-    )
-    assert machine.short(found) == machine.short(dict(reversed(found.items())))
-    assert machine.short(found) != machine.short({**found, "kernel": "another"})
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.00012, "1e-04"), (0.5, "0.500"), (1.5, "1.50"), (15.25, "15.2"), (36.0, "36")]
-)
-def test_numbers_have_three_digits(value: float, text: str) -> None:
-    assert showing.number(value) == text
 
 
 @pytest.fixture
@@ -104,7 +77,3 @@ def test_an_interrupted_run_keeps_what_was_finished(tmp_path: Path) -> None:
     assert answer.exit_code == 1
     (path,) = results.newest_first(tmp_path)
     assert [each.name for each in results.read(path).benchmarks] == ["rivals"]
-
-
-def test_long_ones_are_known_names() -> None:
-    assert set(command.NAMES) >= command.LONG

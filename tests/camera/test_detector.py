@@ -45,11 +45,6 @@ def test_mean_and_variance(read_noise_e: float, em_gain: float, level: float) ->
 
 
 @pytest.mark.parametrize("em_gain", [1.0, 500.0])
-def test_mean_and_variance_with_background_and_dark(em_gain: float) -> None:
-    check_mean_and_variance(Detector(0.3, em_gain=em_gain, background_e=2.0, dark_e=0.4), 5.0)
-
-
-@pytest.mark.parametrize("em_gain", [1.0, 500.0])
 @pytest.mark.parametrize("gain_e_per_adu", [0.7, 5.0])
 def test_mean_and_variance_quantised(em_gain: float, gain_e_per_adu: float) -> None:
     # Read noise of at least 0.6 ADU, where the rounding error is uniform to 1e-3 of itself.

@@ -147,10 +147,13 @@ class TestValues:
 
 class TestChanges:
     def test_some_places(self) -> None:
-        assert Sample().replaced({"number": 3.0}, [1]).values("number", 3, 16).tolist() == [1, 3, 1]
+        for where in ([1], (1,), np.array([1])):
+            assert Sample().replaced({"number": 3.0}, where).values("number", 3, 16).tolist() == [1, 3, 1]
         each = Sample().replaced({"number": [3.0, 4.0]}, np.array([True, False, True]))
         assert each.values("number", 3, 16).tolist() == [3, 1, 4]
         assert Sample(number=[1, 2]).replaced({"number": 2.5}, 0).number.tolist() == [2.5, 2.0]
+        names = Sample(name=["b", "b"]).replaced({"name": "a"}, 1)
+        assert names.values("name", 2, 16).tolist() == ["b", "a"]
         assert Sample().replaced({"number": 3.0}) == Sample(number=3.0)
 
     @pytest.mark.parametrize(
@@ -161,6 +164,7 @@ class TestChanges:
             ("as many as `where`, got 3", {"number": [1, 2, 3]}, [0, 1]),
             ("where", {"number": 1.0}, [-1]),
             ("where", {"number": 1.0}, [0.5]),
+            ("where", {"number": 1.0}, "all"),
         ],
     )
     def test_refused(self, words: str, changes: dict[str, Any], where: Any) -> None:

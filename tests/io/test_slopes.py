@@ -21,7 +21,6 @@ from tests.io.slope_files import (
     write,
     writer_for,
 )
-from tests.refusals import refused
 
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.io import csv_files, open_frames, read_slopes, slopes_zarr
@@ -291,15 +290,6 @@ class TestRefused:
 
         monkeypatch.setattr(Path, "mkdir", refuse)
         assert_refused(tmp_path / name, "read-only", "choose another folder")
-
-    @pytest.mark.parametrize("name", ["slopes.npz", "slopes.fits", "slopes.fits.gz", "slopes.csv"])
-    def test_damaged_files_are_not_read(self, tmp_path: Path, name: str) -> None:
-        path = tmp_path / name
-        write(path, result(500, 40), 100)
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) // 2 - 7])
-        with refused(name):
-            read_slopes(path)
 
 
 def test_csv_is_written_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

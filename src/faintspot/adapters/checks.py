@@ -16,26 +16,25 @@ from faintspot.base.errors import InputError
 
 
 class UntestedVersionWarning(UserWarning):
-    """Warning for a tool outside the range of versions that its adapter was tested with."""
+    """Warning for another version of a tool than its adapter was tested with."""
 
 
 @functools.cache
-def check_version(tool: str, distribution: str, oldest: str, newest: str) -> None:
-    """Warn once if a tool's version is outside the range that its adapter was tested with.
+def check_version(tool: str, distribution: str, tested: str) -> None:
+    """Warn once if a tool's version is not the one that its adapter was tested with.
 
     Parameters
     ----------
     tool, distribution : str
         Name of the tool, and of its installed distribution.
-    oldest, newest : str
-        Range of tested versions.
+    tested : str
+        Tested version.
     """
     try:
         version = importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
         return  # used from source: its version is not known
-    if not _numbers(oldest) <= _numbers(version) <= _numbers(newest):
-        tested = oldest if oldest == newest else f"{oldest} to {newest}"
+    if _numbers(version) != _numbers(tested):
         warnings.warn(
             f"{tool} {version}: faintspot's adapter was tested with {tested}; compare its slopes with "
             f"{tool}'s own before you rely on them",

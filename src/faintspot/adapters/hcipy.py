@@ -22,7 +22,7 @@ try:
 except ImportError:
     raise MissingExtraError("hcipy", "loop", "faintspot.adapters.hcipy") from None
 
-TESTED = "0.7.1", "0.7.1"
+TESTED = "0.7.1"
 
 
 class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
@@ -84,7 +84,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         predict: Any = None,
         **options: Unpack[AdapterOptions],
     ) -> None:
-        check_version("HCIPy", "hcipy", *TESTED)
+        check_version("HCIPy", "hcipy", TESTED)
         self.mla_grid = mla_grid
         self.mla_index = mla_index
         self.detector_grid = _checked_grid(mla_index if detector_grid is None else detector_grid)

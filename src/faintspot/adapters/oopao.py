@@ -16,7 +16,7 @@ from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
 
-TESTED = "1.0.0", "1.0.0"
+TESTED = "1.0.0"
 _LEAST_UNIT = 1e-6  # smallest unit of OOPAO's slopes; a tilt of one pixel gives about 1
 
 
@@ -66,7 +66,7 @@ class Attached:
     ) -> None:
         if getattr(wfs, "tag", None) != "shackHartmann":
             raise InputError(f"wfs: expected OOPAO's ShackHartmann, got {type(wfs).__name__}")
-        check_version("OOPAO", "oopao", *TESTED)
+        check_version("OOPAO", "oopao", TESTED)
         if wfs.is_geometric:
             raise InputError("wfs.is_geometric = True: expected a diffractive sensor, which has images")
         self.wfs = wfs

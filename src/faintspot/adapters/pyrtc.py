@@ -24,7 +24,7 @@ from faintspot.adapters.checks import check_version
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.realtime.stream import Follower
 
-TESTED = "2.1.0", "2.1.0"
+TESTED = "2.1.0"
 _MOMENT_S = 0.1
 _logger = logging.getLogger(__name__)
 PREDICTED = "predicted"
@@ -44,7 +44,7 @@ def _pyrtc() -> Any:
         import pyrtc
     except ImportError:
         raise MissingExtraError("pyrtc", "pyrtc", "faintspot.adapters.pyrtc") from None
-    check_version("pyRTC", "pyrtcao", *TESTED)
+    check_version("pyRTC", "pyrtcao", TESTED)
     return pyrtc
 
 

@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
 
-TESTED = "0.15.0", "0.15.0"
+TESTED = "0.15.0"
 
 
 def attach(
@@ -64,7 +64,7 @@ class Attached:
         centroiders = getattr(sys.modules.get(type(wfs).__module__), "centroiders", None)
         if centroiders is None or not hasattr(wfs, "centSubapArrays"):
             raise InputError(f"wfs: expected soapy's ShackHartmann, got {type(wfs).__name__}")
-        check_version("soapy", "soapy", *TESTED)
+        check_version("soapy", "soapy", TESTED)
         self.wfs, self._centroiders = wfs, centroiders
         self._n, side = int(wfs.n_subaps), int(wfs.nx_subap_pixels)
         self._first = 0.5 * (side - 1)

@@ -23,7 +23,7 @@ try:
 except ImportError:
     raise MissingExtraError("specula", "specula", "faintspot.adapters.specula") from None
 
-TESTED = "1.1.0", "1.1.0"
+TESTED = "1.1.0"
 
 
 class FaintspotSlopec(Slopec):  # type: ignore[misc]
@@ -67,7 +67,7 @@ class FaintspotSlopec(Slopec):  # type: ignore[misc]
         target_device_idx: int | None = None,
         precision: int | None = None,
     ) -> None:
-        check_version("SPECULA", "specula", *TESTED)
+        check_version("SPECULA", "specula", TESTED)
         for part in () if filtmat is None else filtmat:
             check_matrix("filtmat", cpuArray(part))
         self.subapdata = subapdata  # used by the base class for the number of sub-apertures
