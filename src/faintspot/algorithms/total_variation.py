@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,29 +44,31 @@ class Denoised(NamedTuple):
     """Whether the strength exceeds the limit; the result is then the mean, or uses a lower strength."""
 
 
+class Denoising(TypedDict, total=False):
+    """Options of `tv_denoise`."""
+
+    algorithm: str
+    tolerance: float | None
+    max_iterations: int | None
+    preset: str
+    lower_strength: bool
+
+
 @overload
 def tv_denoise(
     images: ArrayLike,
     noise_std: ArrayLike,
     *,
-    algorithm: str = ...,
-    tolerance: float | None = ...,
-    max_iterations: int | None = ...,
-    preset: str = ...,
-    lower_strength: bool = ...,
     full_output: Literal[False] = ...,
+    **options: Unpack[Denoising],
 ) -> NDArray[Any]: ...
 @overload
 def tv_denoise(
     images: ArrayLike,
     noise_std: ArrayLike,
     *,
-    algorithm: str = ...,
-    tolerance: float | None = ...,
-    max_iterations: int | None = ...,
-    preset: str = ...,
-    lower_strength: bool = ...,
     full_output: Literal[True],
+    **options: Unpack[Denoising],
 ) -> Denoised: ...
 def tv_denoise(
     images: ArrayLike,

@@ -7,7 +7,7 @@ the value, what it was and what was expected.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,13 @@ def image_stack(name: str, value: Any) -> NDArray[np.floating[Any]]:
     return np.ascontiguousarray(array, dtype=dtype)
 
 
+class NumberKind(TypedDict, total=False):
+    """Options of `numbers_between`."""
+
+    integer: bool
+    low_open: bool
+
+
 def numbers_between(
     name: str,
     value: Any,
@@ -107,16 +114,10 @@ def numbers_between(
 
 
 def number_between(
-    name: str,
-    value: Any,
-    low: float = -np.inf,
-    high: float = np.inf,
-    *,
-    integer: bool = False,
-    low_open: bool = False,
+    name: str, value: Any, low: float = -np.inf, high: float = np.inf, **kind: Unpack[NumberKind]
 ) -> float:
     """Return one number within the range, like `numbers_between`; as float (exact for whole numbers)."""
-    array = numbers_between(name, value, low, high, integer=integer, low_open=low_open)
+    array = numbers_between(name, value, low, high, **kind)
     if array.ndim:
         raise InputError(f"{name}: expected one number, got an array of shape {array.shape}")
     return float(array)

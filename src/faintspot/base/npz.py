@@ -6,10 +6,10 @@ import lzma
 import math
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, ClassVar, Self
 
 import numpy as np
 
@@ -29,8 +29,6 @@ DAMAGE = (
     NotImplementedError,
 )
 """Exceptions of the gzip and zip decoders."""
-
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -167,30 +165,38 @@ def read_arrays(
     return values
 
 
-def save_fields(path: str | Path, item: object, names: Sequence[str]) -> None:
-    """Write the named attributes that are not None, with `save_arrays`.
+class NpzFile:
+    """Object with arrays and numbers that are its constructor's arguments, saved in an .npz file."""
 
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    values = {name: getattr(item, name) for name in names}
-    save_arrays(path, {name: value for name, value in values.items() if value is not None})
+    WHAT: ClassVar[str]
+    """What a file holds, for errors."""
+    FIELDS: ClassVar[tuple[str, ...]]
+    """Names of the values in a file."""
+    OPTIONAL: ClassVar[tuple[str, ...]] = ("index",)
+    """Names of those that may be None."""
 
+    def save(self, path: str | Path) -> None:
+        """Write the values to a file (.npz).
 
-def load_fields(
-    make: Callable[..., Made], path: str | Path, what: str, names: Sequence[str], optional: Sequence[str] = ()
-) -> Made:
-    """Return the object that `make` constructs from the arrays written by `save_fields`; see `read_arrays`.
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        values = {name: getattr(self, name) for name in self.FIELDS}
+        save_arrays(path, {name: value for name, value in values.items() if value is not None})
 
-    Raises
-    ------
-    InputError
-        As for `read_arrays`; errors of `make` with the file's name.
-    """
-    values = read_arrays(path, what, names, optional)
-    try:
-        return make(**values)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a file written by `save`.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read or holds something else.
+        """
+        values = read_arrays(path, cls.WHAT, cls.FIELDS, cls.OPTIONAL)
+        try:
+            return cls(**{name: value if value.ndim else value.item() for name, value in values.items()})
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,11 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.npz import load_fields, save_fields
+from faintspot.base.npz import NpzFile
 
 Floats = NDArray[np.float64]
 
-_FIELDS = ("x", "y", "mean_spot", "flux", "index")
 _LARGEST = 1e6  # px, or fractions of the flux, for one pixel: above it, float32 sums are meaningless
 _SMALLEST_GAIN = 0.02
 _LEAST_WEIGHT = 1e-4  # of the largest: less counts nothing, and need not be read
@@ -36,7 +34,7 @@ class WeightedCentre(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FixedWeights:
+class FixedWeights(NpzFile):
     """Weights of the pixels of a sub-aperture whose sums are its slopes; immutable.
 
     A spot with image g, in fractions of its flux, is at ``sum x (g - mean_spot)`` px from its reference
@@ -66,6 +64,10 @@ class FixedWeights:
     >>> cell = np.array([[-1.0, 1.0], [-1.0, 1.0]])
     >>> quad_cell = fs.FixedWeights(0.8 * cell, 0.8 * cell.T, np.full((2, 2), 0.25))
     """
+
+    WHAT = "fixed weights"
+    FIELDS = ("x", "y", "mean_spot", "flux", "index")
+    OPTIONAL = ("flux", "index")
 
     x: Any
     y: Any
@@ -226,27 +228,6 @@ class FixedWeights:
         weights[np.abs(weights) < _LEAST_WEIGHT * np.abs(weights).max()] = 0.0
         along, across = weights.T.reshape(2, *shape)
         return cls(along, across, mean.reshape(shape), _best_flux(mean, variance).reshape(shape))
-
-    def save(self, path: str | Path) -> None:
-        """Write the weights to a file (.npz).
-
-        Raises
-        ------
-        InputError
-            If the file cannot be written.
-        """
-        save_fields(path, self, _FIELDS)
-
-    @classmethod
-    def load(cls, path: str | Path) -> FixedWeights:
-        """Read weights written by `save`.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read or holds something else.
-        """
-        return load_fields(cls, path, "fixed weights", _FIELDS, optional=("flux", "index"))
 
 
 def _pairs(first: Floats, second: Floats) -> tuple[tuple[Floats, Floats], ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import LARGEST_FLOAT32, number_between, numbers_between
 from faintspot.base.errors import InputError
-from faintspot.base.npz import load_fields, save_fields
+from faintspot.base.npz import NpzFile
 from faintspot.base.sizes import check_size
 from faintspot.spots.shapes import image_shape, per_spot, position_array, spots
 
 Floats = NDArray[np.float64]
 
-_FIELDS = ("samples", "oversampling", "index")
 _ANALYTIC_OVERSAMPLING = 8
 _LARGEST_RADIUS_PX = 128.0  # a window of the largest size needs 91 from corner to corner
 _LONGEST_SIDE = 4097  # above it, the singular value decomposition takes minutes
@@ -29,7 +27,7 @@ _LARGEST_FRACTION = 1e6  # of a spot's flux in a pixel: above it, samples cancel
 
 
 @dataclass(frozen=True, eq=False)
-class PSF:
+class PSF(NpzFile):
     """An effective, super-sampled point-spread function, for a whole sensor or for each sub-aperture.
 
     "Effective" means integrated over the pixel (Anderson & King 2000, PASP 112, 1360). The PSF is a cubic
@@ -60,6 +58,9 @@ class PSF:
     >>> print(psf.fwhm_px.round(2))
     [[1.87 1.87]]
     """
+
+    WHAT = "a PSF"
+    FIELDS = ("samples", "oversampling", "index")
 
     samples: Any
     oversampling: int
@@ -276,27 +277,6 @@ class PSF:
             remaining = self.samples - _outer(u, s, vt, rank)
         root = np.sqrt(s[:, :rank, None])
         return root * vt[:, :rank], root * np.swapaxes(u, 1, 2)[:, :rank]
-
-    def save(self, path: str | Path) -> None:
-        """Write an .npz file.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written.
-        """
-        save_fields(path, self, _FIELDS)
-
-    @classmethod
-    def load(cls, path: str | Path) -> PSF:
-        """Read a PSF written by `save`.
-
-        Raises
-        ------
-        InputError
-            If it cannot be read or is not a PSF.
-        """
-        return load_fields(cls, path, "a PSF", _FIELDS, optional=("index",))
 
 
 def _outer(u: Floats, s: Floats, vt: Floats, rank: int) -> Floats:

@@ -12,17 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from faintspot.base.checks import finite_array, image_stack, number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
-from faintspot.base.npz import load_fields, save_fields
+from faintspot.base.npz import NpzFile
 from faintspot.spots.fixed_weights import FixedWeights
 
 STARTS = ("reference", "peak")
 _LARGEST_PX = 1e6  # for a table or an error: larger than any frame
 _BLOCK_IMAGES = 4096  # images processed at a time, to limit the memory of the gathered tables
-_FIELDS = ("tables", "flux_e", "standard_error_px", "steps_per_px", "start", "smoothing_px", "index")
 
 
 @dataclass(frozen=True, eq=False)
-class TrainedScore:
+class TrainedScore(NpzFile):
     """Tables of the trained linear score, made by `faintspot.train_estimator`; immutable.
 
     A pass changes the position x to ``q + sum psi(u - q) g / F``: q is x rounded to the grid of the table
@@ -63,6 +62,9 @@ class TrainedScore:
     >>> print(f"R = {np.abs(score.apply(images, 50.0) - truth).mean():.2f} px")
     R = 0.09 px
     """
+
+    WHAT = "a trained score"
+    FIELDS = ("tables", "flux_e", "standard_error_px", "steps_per_px", "start", "smoothing_px", "index")
 
     tables: NDArray[np.float32]
     flux_e: NDArray[np.float64]
@@ -107,7 +109,7 @@ class TrainedScore:
         mine, theirs = vars(self), vars(other)
         return all(
             (mine[name] is None) == (theirs[name] is None) and np.array_equal(mine[name], theirs[name])
-            for name in _FIELDS
+            for name in self.FIELDS
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -228,31 +230,6 @@ class TrainedScore:
             members = np.flatnonzero((kinds == kind) & (classes == level))
             for first in range(0, len(members), _BLOCK_IMAGES):
                 yield int(kind), int(level), members[first : first + _BLOCK_IMAGES]
-
-    def save(self, path: str | Path) -> None:
-        """Write the score to a file (.npz).
-
-        Raises
-        ------
-        InputError
-            If the file cannot be written.
-        """
-        save_fields(path, self, _FIELDS)
-
-    @classmethod
-    def load(cls, path: str | Path) -> TrainedScore:
-        """Read a score written by `save`.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read or holds something else.
-        """
-        return load_fields(cls._stored, path, "a trained score", _FIELDS, optional=("index",))
-
-    @classmethod
-    def _stored(cls, *, start: Any, **values: Any) -> TrainedScore:
-        return cls(start=str(start), **values)
 
 
 Score = TrainedScore | FixedWeights
