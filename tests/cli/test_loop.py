@@ -55,7 +55,7 @@ def test_magnitude(run: Commands) -> None:
         "loop", "magnitude", "small.toml", "--quick", "--workers", 0, "--methods", "brightest", "-o", "here"
     )
     assert result.code == 0, result.err
-    assert result.out.splitlines()[0].split() == ["photo-electrons", "40", "400"]
+    assert result.out.splitlines()[1].startswith("brightest pixels")
     assert Path("here/report.html").is_file()
 
 
@@ -63,8 +63,8 @@ def test_budget(run: Commands) -> None:
     result = run("loop", "budget", "small.toml", "--quick", "--workers", 0, "--methods", "centroid")
     assert result.code == 0, result.err
     lines = result.out.splitlines()
-    assert lines[0].split() == ["without", "centre", "of", "gravity"]
-    assert lines[2].startswith("slope error")
+    assert lines[1].startswith("centre of gravity")
+    assert "slope error" in lines[2]
     assert lines[-1] == "small-quick/report.html: open it in a browser"
 
 

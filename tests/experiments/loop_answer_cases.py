@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
-from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
-from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, arm_kind
+from faintspot.experiments.loop_answer import LoopAnswer
+from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Tunable, arm_kind
 from faintspot.experiments.loop_question import LoopQuestion
+from faintspot.experiments.loop_results import MagnitudeResult
 
 PHOTONS = (5.0, 14.0, 40.0, 100.0, 320.0)
 BRIGHT = 0.8
@@ -39,15 +41,35 @@ def made_up(
     rng = np.random.default_rng(5)
     magnitudes = question.configuration.photometry.magnitude(PHOTONS)
     atmosphere = rng.normal(0.0, 0.02, (len(PHOTONS), realisations))
-    results = []
-    for name, shift in shifts.items():
-        kind = arm_kind(name)
-        strehl = (
+    kinds = [arm_kind(name) for name in shifts]
+    strehl = np.array(
+        [
             strehl_of(magnitudes, shift)[:, None] + atmosphere + rng.normal(0.0, scatter, atmosphere.shape)
-        )
-        tuned = kind.tuned(question.configuration)
-        choice = {option: _VALUES.get(option, each.first[0]) for option, each in tuned.items()}
-        ends = tuple(("window_fwhm_px",) if name == "window" else () for _ in PHOTONS)
-        gain = np.full(strehl.shape, 0.9)
-        results.append(LoopArmResult(kind, (choice,) * len(PHOTONS), np.maximum(strehl, 0.0), gain, ends))
-    return LoopAnswer(question, tuple(results), np.array(PHOTONS), 300, {"map+kalman": "no time"})
+            for shift in shifts.values()
+        ]
+    )
+    shape = strehl.shape[:2]
+    choices = [
+        json.dumps({name: _value(kind, name, each) for name, each in kind.tuned(configuration()).items()})
+        for kind in kinds
+    ]
+    measured = MagnitudeResult(
+        tuple(kind.name for kind in kinds),
+        tuple(kind.label for kind in kinds),
+        np.array(PHOTONS),
+        magnitudes,
+        np.maximum(strehl, 0.0),
+        np.full(strehl.shape, 0.9),
+        np.full(shape, ""),
+        np.repeat(np.array(choices)[:, None], shape[1], axis=1),
+        np.zeros((*shape, 1, 1), np.float32),
+        configuration().to_text(),
+    )
+    return LoopAnswer(question, measured, 300, {"map+kalman": "no time"})
+
+
+def _value(kind: ArmKind, name: str, tunable: Tunable) -> Any:
+    """Return a value that is not the last on offer, but for the window's width."""
+    if (kind.name, name) == ("window", "window_fwhm_px"):
+        return tunable.values[-1]
+    return _VALUES.get(name, tunable.first[0])

@@ -7,7 +7,7 @@ import pytest
 
 from faintspot.experiments.budget import TERMS
 from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
-from faintspot.experiments.loop_verdict import budget_summary, magnitude_summary
+from faintspot.experiments.loop_verdict import LoopResults, loop_summary
 
 
 @pytest.fixture
@@ -30,29 +30,25 @@ def result() -> MagnitudeResult:
     )
 
 
+def summary(result: MagnitudeResult, realisations: int = 5) -> str:
+    few = {name: getattr(result, name)[:, :, :realisations] for name in ("strehl", "centroid_gain")}
+    return loop_summary(LoopResults(magnitude=replace(result, **few)))
+
+
 def test_magnitude(result: MagnitudeResult) -> None:
-    lines = magnitude_summary(result).splitlines()
-    assert lines[0].split() == ["photo-electrons", "10", "40", "160"]
-    assert lines[1].split() == ["magnitude", "13.0", "11.5", "10.0"]
+    heading, brightest, *rest = summary(result).splitlines()
+    assert "10 e⁻, 13.0 mag" in heading
     error = np.std([-0.1, 0.0, 0.1, 0.05, -0.05], ddof=1) / np.sqrt(5)
-    assert lines[2].split() == ["brightest", "pixels", "0.200", f"±{error:.3f}", "0.400", f"±{error:.3f}",
-                                "0.600", f"±{error:.3f}"]  # fmt: skip
-    assert any(line.startswith("TV raises the Strehl ratio nowhere beyond its error") for line in lines)
+    words = "brightest pixels", *(f"{value:.3f} ± {error:.3f}" for value in (0.2, 0.4, 0.6))
+    assert brightest.split() == " ".join(words).split()
+    assert any(line.startswith("TV raises the Strehl ratio nowhere beyond its error") for line in rest)
 
 
-def test_one_realisation_has_no_error(result: MagnitudeResult) -> None:
-    single = replace(result, strehl=result.strehl[:, :, :1], centroid_gain=result.centroid_gain[:, :, :1])
-    text = magnitude_summary(single)
-    assert "nan" not in text
-    assert "0.100 ±?" in text
-
-
-def test_two_realisations_name_no_gain(result: MagnitudeResult) -> None:
-    """Not a figure of a gain whose error is not known."""
-    few = replace(result, strehl=result.strehl[:, :, :2], centroid_gain=result.centroid_gain[:, :, :2])
-    text = " ".join(magnitude_summary(few).split())
-    assert "gain in limiting magnitude: too few realisations for an interval" in text
-    assert " mag." not in text
+def test_few_realisations_have_no_error_and_name_no_gain(result: MagnitudeResult) -> None:
+    single = summary(result, 1)
+    assert "nan" not in single
+    assert "0.100 ±" not in single
+    assert "limiting magnitude" not in summary(result, 2)  # not a figure of a gain whose error is not known
 
 
 def test_budget() -> None:
@@ -60,6 +56,6 @@ def test_budget() -> None:
     strehl = np.broadcast_to(np.linspace(0.3, 0.9, len(TERMS))[:, None], shape)
     residual = np.full(shape, 150.0)
     result = BudgetResult(("brightest",), tuple(TERMS), ("brightest pixels",), strehl, residual)
-    lines = budget_summary(result).splitlines()
-    assert lines[1].split() == ["nothing", "0.300", "±0.000", "150", "±0", "nm"]
-    assert "without slope error: slopes are the mean gradients of the wavefront" in lines
+    lines = loop_summary(LoopResults(budget=result)).splitlines()
+    assert len(lines) == 1 + len(TERMS)
+    assert lines[1].split() == ["brightest", "pixels", "–", "0.300", "±", "0.000", "150", "±", "0"]

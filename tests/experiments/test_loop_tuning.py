@@ -1,17 +1,20 @@
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from tests.experiments.experiment_cases import HERE, StopsAfter, assert_same_units, small
+from tests.experiments.loop_answer_cases import configuration, made_up
 
 from faintspot.base.errors import InputError
 from faintspot.experiments.loop_answer import LoopAnswer
 from faintspot.experiments.loop_arms import LOOP_GAIN, arm_kind
 from faintspot.experiments.loop_question import LoopQuestion
-from faintspot.experiments.loop_tuning import LoopPlan, tune_loop, values_at_end
+from faintspot.experiments.loop_tuning import LoopPlan, tune_loop
 from faintspot.experiments.running import WorkerPool
 from faintspot.experiments.search import Search
 
@@ -39,14 +42,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LoopAnswer]:
 
 def test_answer(whole: tuple[Path, LoopAnswer]) -> None:
     _, answer = whole
-    assert [result.name for result in answer.results] == ["brightest", "window", "window+kalman"]
+    assert list(answer.kinds) == ["brightest", "window", "window+kalman"]
     assert (answer.photons.shape, answer.realisations, answer.scored_frames) == ((3,), 2, 20)
-    for result in answer.results:
-        assert result.strehl.shape == result.centroid_gain.shape == (3, 2)
-        assert (result.strehl > 0).all()
-    assert (answer["window"].strehl[-1] > answer["window"].strehl[0]).all()  # six times the flux
+    assert answer.measured.strehl.shape == answer.measured.centroid_gain.shape == (3, 3, 2)
+    assert (answer.measured.strehl > 0).all()
+    assert (answer.runs("window")[-1] > answer.runs("window")[0]).all()  # six times the flux
     # What learns has the estimator's options that were tuned with the integrator.
-    for plain, learning in zip(answer["window"].choices, answer["window+kalman"].choices, strict=True):
+    for flux in range(3):
+        plain, learning = answer.choice("window", flux), answer.choice("window+kalman", flux)
         assert all(learning[name] == plain[name] for name in plain if name != LOOP_GAIN)
         assert "noise_scale" in learning
 
@@ -57,7 +60,7 @@ def test_interrupted_it_goes_on_to_the_same_answer(tmp_path: Path, whole: tuple[
         tuned(tmp_path, WorkerPool(0, progress=StopsAfter(60)))
     again = tuned(tmp_path)
     assert_same_units(tmp_path, folder)
-    np.testing.assert_array_equal(again["window+kalman"].strehl, answer["window+kalman"].strehl)
+    np.testing.assert_array_equal(again.runs("window+kalman"), answer.runs("window+kalman"))
 
 
 def test_candidates_that_there_is_no_time_for_are_left_out(
@@ -65,10 +68,10 @@ def test_candidates_that_there_is_no_time_for_are_left_out(
 ) -> None:
     monkeypatch.setattr(LoopQuestion, "_default", lambda self: ["window+kalman"])
     answer = tuned(tmp_path, arms=None, minutes=1e-6)
-    assert [result.name for result in answer.results] == ["brightest", "window"]
+    assert list(answer.kinds) == ["brightest", "window"]
     assert "of the 1e-06 minutes" in answer.left_out["window+kalman"]
     answer = tuned(tmp_path, arms=None, minutes=5.0)
-    assert answer.results[-1].name == "window+kalman"
+    assert "window+kalman" in answer.kinds
 
 
 def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> None:
@@ -80,20 +83,22 @@ def test_another_loop_in_the_folder_is_refused_or_replaced(tmp_path: Path) -> No
     assert answer.question is other
 
 
-def test_values_at_the_end_of_what_was_on_offer() -> None:
-    kind, loop = arm_kind("window"), small()
-    tuned_values = {name: each.values for name, each in kind.tuned(loop).items()}
-    widths, gains = tuned_values["window_fwhm_px"], tuned_values[LOOP_GAIN]
-    inside = {LOOP_GAIN: gains[3], "window_fwhm_px": widths[2]}
-    assert values_at_end(kind, loop, inside) == ()
-    assert values_at_end(kind, loop, {**inside, LOOP_GAIN: gains[-1]}) == (LOOP_GAIN,)
-    assert values_at_end(kind, loop, {**inside, "window_fwhm_px": widths[0]}) == ("window_fwhm_px",)
-
-
-def test_a_choice_that_cannot_be_beyond_is_not_at_an_end() -> None:
-    kind, loop = arm_kind("map_predicted"), small()
-    values = {name: each.values[0] for name, each in kind.tuned(loop).items()}
-    assert "model_error" not in values_at_end(kind, loop, {**values, "model_error": 0.0})
+@pytest.mark.parametrize(
+    ("name", "option", "place", "at_end"),
+    [
+        ("window", LOOP_GAIN, 3, False),
+        ("window", LOOP_GAIN, -1, True),
+        ("window", "window_fwhm_px", 0, True),
+        ("map_predicted", "model_error", 0, False),  # it cannot be beyond
+    ],
+)
+def test_values_at_the_end_of_what_was_on_offer(name: str, option: str, place: int, at_end: bool) -> None:
+    answer = made_up({"brightest": -2.0, name: 0.0})
+    tuned_values = {each: tunable.values for each, tunable in arm_kind(name).tuned(configuration()).items()}
+    choice = {each: values[len(values) // 2] for each, values in tuned_values.items()}
+    text = json.dumps({**choice, option: tuned_values[option][place]})
+    measured = replace(answer.measured, choices=np.full(answer.measured.choices.shape, text))
+    assert (option in replace(answer, measured=measured).at_end(name, 0)) is at_end
 
 
 def test_bad_input(tmp_path: Path) -> None:

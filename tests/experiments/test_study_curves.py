@@ -28,9 +28,10 @@ def test_curve_holds_the_cells_of_a_configuration_by_flux() -> None:
     found = study_curves(study, "best")
     assert [configuration.size for configuration in found] == [1.0, 2.0]
     assert np.all(np.diff(found[CONFIGURATION].flux_e) > 0)
-    r, se = found[CONFIGURATION].at(30.0, "brightest") or (0.0, 0.0)
-    assert r == power_law(gain_of)(cells()[1], "brightest", "best")
-    assert se == pytest.approx(0.003 * r)
+    r = found[CONFIGURATION].at(30.0, "brightest")
+    assert r is not None
+    assert r.value == power_law(gain_of)(cells()[1], "brightest", "best")
+    assert r.standard_error == pytest.approx(0.003 * r.value)
     assert found[CONFIGURATION].at(31.0, "brightest") is None
 
 
@@ -40,8 +41,9 @@ def test_unfinished_cells_are_left_out() -> None:
 
 def test_gain_at_an_error_is_that_at_the_flux_where_it_is_reached() -> None:
     item = curve()
-    r, _ = item.at(80.0, "brightest") or (0.0, 0.0)
-    by_error = gain_at_error(item, r, np.random.default_rng(1), **TV_OVER_NO_TV)
+    r = item.at(80.0, "brightest")
+    assert r is not None
+    by_error = gain_at_error(item, r.value, np.random.default_rng(1), **TV_OVER_NO_TV)
     by_flux = gain_at_flux(item, 80.0, np.random.default_rng(1), **TV_OVER_NO_TV)
     assert by_error is not None
     assert by_flux is not None

@@ -28,4 +28,4 @@ def test_gains_of_every_mode_and_none_where_there_is_no_crossing() -> None:
     # 10,000 spots give 1.24 and 1.77; 300 scored spots at each flux leave errors of about 10 %.
     assert best.factor == pytest.approx(1.24, rel=0.4)
     assert fixed.factor > best.factor
-    assert np.isfinite(fixed.magnitudes[0])
+    assert np.isfinite(fixed.in_magnitudes.value)

@@ -19,6 +19,7 @@ from faintspot.cli.needs import can_make
 from faintspot.cli.progress import progress_bar
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import Comparison
+from faintspot.experiments.words import with_interval
 from faintspot.io.slopes import read_slopes
 from faintspot.pipeline import configuration
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -74,9 +75,9 @@ def command(output: str, frames: int, seed: int) -> None:
 def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
     """Return the slope errors of both arms and the flux gain as a table."""
     gain = comparison.flux_gain(rng)
-    value, low, high = gain.magnitudes
+    saved_mag = gain.in_magnitudes
     saved = (
-        f"denoising saves a factor {gain.in_words()} of flux: {value:.2f} ({low:.2f} to {high:.2f}) mag"
+        f"denoising saves a factor {gain.in_words()} of flux: {with_interval(saved_mag, 2)} mag"
         if 0 < gain.factor < np.inf
         else "no flux that was simulated gives the same error with denoising"
     )

@@ -112,13 +112,13 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
     """
     from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.interleaved import run_interleaved
-    from faintspot.experiments.loop_verdict import interleaved_summary
+    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
     with _worker_pool(**where) as place:
         result = run_interleaved(loop, folder, quick=quick, place=place, overwrite=overwrite)
-    click.echo(interleaved_summary(result))
+    click.echo(loop_summary(LoopResults(interleaved=result)))
     _report(folder)
 
 
@@ -156,7 +156,7 @@ def magnitude(
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
     from faintspot.ao_loop.configuration import load_loop
-    from faintspot.experiments.loop_verdict import magnitude_summary
+    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
     from faintspot.experiments.magnitude import run_magnitude
 
     loop = load_loop(configuration)
@@ -165,7 +165,7 @@ def magnitude(
     names = None if methods is None else _methods(methods)
     with _worker_pool(**where) as place:
         result = run_magnitude(loop, folder, names, fluxes, quick=quick, place=place, overwrite=overwrite)
-    click.echo(magnitude_summary(result))
+    click.echo(loop_summary(LoopResults(magnitude=result)))
     _report(folder)
 
 
@@ -188,14 +188,14 @@ def budget(
     """
     from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.budget import run_budget
-    from faintspot.experiments.loop_verdict import budget_summary
+    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
 
     loop = load_loop(configuration)
     folder = output or _folder(loop.name, quick)
     names = None if methods is None else _methods(methods)
     with _worker_pool(**where) as place:
         result = run_budget(loop, folder, names, quick=quick, place=place, overwrite=overwrite)
-    click.echo(budget_summary(result))
+    click.echo(loop_summary(LoopResults(budget=result)))
     _report(folder)
 
 

@@ -112,7 +112,7 @@ def tune(
     )
     click.echo(f"Next, a long search and long runs: {command} --flux-e {photons}")
     if target.name == ENGINE_FILE:
-        folder, control = str(target.parent), answer.best.kind.control
+        folder, control = str(target.parent), answer.best.control
         command = shlex.join(["faintspot", "loop", "engine", str(loop), "-o", folder, "--control", control])
         click.echo(f"In real time: {command}")
 
@@ -142,16 +142,16 @@ def show(answer: LoopAnswer) -> None:
 
 def strehl_table(answer: LoopAnswer) -> Table:
     """Return the Strehl ratios of all candidates at all measured magnitudes as a table."""
-    from faintspot.experiments.answer_text import plain_number
+    from faintspot.experiments.words import plain_number
 
     table = _table()
     for flux in reversed(range(len(answer.photons))):
         heading = f"{answer.magnitudes[flux]:.2f}\n{plain_number(answer.photons[flux])} e-"
         table.add_column(heading, justify="right", no_wrap=True)
-    for result in answer.results:
-        values = [answer.strehl(result.name, flux) for flux in reversed(range(len(answer.photons)))]
+    for name in answer.kinds:
+        values = [answer.strehl(name, flux) for flux in reversed(range(len(answer.photons)))]
         texts = [f"{each.value:.3f}±{each.standard_error:.3f}".removesuffix("±nan") for each in values]
-        table.add_row(result.name, *texts, style="bold" if result is answer.best else None)
+        table.add_row(name, *texts, style="bold" if name == answer.best.name else None)
     table.caption = "Strehl ratio and its standard error, at magnitudes that were measured."
     return table
 
@@ -163,12 +163,12 @@ def gain_table(answer: LoopAnswer) -> Table:
     table = _table()
     for heading in ("limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for result in answer.results:
-        cells = [loop_text.limit_in_words(answer, result.name)]
+    for name in answer.kinds:
+        cells = [loop_text.limit_in_words(answer, name)]
         for reference in loop_text.REFERENCES:
-            same = result.name == reference
-            cells.append("" if same else loop_text.gain_in_words(answer, result.name, reference))
-        table.add_row(result.name, *cells, style="bold" if result is answer.best else None)
+            same = name == reference
+            cells.append("" if same else loop_text.gain_in_words(answer, name, reference))
+        table.add_row(name, *cells, style="bold" if name == answer.best.name else None)
     table.caption = f"Limiting magnitude: for a Strehl ratio of {answer.level:.3g}, interpolated."
     return table
 
@@ -181,10 +181,10 @@ def sky_table(answer: LoopAnswer) -> Table:
     table = _table()
     for place in PLACES:
         table.add_column(f"{place}\n%", justify="right", no_wrap=True)
-    for result in answer.results:
-        found = [answer.coverage(result.name, place) for place in PLACES]
+    for name in answer.kinds:
+        found = [answer.coverage(name, place) for place in PLACES]
         cells = [loop_text.coverage_in_words(each) for each in found if each is not None]
-        table.add_row(result.name, *cells, style="bold" if result is answer.best else None)
+        table.add_row(name, *cells, style="bold" if name == answer.best.name else None)
     return table
 
 

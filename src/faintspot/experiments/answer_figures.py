@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from faintspot.experiments.answer import Answer
-    from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
+    from faintspot.experiments.loop_answer import LoopAnswer
+    from faintspot.experiments.loop_arms import ArmKind
 
 
 _WIDTH, _HEIGHT = 10.5, 6.6
@@ -143,10 +144,10 @@ def loop_figure(answer: LoopAnswer) -> Figure:
 
 def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
     magnitudes = answer.magnitudes
-    for result in answer.results:
-        drawn = _look(result)
-        axes.plot(magnitudes, answer.curve(result.name), lw=1.6, color=drawn["color"], ls=drawn["ls"])
-        values = [answer.strehl(result.name, flux) for flux in range(len(magnitudes))]
+    for name, kind in answer.kinds.items():
+        drawn = _look(kind)
+        axes.plot(magnitudes, answer.curve(name), lw=1.6, color=drawn["color"], ls=drawn["ls"])
+        values = [answer.strehl(name, flux) for flux in range(len(magnitudes))]
         axes.errorbar(
             magnitudes,
             [each.value for each in values],
@@ -159,12 +160,12 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
             mfc=drawn["mfc"],
             ms=6,
         )
-        limit = answer.limit(result.name)
+        limit = answer.limit(name)
         if limit.is_known:
             error = limit.error if np.isfinite(limit.error) else 0.0
             axes.errorbar(limit.magnitude.value, answer.level, xerr=error, **_limit_mark(drawn), zorder=5)
-        name = f"{result.name} (recommended)" if result is answer.best else result.name
-        axes.plot([], [], label=name, lw=1.6, ms=6, **drawn)
+        label = f"{name} (recommended)" if kind is answer.best else name
+        axes.plot([], [], label=label, lw=1.6, ms=6, **drawn)
     axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
     words, place = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.99, answer.level)
     note(axes, words, place, "axes fraction, data", xytext=(0, 3), ha="right", color="#666666")
@@ -182,16 +183,16 @@ def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
 
 def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
     """Draw the fraction of the sky: thick error bars are the limits', thin ones with the star counts'."""
-    width = 0.8 / len(answer.results)
-    for number, result in enumerate(answer.results):
-        drawn = _look(result)
+    width = 0.8 / len(answer.kinds)
+    for number, (name, kind) in enumerate(answer.kinds.items()):
+        drawn = _look(kind)
         for group, place in enumerate(PLACES):
-            found = answer.coverage(result.name, place)
+            found = answer.coverage(name, place)
             assert found is not None
             where, value = group + (number + 0.5) * width - 0.4, 100 * found.fraction
             own = 100 * np.nan_to_num(found.strehl_error)
             both = float(np.hypot(own, 100 * found.model_error))
-            learns = result.kind.control != INTEGRATOR
+            learns = kind.control != INTEGRATOR
             axes.bar(
                 where,
                 value,
@@ -225,11 +226,11 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
     )
 
 
-def _look(result: LoopArmResult) -> dict[str, Any]:
+def _look(kind: ArmKind) -> dict[str, Any]:
     """Return colour, line and marker: the estimator's, open and dash-dotted where control learns."""
-    style = result.kind.estimator.style
-    colour = GREY if result.kind.estimator.name == SECOND else style.colour
-    learns = result.kind.control != INTEGRATOR
+    style = kind.estimator.style
+    colour = GREY if kind.estimator.name == SECOND else style.colour
+    learns = kind.control != INTEGRATOR
     return {
         "color": colour,
         "ls": _LEARNING_LINE if learns else style.line,

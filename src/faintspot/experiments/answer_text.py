@@ -10,6 +10,7 @@ from faintspot.estimators.total_variation import TotalVariation
 from faintspot.experiments.answer import Answer, ArmResult, settings_in_words
 from faintspot.experiments.arms import Knowledge
 from faintspot.experiments.statistics import Estimate
+from faintspot.experiments.words import plain_number, with_error
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.experiments")
@@ -71,12 +72,12 @@ def promise_lines(answer: Answer) -> list[str]:
     text = _TEXT(
         "answer.checked",
         flux=plain_number(promise.flux_e),
-        predicted=_with_error(promise.predicted),
-        measured=_with_error(promise.measured),
+        predicted=with_error(promise.predicted, 4),
+        measured=with_error(promise.measured, 4),
         ratio=promise.noise_ratio,
     )
     if math.isfinite(promise.frame_to_frame.value):
-        text += _TEXT("answer.frame_to_frame", error=_with_error(promise.frame_to_frame))
+        text += _TEXT("answer.frame_to_frame", error=with_error(promise.frame_to_frame, 4))
     if not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px:
         text += _TEXT("answer.placed", **errors)
     lines = [text]
@@ -95,10 +96,6 @@ def promise_lines(answer: Answer) -> list[str]:
 
 def _rms(value: float) -> float:
     return value if math.isfinite(value) else math.inf
-
-
-def _with_error(value: Estimate) -> str:
-    return f"{value.value:.4f} ± {value.standard_error:.4f}"
 
 
 def foundations(answer: Answer) -> list[str]:
@@ -125,7 +122,7 @@ def foundations(answer: Answer) -> list[str]:
 def gain_in_words(answer: Answer, gain: Estimate) -> str:
     """Return magnitudes gained, `more than` what the plot spans where beyond."""
     if math.isfinite(gain.value):
-        return f"{gain.value:.2f} ± {max(gain.standard_error, _SMALLEST_ERROR_MAG):.2f} mag"
+        return f"{with_error(gain, 2, smallest=_SMALLEST_ERROR_MAG)} mag"
     span = _span(answer)
     return f"more than {span:.1f} mag" if gain.value > 0 else f"-{span:.1f} mag or less"
 
@@ -133,13 +130,8 @@ def gain_in_words(answer: Answer, gain: Estimate) -> str:
 def short_gain(answer: Answer, gain: Estimate) -> str:
     """Return the same for a table."""
     if math.isfinite(gain.value):
-        return f"{gain.value:+.2f}±{max(gain.standard_error, _SMALLEST_ERROR_MAG):.2f}"
+        return with_error(gain, 2, sign=True, smallest=_SMALLEST_ERROR_MAG).replace(" ", "")
     return f">+{_span(answer):.1f}" if gain.value > 0 else f"<-{_span(answer):.1f}"
-
-
-def plain_number(value: float, digits: int = 3) -> str:
-    """Return a number to so many digits, without an exponent up to a million."""
-    return f"{float(f'{value:.{digits}g}'):g}"
 
 
 def _span(answer: Answer) -> float:

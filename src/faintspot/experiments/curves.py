@@ -80,10 +80,12 @@ class Curve:
         variance = covariance[:, i, i] + covariance[:, j, j] - 2 * covariance[:, i, j]
         return self.error[:, j] - self.error[:, i], np.sqrt(np.maximum(variance, 0.0))
 
-    def at(self, flux_e: float, arm: str) -> tuple[float, float] | None:
-        """Return R and its standard error at that flux; None when there is none."""
+    def at(self, flux_e: float, arm: str) -> Estimate | None:
+        """Return R at that flux; None when there is none."""
         found = np.flatnonzero(np.isclose(self.flux_e, flux_e) & np.isfinite(self.of(arm)))
-        return (float(self.of(arm)[found[0]]), float(self.se_of(arm)[found[0]])) if found.size else None
+        return (
+            Estimate(float(self.of(arm)[found[0]]), float(self.se_of(arm)[found[0]])) if found.size else None
+        )
 
     def _index(self, arm: str) -> int:
         if arm not in self.arms:
@@ -103,10 +105,12 @@ class Gain:
     """Natural logarithm of the bootstrap's factors."""
 
     @property
-    def magnitudes(self) -> tuple[float, float, float]:
+    def in_magnitudes(self) -> Estimate:
         """The gain and its interval in magnitudes."""
         with np.errstate(divide="ignore"):
-            return magnitudes(self.factor), magnitudes(self.low), magnitudes(self.high)
+            value, low, high = (magnitudes(each) for each in (self.factor, self.low, self.high))
+        error = magnitudes(math.e) * self.log_se if math.isfinite(value + self.log_se) else math.nan
+        return Estimate(value, error, low, high)
 
     @property
     def is_bounded(self) -> bool:
@@ -194,11 +198,7 @@ def magnitude_gain(
     if method == reference:
         return Estimate(0.0, 0.0)
     gain = gain_at_flux(curve, flux_e, rng, method=method, reference=reference)
-    if gain is None:
-        return Estimate(math.nan)
-    value, low, high = gain.magnitudes
-    error = magnitudes(math.e) * gain.log_se if math.isfinite(value + gain.log_se) else math.nan
-    return Estimate(value, error, low, high)
+    return Estimate(math.nan) if gain is None else gain.in_magnitudes
 
 
 def limiting_flux(curve: Curve, arm: str, budget_px: float, rng: np.random.Generator) -> Estimate:

@@ -7,6 +7,7 @@ taken only where R without TV is below INFORMATIVE times that of an estimator th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
@@ -23,8 +24,8 @@ from faintspot.experiments.study_curves import (
     kept_panels,
     spread,
     study_curves,
-    with_error,
 )
+from faintspot.experiments.words import with_error, with_interval
 from faintspot.report.texts import Texts
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def thirty_equal_eighty(dataset: xarray.Dataset, mode: str, rng: np.random.Gener
         gain = gain_at_flux(curve, 80, rng, **TV_OVER_NO_TV)
         if with_tv is None or without is None or gain is None:
             continue
-        words = {"tv": with_error(*with_tv), "plain": with_error(*without), "gain": gain.in_words()}
+        words = {"tv": with_error(with_tv, 4), "plain": with_error(without, 4), "gain": gain.in_words()}
         finding = _TEXT("findings.thirty", **words)
         cases.append(Case(key.in_words(), finding, _reaches(gain, 80 / 30)))
     return cases
@@ -269,8 +270,7 @@ def _reaches(gain: Gain, claimed: float) -> Outcome:
 
 
 def _in_magnitudes(gain: Gain) -> str:
-    value, low, high = gain.magnitudes
-    return f"{value:+.2f} mag ({low:+.2f} to {high:+.2f})"
+    return f"{with_interval(gain.in_magnitudes, 2)} mag"
 
 
 def _profiles(dataset: xarray.Dataset) -> list[str]:
@@ -293,7 +293,8 @@ def _log_change(small: Curve, large: Curve, flux_e: float, arm: str) -> tuple[fl
     first, second = small.at(flux_e, arm), large.at(flux_e, arm)
     if first is None or second is None:
         return None
-    return float(np.log(second[0] / first[0])), float(np.hypot(first[1] / first[0], second[1] / second[0]))
+    errors = (each.standard_error / each.value for each in (first, second))
+    return math.log(second.value / first.value), math.hypot(*errors)
 
 
 def _slope_with_noise(gains: list[tuple[Configuration, Gain]]) -> tuple[float, float]:

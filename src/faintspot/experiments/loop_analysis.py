@@ -14,7 +14,6 @@ from faintspot.ao_loop.record import LoopRecord
 from faintspot.base.errors import InputError
 from faintspot.experiments.loop_results import (
     InterleavedResult,
-    MagnitudeGain,
     MagnitudeResult,
     RegressionLine,
     magnitude_gain,
@@ -146,7 +145,7 @@ def measurements(result: InterleavedResult) -> Measurements:
     return Measurements(result.set_names, number, arm, strength, time, strehl, r0, truth, frames)
 
 
-def strehl_table(table: Measurements, set_number: int | None = None) -> list[GroupRow]:
+def group_rows(table: Measurements, set_number: int | None = None) -> list[GroupRow]:
     """Return mean and scatter of the Strehl ratio of each group, and paired differences with intervals.
 
     Each measurement with TV is compared with the straight line between the measurements without just before
@@ -254,17 +253,15 @@ def differences_by_flux(result: MagnitudeResult, arm: int, reference: int) -> li
     return [paired_mean(result.strehl[arm, f] - result.strehl[reference, f], fluxes) for f in range(fluxes)]
 
 
-def gains_in_magnitude(result: MagnitudeResult, arm: int, reference: int) -> list[MagnitudeGain]:
+def gains_in_magnitude(result: MagnitudeResult, arm: int, reference: int) -> dict[float, Estimate]:
     """Return the gain in limiting magnitude at each Strehl ratio that the reference's curve passes."""
     curve = np.array([paired_mean(values).value for values in result.strehl[reference]])
     known = curve[np.isfinite(curve)]
-    if not len(known):
-        return []
-    levels = [level for level in _STREHL_LEVELS if known.min() < level <= known.max()]
-    return [
-        magnitude_gain(result.magnitudes, result.strehl[arm], result.strehl[reference], level)
-        for level in levels
-    ]
+    return {
+        level: magnitude_gain(result.magnitudes, result.strehl[arm], result.strehl[reference], level)
+        for level in _STREHL_LEVELS
+        if len(known) and known.min() < level <= known.max()
+    }
 
 
 def _rows_of_set(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from faintspot.config.tables import save_tables
 from faintspot.control.learning import INTEGRATOR
 from faintspot.estimators.base import Need
 from faintspot.experiments.arms import Knowledge
-from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, Choice
+from faintspot.experiments.loop_arms import LOOP_GAIN, NOISE_SCALE, ArmKind, arm_kind
 from faintspot.experiments.loop_question import (
     BASELINE,
     MODEL_ERROR,
@@ -30,37 +31,14 @@ from faintspot.experiments.loop_question import (
     known_magnitudes,
     sky_coverage,
 )
-from faintspot.experiments.loop_results import falling, limiting_magnitudes, magnitude_gain
+from faintspot.experiments.loop_results import MagnitudeResult, falling, limiting_magnitudes, magnitude_gain
 from faintspot.experiments.magnitude import with_flux
 from faintspot.experiments.statistics import DRAWS, FEWEST_PIECES, SEED, Estimate, of_draws, paired_mean
+from faintspot.experiments.words import with_error
 from faintspot.pipeline import configuration as configuration_file
 from faintspot.spots.psf import PSF
 
-if TYPE_CHECKING:
-    pass
-
-
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class LoopArmResult:
-    """One candidate: F fluxes, R realisations of the air."""
-
-    kind: ArmKind
-    choices: tuple[Choice, ...]
-    """(F,): tuned values at every flux."""
-    strehl: Floats
-    """(F, R): long exposure, at the science wavelength."""
-    centroid_gain: Floats
-    """(F, R): that slopes were divided by, where the arm does so."""
-    at_end: tuple[tuple[str, ...], ...]
-    """(F,): which of the values are the first or the last that were on offer."""
-
-    @property
-    def name(self) -> str:
-        """See `faintspot.experiments.loop_arms.arm_kind`."""
-        return self.kind.name
 
 
 @dataclass(frozen=True)
@@ -81,6 +59,10 @@ class Limit:
     def error(self) -> float:
         """Standard error, both kinds together; NaN with too few realisations."""
         return math.hypot(self.magnitude.standard_error, self.interpolation_error)
+
+    def in_words(self, *, sign: bool = False) -> str:
+        """Return it with its error, at least 0.01 mag."""
+        return with_error(Estimate(self.magnitude.value, self.error), 2, sign=sign, smallest=0.01)
 
 
 @dataclass(frozen=True)
@@ -109,18 +91,27 @@ class LoopAnswer:
     """
 
     question: LoopQuestion
-    results: tuple[LoopArmResult, ...]
-    photons: Floats
-    """(F,), rising: photo-electrons of a fully lit sub-aperture in a frame. All of these are measured."""
+    measured: MagnitudeResult
+    """Strehl ratios and tuned values of all candidates with rising flux."""
     scored_frames: int
     """Of every run."""
     left_out: dict[str, str]
     """Candidates that were not tried, and why."""
 
     @cached_property
+    def kinds(self) -> dict[str, ArmKind]:
+        """Candidates that were tried, by name."""
+        return {name: arm_kind(name) for name in self.measured.names}
+
+    @property
+    def photons(self) -> Floats:
+        """(F,), rising: photo-electrons of a fully lit sub-aperture in a frame."""
+        return self.measured.photons
+
+    @property
     def magnitudes(self) -> Floats:
         """(F,) of these stars."""
-        return self.question.configuration.photometry.magnitude(self.photons)
+        return self.measured.magnitudes
 
     @property
     def at_star(self) -> int:
@@ -131,38 +122,60 @@ class LoopAnswer:
     @property
     def realisations(self) -> int:
         """Realisations of the turbulence that were scored."""
-        return int(self.results[0].strehl.shape[1])
+        return int(self.measured.strehl.shape[2])
 
     @property
     def level(self) -> float:
         """The Strehl ratio that limiting magnitudes are for."""
         asked = self.question.strehl
-        return float(0.5 * self[BASELINE].strehl[-1].mean()) if asked is None else float(asked)
+        return float(0.5 * self.runs(BASELINE)[-1].mean()) if asked is None else float(asked)
 
-    def __getitem__(self, name: str) -> LoopArmResult:
-        """Return the result of a candidate.
+    def runs(self, name: str) -> Floats:
+        """Return a candidate's Strehl ratios (F, R).
 
         Raises
         ------
         InputError
             For one that was not tried.
         """
-        results = {result.name: result for result in self.results}
-        if name not in results:
-            raise InputError(f"arm {name!r}: expected one that was tried: {', '.join(results)}")
-        return results[name]
+        runs: Floats = self.measured.strehl[self._place(name)]
+        return runs
+
+    def choice(self, name: str, flux: int) -> dict[str, Any]:
+        """Return a candidate's tuned values at a measured flux."""
+        choice: dict[str, Any] = json.loads(str(self.measured.choices[self._place(name), flux]))
+        return choice
+
+    def _place(self, name: str) -> int:
+        names = self.measured.names
+        if name not in names:
+            raise InputError(f"arm {name!r}: expected one that was tried: {', '.join(names)}")
+        return names.index(name)
+
+    def at_end(self, name: str, flux: int) -> list[str]:
+        """Return which tuned values are the first or last that were on offer, but could be beyond."""
+        kind, choice = self.kinds[name], self.choice(name, flux)
+        declared = kind.estimator.declared()
+        found = []
+        for option, each in kind.tuned(self.star(flux)).items():
+            if len(each.values) < 2 or isinstance(choice[option], str):
+                continue
+            limits = (declared[option].low, declared[option].high) if option in declared else ()
+            if choice[option] in (min(each.values), max(each.values)) and choice[option] not in limits:
+                found.append(option)
+        return found
 
     def strehl(self, name: str, flux: int) -> Estimate:
         """Return an arm's Strehl ratio at a measured flux."""
-        return paired_mean(self[name].strehl[flux])
+        return paired_mean(self.runs(name)[flux])
 
     def difference(self, name: str, reference: str, flux: int) -> Estimate:
         """Return the difference of two methods' Strehl ratios in the same turbulence.
 
         Its interval holds for all comparisons with one arm together.
         """
-        differences = self[name].strehl[flux] - self[reference].strehl[flux]
-        return paired_mean(differences, max(1, len(self.results) - 1))
+        differences = self.runs(name)[flux] - self.runs(reference)[flux]
+        return paired_mean(differences, max(1, len(self.kinds) - 1))
 
     def equal(self, flux: int) -> tuple[str, ...]:
         """Return the arms that are not below the best beyond the error; the first is recommended.
@@ -170,14 +183,14 @@ class LoopAnswer:
         That is the baseline where it is among them, else the one that need not learn, has to know least and
         costs least.
         """
-        best = max(self.results, key=lambda result: float(result.strehl[flux].mean()))
-        same = [each for each in self.results if self.difference(best.name, each.name, flux).decided != 1]
-        return tuple(each.name for each in sorted(same, key=_simplicity))
+        best = max(self.kinds, key=lambda name: float(self.runs(name)[flux].mean()))
+        same = [name for name in self.kinds if self.difference(best, name, flux).decided != 1]
+        return tuple(sorted(same, key=lambda name: _simplicity(self.kinds[name])))
 
     @property
-    def best(self) -> LoopArmResult:
+    def best(self) -> ArmKind:
         """Recommended method for the star."""
-        return self[self.equal(self.at_star)[0]]
+        return self.kinds[self.equal(self.at_star)[0]]
 
     def limit(self, name: str) -> Limit:
         """Return an arm's limiting magnitude."""
@@ -197,13 +210,13 @@ class LoopAnswer:
         """Return the gain in limiting magnitude over another arm; NaN where one of them has no limit."""
         faint, strehl = self._from_bright(name)
         found = magnitude_gain(faint, strehl, self._from_bright(reference)[1], self.level)
-        if not math.isfinite(found.gain.value):
-            return Limit(found.gain, 0.0)
-        curves = [self[each].strehl[::-1].mean(axis=1) for each in (name, reference)]
+        if not math.isfinite(found.value):
+            return Limit(found, 0.0)
+        curves = [self._from_bright(each)[1].mean(axis=1) for each in (name, reference)]
         values = [float(limiting_magnitudes(faint, curve, self.level)) for curve in curves]
         # Curves that bend alike are wrong alike.
         mine, other = (_interpolation_error(faint, *each) for each in zip(curves, values, strict=True))
-        return Limit(found.gain, abs(mine - other))
+        return Limit(found, abs(mine - other))
 
     def coverage(self, name: str, place: str) -> Coverage | None:
         """Return what part of a place of `PLACES` an arm can use; None: no radius."""
@@ -236,8 +249,7 @@ class LoopAnswer:
 
     def arm(self, name: str, flux: int) -> Arm:
         """Return a candidate with its settings for a measured flux, as `simulate_loop` takes it."""
-        result = self[name]
-        return result.kind.arm(self.star(flux), result.choices[flux])
+        return self.kinds[name].arm(self.star(flux), self.choice(name, flux))
 
     def save(self, path: str | Path) -> Path:
         """Write what is recommended for the star as a configuration file; what else it holds stays.
@@ -268,17 +280,18 @@ class LoopAnswer:
                 configuration_file.save(path, item)
         if not configuration_file.has(path, "calibration"):
             configuration_file.save(path, camera_calibration(star))
-        save_tables(path, {"loop": self._loop_table(best, flux)})
+        save_tables(path, {"loop": self._loop_table(flux)})
         loop = derived(path, "-loop.toml")
         gain = {} if arm.gain is None else {"gain": arm.gain}
         write_atomically(loop, star.replace("control", **gain).to_text())
         return loop
 
-    def _loop_table(self, best: LoopArmResult, flux: int) -> dict[str, Any]:
-        strehl, choice = self.strehl(best.name, flux), best.choices[flux]
+    def _loop_table(self, flux: int) -> dict[str, Any]:
+        best = self.best
+        strehl, choice = self.strehl(best.name, flux), self.choice(best.name, flux)
         table = {
             "arm": best.name,
-            "control": best.kind.control,
+            "control": best.control,
             "gain": float(choice[LOOP_GAIN]),
             "photons_per_subaperture": float(self.photons[flux]),
             "strehl": round(strehl.value, 4),
@@ -286,14 +299,15 @@ class LoopAnswer:
         if NOISE_SCALE in choice:
             table["noise_scale"] = float(choice[NOISE_SCALE])
         if self.arm(best.name, flux).correct_gain:
-            table["centroid_gain"] = round(float(best.centroid_gain[flux].mean()), 3)
+            gains = self.measured.centroid_gain[self._place(best.name), flux]
+            table["centroid_gain"] = round(float(gains.mean()), 3)
         if math.isfinite(strehl.standard_error):
             table["strehl_error"] = round(strehl.standard_error, 4)
         return table
 
     def _from_bright(self, name: str) -> tuple[Floats, Floats]:
         """Return rising magnitudes (F,), and the Strehl ratios (F, R) there."""
-        return self.magnitudes[::-1], self[name].strehl[::-1]
+        return self.magnitudes[::-1], self.runs(name)[::-1]
 
 
 def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
@@ -310,11 +324,9 @@ def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
     return float(bend * (value - faint[end - 1]) * (faint[end] - value) / abs(slopes[end - 1]))
 
 
-def _simplicity(result: LoopArmResult) -> tuple[Any, ...]:
-    kind = result.kind
-    estimator = kind.estimator
-    own = result.name != BASELINE, kind.control != INTEGRATOR
-    return *own, int(Knowledge.of(estimator)), estimator.cost, result.name
+def _simplicity(kind: ArmKind) -> tuple[Any, ...]:
+    own = kind.name != BASELINE, kind.control != INTEGRATOR
+    return *own, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name
 
 
-__all__ = ["BASELINE", "SECOND", "Coverage", "Limit", "LoopAnswer", "LoopArmResult"]
+__all__ = ["BASELINE", "SECOND", "Coverage", "Limit", "LoopAnswer"]

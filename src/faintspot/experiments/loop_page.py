@@ -9,7 +9,6 @@ import numpy as np
 
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.errors import InputError
-from faintspot.experiments.budget import TERMS
 from faintspot.experiments.loop_analysis import NO_TV, Measurements, measurements
 from faintspot.experiments.loop_figures import (
     budget_figure,
@@ -23,10 +22,9 @@ from faintspot.experiments.loop_results import (
     BudgetResult,
     InterleavedResult,
     MagnitudeResult,
-    in_words,
-    with_error,
 )
 from faintspot.experiments.loop_tables import (
+    budget_table,
     centroid_gain_table,
     difference_table,
     gain_table,
@@ -34,6 +32,7 @@ from faintspot.experiments.loop_tables import (
     seeing_table,
     settings_table,
     strehl_groups_table,
+    strehl_table,
 )
 from faintspot.experiments.loop_verdict import (
     LoopResults,
@@ -43,6 +42,7 @@ from faintspot.experiments.loop_verdict import (
     tv_arm,
 )
 from faintspot.experiments.statistics import paired_mean
+from faintspot.experiments.words import with_interval
 from faintspot.report.figure_data import FigureWithData
 from faintspot.report.page import POSITIONS, Page, Section, configuration_section, write_page
 from faintspot.report.texts import Texts
@@ -158,7 +158,7 @@ def _magnitude(result: MagnitudeResult) -> list[Section]:
     references = reference_arms(result)
     base = " and then with ".join(result.labels[arm] for arm in references)
     wavelength = LoopConfiguration.from_text(result.configuration).science.wavelength_m
-    tables = []
+    tables = [strehl_table(result)]
     for place, reference in enumerate(references):
         others = [arm for arm in range(len(result.labels)) if arm not in references[: place + 1]]
         tables += [
@@ -225,19 +225,8 @@ def _images_of_set(result: InterleavedResult) -> FigureWithData | None:
 def _budget(result: BudgetResult, results: LoopResults) -> Section:
     configuration = configuration_of(results)
     label = strehl_axis(1.65e-6 if configuration is None else configuration.science.wavelength_m)
-    rows = []
-    for arm, name in enumerate(result.labels):
-        for number, term in enumerate(result.terms):
-            strehl, residual = (
-                paired_mean(values[arm, number]) for values in (result.strehl, result.residual_nm)
-            )
-            change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
-            off = "–" if number == 0 else term
-            rows.append([name, off, with_error(strehl), with_error(residual, 0), in_words(change)])
-    meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
-    table = _TEXT.table("tables.budget", rows, meanings=meanings)
     text = _budget_lines(result)
-    return Section("budget", "Error budget", text, [table], [budget_figure(result, label)])
+    return Section("budget", "Error budget", text, [budget_table(result)], [budget_figure(result, label)])
 
 
 def _budget_lines(result: BudgetResult) -> list[str]:
@@ -247,15 +236,15 @@ def _budget_lines(result: BudgetResult) -> list[str]:
     for arm, name in enumerate(result.labels):
         gains = [paired_mean(runs) for runs in changes[arm]]
         order = sorted(range(1, len(gains)), key=lambda number: -np.nan_to_num(gains[number].value))
-        parts = [f"{result.terms[n]} {in_words(gains[n])}" for n in order[:3] if gains[n].decided > 0]
+        parts = [f"{result.terms[n]} {with_interval(gains[n])}" for n in order[:3] if gains[n].decided > 0]
         if parts:
             lines.append(f"{name}: most Strehl is gained without {', then '.join(parts)}.")
         if _SLOPE_ERROR in result.terms:
-            most = in_words(gains[result.terms.index(_SLOPE_ERROR)])
+            most = with_interval(gains[result.terms.index(_SLOPE_ERROR)])
             lines.append(_TEXT("loop.true_slopes", name=name, change=most))
     for arm, name in enumerate(result.labels[1:], start=1):
         parts = [
-            f"{_without(number, term)} {in_words(paired_mean(difference))}"
+            f"{_without(number, term)} {with_interval(paired_mean(difference))}"
             for number, (term, difference) in enumerate(
                 zip(result.terms, result.strehl[arm] - result.strehl[0], strict=True)
             )

@@ -169,18 +169,6 @@ class RegressionLine:
         return self.intercept + self.slope * np.asarray(x, np.float64)
 
 
-@dataclass(frozen=True)
-class MagnitudeGain:
-    """Magnitudes by which a star may be fainter for the same Strehl ratio as the reference."""
-
-    strehl: float
-    gain: Estimate
-    """NaN when one of the curves does not reach it; its interval is infinite where more than 2.5 % of the
-    draws left the measured magnitudes there."""
-    why_not: str = ""
-    """Why there is no gain, or no interval."""
-
-
 def neighbour_differences(values: ArrayLike, time: ArrayLike, reference: ArrayLike) -> Floats:
     """Return each value's difference from those of the reference just before and after it.
 
@@ -250,7 +238,7 @@ def magnitude_gain(
     reference: ArrayLike,
     level: float,
     rng: np.random.Generator | None = None,
-) -> MagnitudeGain:
+) -> Estimate:
     """Return the gain in limiting magnitude at a Strehl ratio, with its interval over realisations.
 
     Each arm's mean curve is made to fall with magnitude (isotonic regression) and read off between its
@@ -264,6 +252,13 @@ def magnitude_gain(
     level : float
         The Strehl ratio.
     rng : numpy.random.Generator, optional
+
+    Returns
+    -------
+    Estimate
+        Infinite where the arm's curve stays above the level and the reference's does not, minus infinite
+        where it stays below; NaN where neither crosses it, or nothing is measured yet. An end of the interval
+        is infinite where more than 2.5 % of the draws left the measured magnitudes there.
 
     Raises
     ------
@@ -279,19 +274,17 @@ def magnitude_gain(
     whole = ~np.isnan(curves[0] + curves[1]).any(axis=1)
     order = np.flatnonzero(whole)[np.argsort(faint[whole])]
     if len(order) < 2:
-        return MagnitudeGain(level, Estimate(math.nan), "not measured yet")
+        return Estimate(math.nan)
     faint, curves = faint[order], [curve[order] for curve in curves]
     limits = [float(limiting_magnitudes(faint, curve.mean(axis=1), level)) for curve in curves]
-    if any(math.isinf(limit) for limit in limits):
-        return MagnitudeGain(level, Estimate(math.nan), _why_not(limits))
     realisations = curves[0].shape[1]
     gain = limits[0] - limits[1]
-    if realisations < FEWEST_PIECES:
-        return MagnitudeGain(level, Estimate(gain), "too few realisations for an interval")
+    if not math.isfinite(gain) or realisations < FEWEST_PIECES:
+        return Estimate(gain)
     rng = np.random.default_rng(SEED) if rng is None else rng
     draws = rng.integers(0, realisations, (DRAWS, realisations))
     ends = [limiting_magnitudes(faint, curve[:, draws].mean(axis=2).T, level) for curve in curves]
-    return MagnitudeGain(level, of_draws(gain, _differences(*ends), realisations))
+    return of_draws(gain, _differences(*ends), realisations)
 
 
 def limiting_magnitudes(magnitudes: ArrayLike, strehl: ArrayLike, level: float) -> Floats:
@@ -340,47 +333,3 @@ def _differences(ends: Floats, starts: Floats) -> Floats:
     """Return ends - starts; which of two infinite ones is fainter is not known, and they count as equal."""
     same = np.isinf(ends) & (ends == starts)
     return np.asarray(np.where(same, 0.0, ends) - np.where(same, 0.0, starts), np.float64)
-
-
-def _why_not(limits: list[float]) -> str:
-    sides = {math.inf: "above it", -math.inf: "below it"}
-    parts = [
-        f"{name}{sides[limit]} at all magnitudes"
-        for name, limit in zip(("", "the reference is "), limits, strict=True)
-        if limit in sides
-    ]
-    return "; ".join(parts)
-
-
-NOTHING = "–"
-
-
-def in_words(estimate: Estimate | None) -> str:
-    """Return a difference in Strehl with its interval, as "+0.012 (−0.004 to +0.028)"."""
-    if estimate is None or not math.isfinite(estimate.value):
-        return NOTHING
-    if not math.isfinite(estimate.low):
-        return "too few for an interval"
-    return f"{signed(estimate.value)} ({signed(estimate.low)} to {signed(estimate.high)})"
-
-
-def gain_in_words(gain: MagnitudeGain) -> str:
-    """Return a gain in magnitudes with its interval, or why there is none."""
-    found = gain.gain
-    if math.isnan(found.value) or math.isnan(found.low):
-        return gain.why_not
-    ends = [signed(end, 2) if math.isfinite(end) else "beyond" for end in (found.low, found.high)]
-    return f"{signed(found.value, 2)} ({ends[0]} to {ends[1]})"
-
-
-def with_error(estimate: Estimate, digits: int = 3) -> str:
-    """Return a mean with its standard error, as "0.512 ±0.004"; "±?" where there is but one value."""
-    if not math.isfinite(estimate.value):
-        return NOTHING
-    error = estimate.standard_error
-    return f"{estimate.value:.{digits}f} ±{f'{error:.{digits}f}' if math.isfinite(error) else '?'}"
-
-
-def signed(value: float, digits: int = 3) -> str:
-    """Return a number with its sign, a minus as long as a plus."""
-    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")

@@ -6,24 +6,27 @@ import json
 import tomllib
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.experiments.budget import TERMS
 from faintspot.experiments.loop_analysis import (
     NO_TV,
     Measurements,
     differences_by_flux,
     gains_in_magnitude,
+    group_rows,
     regression_lines,
     seeing_of_sets,
-    strehl_table,
 )
 from faintspot.experiments.loop_arms import LOOP_GAIN
 from faintspot.experiments.loop_results import (
+    BudgetResult,
     InterleavedResult,
     MagnitudeResult,
-    gain_in_words,
-    in_words,
-    with_error,
 )
 from faintspot.experiments.statistics import paired_mean
+from faintspot.experiments.words import NOTHING, with_error, with_interval
 from faintspot.report.page import Table
 from faintspot.report.texts import Texts
 
@@ -57,11 +60,15 @@ def _group_rows(name: str, table: Measurements, number: int | None) -> list[list
             name,
             row.group,
             f"{row.mean:.3f}",
-            f"{row.standard_deviation:.3f}" if row.count > 1 else "–",
+            f"{row.standard_deviation:.3f}" if row.count > 1 else NOTHING,
             str(row.count),
-            *(("", "") if row.group == NO_TV else (in_words(row.difference), in_words(row.at_equal_r0))),
+            *(
+                ("", "")
+                if row.group == NO_TV
+                else (with_interval(row.difference), with_interval(row.at_equal_r0))
+            ),
         ]
-        for row in strehl_table(table, number)
+        for row in group_rows(table, number)
     ]
 
 
@@ -80,8 +87,11 @@ def seeing_table(result: InterleavedResult) -> Table:
 def gain_table(result: MagnitudeResult, arms: Sequence[int], reference: int) -> Table:
     """Return the gains in limiting magnitude of arms over a reference at equal Strehl."""
     gains = {arm: gains_in_magnitude(result, arm, reference) for arm in arms}
-    levels = next(([gain.strehl for gain in found] for found in gains.values()), [])
-    rows = [[result.labels[arm], *map(gain_in_words, found)] for arm, found in gains.items()]
+    rows = [
+        [result.labels[arm], *(with_interval(gain, 2) for gain in found.values())]
+        for arm, found in gains.items()
+    ]
+    levels = next(iter(gains.values()), {})
     columns = [f"at Strehl {level:g}" for level in levels]
     return _TEXT.table("tables.gain", rows, columns, reference=result.labels[reference])
 
@@ -89,19 +99,56 @@ def gain_table(result: MagnitudeResult, arms: Sequence[int], reference: int) -> 
 def difference_table(result: MagnitudeResult, pairs: Sequence[tuple[int, int]]) -> Table:
     """Return the difference in Strehl of pairs of arms at each flux."""
     rows = [
-        [result.labels[arm], result.labels[other], *map(in_words, differences_by_flux(result, arm, other))]
+        [
+            result.labels[arm],
+            result.labels[other],
+            *map(with_interval, differences_by_flux(result, arm, other)),
+        ]
         for arm, other in pairs
     ]
     return _TEXT.table("tables.difference", rows, _fluxes(result))
 
 
+def strehl_table(result: MagnitudeResult) -> Table:
+    """Return the Strehl ratio of every arm at each flux."""
+    stars = zip(result.photons, result.magnitudes, strict=True)
+    columns = [f"{photons:.3g} e⁻, {magnitude:.1f} mag" for photons, magnitude in stars]
+    return _TEXT.table("tables.strehl", _by_flux(result, result.strehl, 3), columns)
+
+
 def centroid_gain_table(result: MagnitudeResult) -> Table:
     """Return the centroid gain of every arm at each flux."""
-    rows = [
-        [label, *(with_error(paired_mean(values), 2) for values in gains)]
-        for label, gains in zip(result.labels, result.centroid_gain, strict=True)
+    return _TEXT.table("tables.centroid_gain", _by_flux(result, result.centroid_gain, 2), _fluxes(result))
+
+
+def _by_flux(result: MagnitudeResult, values: NDArray[np.float64], digits: int) -> list[list[str]]:
+    return [
+        [label, *(with_error(paired_mean(runs), digits) for runs in of_arm)]
+        for label, of_arm in zip(result.labels, values, strict=True)
     ]
-    return _TEXT.table("tables.centroid_gain", rows, _fluxes(result))
+
+
+def budget_table(result: BudgetResult) -> Table:
+    """Return the Strehl ratio and the rms wavefront of every arm without each term."""
+    rows = []
+    for arm, name in enumerate(result.labels):
+        for number, term in enumerate(result.terms):
+            strehl, residual = (
+                paired_mean(values[arm, number]) for values in (result.strehl, result.residual_nm)
+            )
+            change = None if number == 0 else paired_mean(result.strehl[arm, number] - result.strehl[arm, 0])
+            off = NOTHING if number == 0 else term
+            rows.append([name, off, with_error(strehl), with_error(residual, 0), with_interval(change)])
+    meanings = "; ".join(f"{term}: {_TEXT[f'terms.{term}']}" for term in result.terms[1:] if term in TERMS)
+    return _TEXT.table("tables.budget", rows, meanings=meanings)
+
+
+def in_columns(table: Table, most: int | None = None) -> str:
+    """Return a table of texts as lines for a terminal, with its first columns alone if there are too many."""
+    rows = [[str(cell) for cell in row[:most]] for row in (table.header, *table.rows)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(str.rjust, row[1:], widths[1:])) for row in rows)
+    return "\n".join(f"{row[0]:{widths[0]}}  {line}" for row, line in zip(rows, lines, strict=True))
 
 
 def settings_table(result: MagnitudeResult) -> Table:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 
-from faintspot.experiments.answer_text import plain_number
 from faintspot.experiments.loop_answer import BASELINE, SECOND, Coverage, LoopAnswer
 from faintspot.experiments.loop_arms import LOOP_GAIN, Choice
 from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, magnitudes_apart
-from faintspot.experiments.statistics import Estimate
+from faintspot.experiments.words import plain_number, with_error
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.experiments")
 REFERENCES = (BASELINE, SECOND)
 _SMALLEST_ERROR = 0.001
-_SMALLEST_ERROR_MAG = 0.01
 
 
 def situation(answer: LoopAnswer) -> str:
@@ -42,8 +40,8 @@ def recommendation(answer: LoopAnswer) -> list[str]:
     """Return the recommendation in a few sentences, the first a heading."""
     flux, best = answer.at_star, answer.best
     same = [name for name in answer.equal(flux) if name != best.name]
-    lines = [f"Recommended: {best.name} ({choice_in_words(best.choices[flux])})"]
-    strehl = _plus_minus(answer.strehl(best.name, flux), _SMALLEST_ERROR)
+    lines = [f"Recommended: {best.name} ({choice_in_words(answer.choice(best.name, flux))})"]
+    strehl = with_error(answer.strehl(best.name, flux), smallest=_SMALLEST_ERROR)
     wavelength = 1e6 * answer.question.configuration.science.wavelength_m
     lines.append(_TEXT("loop_answer.expected", strehl=strehl, wavelength_um=wavelength))
     if same:
@@ -63,7 +61,7 @@ def difference_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     """Describe the gain of a method over another, in Strehl ratio and limiting magnitude."""
     found = answer.difference(name, reference, answer.at_star)
     verdict = {1: "", 0: ", within its error", -1: ", less beyond its error"}[found.decided]
-    text = f"Strehl ratio {_signed(found, 3, _SMALLEST_ERROR)}{verdict}"
+    text = f"Strehl ratio {with_error(found, sign=True, smallest=_SMALLEST_ERROR)}{verdict}"
     return f"{text}; limiting magnitude {gain_in_words(answer, name, reference)}"
 
 
@@ -71,7 +69,7 @@ def gain_in_words(answer: LoopAnswer, name: str, reference: str) -> str:
     """Return the gain in limiting magnitude with its error, or what is known of it."""
     found = answer.gain(name, reference)
     if found.is_known:
-        return _signed(Estimate(found.magnitude.value, found.error), 2, _SMALLEST_ERROR_MAG)
+        return found.in_words(sign=True)
     mine, other = (answer.limit(each).magnitude.value for each in (name, reference))
     if math.isinf(mine) and mine == other:
         return "not within what was measured"
@@ -84,7 +82,7 @@ def limit_in_words(answer: LoopAnswer, name: str) -> str:
     """Return an arm's limiting magnitude with its error."""
     limit = answer.limit(name)
     if limit.is_known:
-        return _plus_minus(Estimate(limit.magnitude.value, limit.error), _SMALLEST_ERROR_MAG, 2)
+        return limit.in_words()
     if limit.magnitude.value > 0:
         return f">{answer.magnitudes[0]:.2f}"
     return f"<{answer.magnitudes[-1]:.2f}"
@@ -149,22 +147,8 @@ def _ends(answer: LoopAnswer) -> str:
     flux = answer.at_star
     parts = []
     for name in dict.fromkeys((answer.best.name, *REFERENCES)):
-        result = answer[name]
-        parts += [
-            f"{value} {plain_number(result.choices[flux][value])} of {name}" for value in result.at_end[flux]
-        ]
+        choice = answer.choice(name, flux)
+        parts += [f"{value} {plain_number(choice[value])} of {name}" for value in answer.at_end(name, flux)]
     if not parts:
         return ""
     return _TEXT("loop_answer.at_end", parts=", ".join(parts))
-
-
-def _plus_minus(value: Estimate, smallest: float, digits: int = 3) -> str:
-    if not math.isfinite(value.standard_error):
-        return f"{value.value:.{digits}f}"
-    return f"{value.value:.{digits}f}±{max(value.standard_error, smallest):.{digits}f}"
-
-
-def _signed(value: Estimate, digits: int, smallest: float) -> str:
-    if not math.isfinite(value.standard_error):
-        return f"{value.value:+.{digits}f} (no error: too few realisations)"
-    return f"{value.value:+.{digits}f}±{max(value.standard_error, smallest):.{digits}f}"

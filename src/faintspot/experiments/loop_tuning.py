@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.control.learning import INTEGRATOR
-from faintspot.experiments.loop_answer import LoopAnswer, LoopArmResult
-from faintspot.experiments.loop_arms import ArmKind, Choice, arm_kind
+from faintspot.experiments.loop_answer import LoopAnswer
 from faintspot.experiments.loop_question import LoopQuestion
 from faintspot.experiments.loop_results import MagnitudeResult
 from faintspot.experiments.magnitude import run_magnitude, with_flux
@@ -125,30 +122,4 @@ def tune_loop(
         else:
             names.append(kind.name)
             result = measured(names)
-    return LoopAnswer(
-        question, _results(base, result), result.photons, plan.frames - plan.settle_frames, left_out
-    )
-
-
-def _results(base: LoopConfiguration, result: MagnitudeResult) -> tuple[LoopArmResult, ...]:
-    stars = [with_flux(base, float(flux)) for flux in result.photons]
-    found = []
-    for arm, name in enumerate(result.names):
-        kind = arm_kind(name)
-        choices: list[dict[str, Any]] = [json.loads(text) for text in result.choices[arm]]
-        ends = tuple(values_at_end(kind, *each) for each in zip(stars, choices, strict=True))
-        found.append(LoopArmResult(kind, tuple(choices), result.strehl[arm], result.centroid_gain[arm], ends))
-    return tuple(found)
-
-
-def values_at_end(kind: ArmKind, configuration: LoopConfiguration, choice: Choice) -> tuple[str, ...]:
-    """Return which chosen values are the first or last that were on offer, but could be beyond."""
-    declared = kind.estimator.declared()
-    found = []
-    for name, each in kind.tuned(configuration).items():
-        if len(each.values) < 2 or isinstance(choice[name], str):
-            continue
-        limits = (declared[name].low, declared[name].high) if name in declared else ()
-        if choice[name] in (min(each.values), max(each.values)) and choice[name] not in limits:
-            found.append(name)
-    return tuple(found)
+    return LoopAnswer(question, result, plan.frames - plan.settle_frames, left_out)

@@ -13,31 +13,26 @@ from faintspot.base.errors import InputError
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
 from faintspot.estimators.window import Window
-from faintspot.experiments.budget import TERMS
 from faintspot.experiments.loop_analysis import (
-    GROUPS,
     NO_TV,
     TV,
     TV_BEST,
-    GroupRow,
     Measurements,
     differences_by_flux,
     differences_by_strength,
     gains_in_magnitude,
+    group_rows,
     measurements,
-    strehl_table,
 )
 from faintspot.experiments.loop_arms import VARIANTS
 from faintspot.experiments.loop_results import (
     BudgetResult,
     InterleavedResult,
     MagnitudeResult,
-    gain_in_words,
-    in_words,
-    with_error,
 )
-from faintspot.experiments.statistics import Estimate, paired_mean
-from faintspot.report.texts import Texts
+from faintspot.experiments.loop_tables import budget_table, in_columns, strehl_groups_table, strehl_table
+from faintspot.experiments.statistics import Estimate
+from faintspot.experiments.words import with_interval
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
 REFERENCES = (Window.name, BrightestPixels.name)
@@ -82,7 +77,7 @@ def loop_verdict(results: LoopResults) -> list[str]:
     if results.interleaved is not None:
         table = measurements(results.interleaved)
         lines += _interleaved_lines(table)
-        comparisons += [row.difference for row in strehl_table(table)]
+        comparisons += [row.difference for row in group_rows(table)]
         comparisons += [row.difference for row in differences_by_strength(table)]
     if results.magnitude is not None:
         lines += _magnitude_lines(results.magnitude)
@@ -151,14 +146,13 @@ def _headline(comparisons: list[Estimate | None]) -> list[str]:
 
 
 def _interleaved_lines(table: Measurements) -> list[str]:
-    rows = {row.group: row for row in strehl_table(table)}
+    rows = {row.group: row for row in group_rows(table)}
     if NO_TV not in rows:
         return ["Interleaved observations: no measurement without TV yet."]
     return [
         f"Interleaved, {name}: Strehl {row.mean:.3f} in {row.count} measurements against "
         f"{rows[NO_TV].mean:.3f} in {rows[NO_TV].count} without; paired difference "
-        f"{in_words(row.difference)}, "
-        f"{_judgement(row.difference)}."
+        f"{with_interval(row.difference)}, {_judgement(row.difference)}."
         for name, row in rows.items()
         if name in (TV, TV_BEST)
     ]
@@ -189,13 +183,13 @@ def _comparison(result: MagnitudeResult, arm: int, reference: int) -> str:
 def _gain_in_magnitude(result: MagnitudeResult, arm: int, reference: int) -> str:
     """Return the gain at the middle one of the Strehl ratios at which there is one."""
     every = gains_in_magnitude(result, arm, reference)
-    gains = [each for each in every if np.isfinite(each.gain.value)]
+    gains = [
+        (level, each) for level, each in every.items() if np.isfinite(each.value) and not np.isnan(each.low)
+    ]
     if not gains:
         return ""
-    middle = gains[len(gains) // 2]
-    if np.isnan(middle.gain.low):
-        return f"; gain in limiting magnitude: {middle.why_not}"
-    return f"; limiting magnitude at Strehl {middle.strehl:g}: {gain_in_words(middle)} mag"
+    level, middle = gains[len(gains) // 2]
+    return f"; limiting magnitude at Strehl {level:g}: {with_interval(middle, 2)} mag"
 
 
 def _judgement(estimate: Estimate | None) -> str:
@@ -207,54 +201,15 @@ def _judgement(estimate: Estimate | None) -> str:
 _WIDTH = 100
 
 
-def interleaved_summary(result: InterleavedResult) -> str:
-    """Return mean and standard deviation of the measurements of each group in each set, and the verdict."""
-    table = measurements(result)
-    lines = ["Strehl ratio".ljust(30) + "".join(f"{group:>25s}" for group in GROUPS)]
-    for number, name in [*enumerate(result.set_names), (None, "all sets")]:
-        rows = {row.group: row for row in strehl_table(table, number)}
-        cells = (_cell(rows[group]) if group in rows else "-" for group in GROUPS)
-        lines.append(f"{name:30s}" + "".join(f"{cell:>25s}" for cell in cells))
-    lines.append("± standard deviation of the measurements, whose number is in brackets; turbulence drifts")
-    return "\n".join([*lines, "", *_verdict(LoopResults(interleaved=result))])
-
-
-def magnitude_summary(result: MagnitudeResult) -> str:
-    """Return the Strehl ratio of every arm at every flux with its standard error, and the verdict."""
-    width = max(map(len, result.labels)) + 2
-    lines = [
-        "photo-electrons".ljust(width) + "".join(f"{flux:>14g}" for flux in result.photons),
-        "magnitude".ljust(width) + "".join(f"{magnitude:>14.1f}" for magnitude in result.magnitudes),
-    ]
-    for label, curve in zip(result.labels, result.strehl, strict=True):
-        cells = (with_error(paired_mean(runs)) for runs in curve)
-        lines.append(label.ljust(width) + "".join(f"{cell:>14s}" for cell in cells))
-    lines.append(f"± standard error from {result.strehl.shape[-1]} realisations of the air")
-    return "\n".join([*lines, "", *_verdict(LoopResults(magnitude=result))])
-
-
-def budget_summary(result: BudgetResult) -> str:
-    """Return the Strehl ratio and the rms wavefront of every arm without each term."""
-    width = max(map(len, result.terms)) + 2
-    column = max(30, *(len(label) + 2 for label in result.labels))
-    lines = ["without".ljust(width) + "".join(label.rjust(column) for label in result.labels)]
-    for number, term in enumerate(result.terms):
-        cells = (
-            f"{with_error(paired_mean(result.strehl[arm, number]))}  "
-            f"{with_error(paired_mean(result.residual_nm[arm, number]), 0)} nm"
-            for arm in range(len(result.labels))
-        )
-        lines.append(term.ljust(width) + "".join(cell.rjust(column) for cell in cells))
-    lines += ["Strehl ratio and rms wavefront with their standard errors", ""]
-    texts = Texts("faintspot.experiments")["terms"]
-    meanings = (f"without {term}: {texts[term]}" for term in result.terms if term in TERMS)
-    return "\n".join([*lines, *meanings])
-
-
-def _cell(row: GroupRow) -> str:
-    return f"{with_error(Estimate(row.mean, row.standard_deviation))} ({row.count})"
-
-
-def _verdict(results: LoopResults) -> list[str]:
-    lines = loop_verdict(results)
-    return [part for line in lines for part in textwrap.wrap(line, _WIDTH, subsequent_indent="  ")]
+def loop_summary(results: LoopResults) -> str:
+    """Return the main tables of results and the verdict as text."""
+    tables = []
+    if results.interleaved is not None:
+        table = strehl_groups_table(results.interleaved, measurements(results.interleaved))
+        tables.append(in_columns(table, 5))
+    if results.magnitude is not None:
+        tables.append(in_columns(strehl_table(results.magnitude)))
+    if results.budget is not None:
+        tables.append(in_columns(budget_table(results.budget), 4))
+    verdict = [textwrap.fill(line, _WIDTH, subsequent_indent="  ") for line in loop_verdict(results)]
+    return "\n\n".join([*tables, *(["\n".join(verdict)] if verdict else [])])

@@ -326,8 +326,3 @@ def judged(holds: bool, in_part: bool) -> Outcome:
     if holds:
         return Outcome.HOLDS
     return Outcome.IN_PART if in_part else Outcome.FAILS
-
-
-def with_error(value: float, error: float) -> str:
-    """Return "0.1327 ± 0.0012"."""
-    return f"{value:.4f} ± {error:.4f}"
