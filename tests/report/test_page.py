@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from tests.recorded.recorded_cases import Page as Reader
-from tests.refusals import refused
 
 from faintspot.base.errors import InputError
 from faintspot.report.drawing import new_figure
@@ -21,7 +20,6 @@ from faintspot.report.page import (
     configuration_section,
     html_of,
     write_page,
-    write_report,
 )
 
 pytestmark = pytest.mark.usefixtures("coarse_pictures")
@@ -117,14 +115,3 @@ def test_files_lie_beside_the_page(tmp_path: Path) -> None:
     (tmp_path / "b-figures").write_text("a file")
     with pytest.raises(InputError, match="choose another folder"):
         write_page(page(), tmp_path / "b.html")
-
-
-def test_write_report_is_whole_or_refused(tmp_path: Path) -> None:
-    target = tmp_path / "report.html"
-    target.write_text("old")
-    write_report(target, "<p>é</p>")
-    assert target.read_text(encoding="utf-8") == "<p>é</p>"
-    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
-    for bad in (tmp_path / "missing" / "report.html", tmp_path):
-        with refused():
-            write_report(bad, "x")

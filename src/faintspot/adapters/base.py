@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_keys, checked_table
 from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import read_tables
-from faintspot.pipeline import configuration
+from faintspot.pipeline.configuration import Parts
 from faintspot.pipeline.mean_flux import MeanFlux
 from faintspot.pipeline.settings import Settings
 from faintspot.pipeline.slope_pipeline import SlopePipeline
@@ -98,15 +98,6 @@ def layout_around(centres: ArrayLike, frame_shape: tuple[int, int], side: int) -
     return Layout(frame_shape, (side, side), corners, finite_array("lenslet centres", centres))
 
 
-class Parts(NamedTuple):
-    """Parts of a pipeline except the layout, which the tool provides."""
-
-    settings: Settings
-    calibration: Calibration
-    psf: PSF | None
-    score: Score | None
-
-
 def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
     """Return the pipeline's parts from a tool's configuration.
 
@@ -129,12 +120,7 @@ def parts_of(source: str | Path | Mapping[str, Any]) -> Parts:
         document = {name: checked_table(f"faintspot: {name}", values) for name, values in source.items()}
     else:
         raise InputError(f"faintspot: expected a file or tables of settings, got {type(source).__name__}")
-    return Parts(
-        Settings.from_tables(path, document),
-        Calibration.from_tables(path, document),
-        configuration.psf_of(path, document),
-        configuration.score_of(path, document),
-    )
+    return Parts.from_tables(path, document)
 
 
 class AdapterOptions(TypedDict, total=False):

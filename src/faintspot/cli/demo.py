@@ -133,8 +133,8 @@ def write_files(
 
 def write_page(folder: Path, arms: list[MeasuredSlopes], **shown: Any) -> None:
     """Make the report."""
+    from faintspot.base.files import write_atomically
     from faintspot.recorded.page import slopes_report
-    from faintspot.report.page import write_report
 
     facts = {
         "Source": "simulated, with known truth",
@@ -149,4 +149,4 @@ def write_page(folder: Path, arms: list[MeasuredSlopes], **shown: Any) -> None:
         facts=facts,
         configurations={"Configuration": (folder / "tv.toml").read_text(encoding="utf-8")},
     )
-    write_report(folder / "report.html", html)
+    write_atomically(folder / "report.html", html)

@@ -44,9 +44,9 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
       faintspot report night.zarr
       faintspot report canary -o canary.html
     """
+    from faintspot.base.files import write_atomically
     from faintspot.experiments.study_page import report_of_study
     from faintspot.recorded.report_of_stored import report_of_stored
-    from faintspot.report.page import write_report
 
     paths = [Path(path) for path in slopes]
     if output is not None and Path(output).resolve() in [path.resolve() for path in paths]:
@@ -73,5 +73,5 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
     else:
         html = report_of_stored(paths, frames=[Path(path) for path in recording] or None)
     target = output or str(derived(paths[0], ".html"))
-    write_report(target, html)
+    write_atomically(target, html)
     click.echo(f"{target}: open it in a browser")

@@ -25,8 +25,27 @@ class Npy(FileFormat):
     signatures = (b"\x93NUMPY",)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return the array of the file."""
-        return _find_npy(path, key)
+        """Return the array of a .npy file.
+
+        Raises
+        ------
+        InputError
+            When the file is incomplete, holds Python objects, or a key is given.
+        """
+        if key is not None:
+            raise InputError(f"{path}: a .npy file holds one unnamed array, expected no key, got {key!r}")
+        with path.open("rb") as stream:
+            header = read_header(str(path), stream, path.stat().st_size)
+        if header.fortran_order and len(header.shape) > 1:
+            return MappedArray(str(path), np.load(path, mmap_mode="r", allow_pickle=False))
+        return RawArray(
+            str(path),
+            lambda: path.open("rb"),
+            offset=header.offset,
+            dtype=header.dtype,
+            shape=header.shape,
+            forward_only=False,
+        )
 
 
 class Npz(FileFormat):
@@ -37,8 +56,24 @@ class Npz(FileFormat):
     endings = (".npz",)
 
     def find(self, path: Path, key: str | None) -> StoredArray:
-        """Return an array of the file, streamed from its zip member."""
-        return _find_npz(path, key)
+        """Return one array of a .npz file, streamed from its zip member.
+
+        Raises
+        ------
+        InputError
+            When the file is damaged, has no such array, or has several and no key is given.
+        """
+        try:
+            archive, members = open_archive(path)
+            archive.close()
+            wanted = PREFERRED_NAME if key is None else key
+            # Without a name, the headers decide which array to read.
+            headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
+        except DAMAGE as error:
+            raise InputError(f"{path}: expected a valid .npz file ({one_line(error)})") from None
+        dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
+        chosen = choose_name(path, dimensions, key)
+        return _npz_array(path, chosen, members[chosen], headers[chosen])
 
     def write(self, stream: IO[bytes], slopes: StoredSlopes) -> None:
         """Write each variable and coordinate, and the attributes as a JSON text named `attributes`."""
@@ -74,51 +109,6 @@ class Npz(FileFormat):
             return False  # its reader gives the reason
         archive.close()
         return {*REQUIRED, "attributes"} <= members.keys()
-
-
-def _find_npy(path: Path, key: str | None) -> StoredArray:
-    """Return the array of a .npy file.
-
-    Raises
-    ------
-    InputError
-        When the file is incomplete, holds Python objects, or a key is given.
-    """
-    if key is not None:
-        raise InputError(f"{path}: a .npy file holds one unnamed array, expected no key, got {key!r}")
-    with path.open("rb") as stream:
-        header = read_header(str(path), stream, path.stat().st_size)
-    if header.fortran_order and len(header.shape) > 1:
-        return MappedArray(str(path), np.load(path, mmap_mode="r", allow_pickle=False))
-    return RawArray(
-        str(path),
-        lambda: path.open("rb"),
-        offset=header.offset,
-        dtype=header.dtype,
-        shape=header.shape,
-        forward_only=False,
-    )
-
-
-def _find_npz(path: Path, key: str | None) -> StoredArray:
-    """Return one array of a .npz file, streamed from its zip member.
-
-    Raises
-    ------
-    InputError
-        When the file is damaged, has no such array, or has several and no key is given.
-    """
-    try:
-        archive, members = open_archive(path)
-        archive.close()
-        wanted = PREFERRED_NAME if key is None else key
-        # Without a name, the headers decide which array to read.
-        headers = headers_of(path, [wanted] if wanted in members or key is not None else None)
-    except DAMAGE as error:
-        raise InputError(f"{path}: expected a valid .npz file ({one_line(error)})") from None
-    dimensions = {name: len(headers[name].shape) if name in headers else 0 for name in members}
-    chosen = choose_name(path, dimensions, key)
-    return _npz_array(path, chosen, members[chosen], headers[chosen])
 
 
 def _npz_array(path: Path, key: str, member: zipfile.ZipInfo, header: Header) -> StoredArray:

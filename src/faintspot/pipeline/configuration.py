@@ -27,6 +27,25 @@ _ANALYTIC_KEYS = ("profile", "size", "elongation", "angle_deg", "radius_px")
 Item = Layout | Calibration | Settings | PSF | Score
 
 
+class Parts(NamedTuple):
+    """Parts of a pipeline except the layout."""
+
+    settings: Settings
+    calibration: Calibration
+    psf: PSF | None
+    score: Score | None
+
+    @classmethod
+    def from_tables(cls, path: Path, document: Mapping[str, dict[str, Any]]) -> Parts:
+        """Read the parts from the tables of a configuration file; PSF and score may be absent."""
+        return cls(
+            Settings.from_tables(path, document),
+            Calibration.from_tables(path, document),
+            psf_of(path, document),
+            score_of(path, document),
+        )
+
+
 class Configuration(NamedTuple):
     """Contents of a configuration file."""
 
@@ -63,13 +82,7 @@ def load_all(path: str | Path) -> Configuration:
     """Read all parts of a configuration file; PSF and score may be absent."""
     path = Path(path)
     document = read_tables(path)
-    return Configuration(
-        Layout.from_tables(path, document),
-        Settings.from_tables(path, document),
-        Calibration.from_tables(path, document),
-        psf_of(path, document),
-        score_of(path, document),
-    )
+    return Configuration(Layout.from_tables(path, document), *Parts.from_tables(path, document))
 
 
 def has(path: str | Path, table: str) -> bool:

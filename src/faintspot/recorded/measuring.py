@@ -16,7 +16,6 @@ from faintspot.base.checks import one_of
 from faintspot.base.errors import InputError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.base.version import __version__
-from faintspot.camera.calibration import Calibration
 from faintspot.config.tables import read_tables
 from faintspot.io.aot_reading import is_aot, read_aot
 from faintspot.io.frames import FrameSource, open_frames
@@ -217,17 +216,12 @@ def _given(
     else:
         words.append("settings")
     where = Path(path)
-    settings = Settings.from_tables(where, document)
     if "settings" in words and sensor.parts is not None:
-        parts = configuration.Configuration(sensor.layout, settings, *configuration.unpacked(sensor.parts))
+        settings = Settings.from_tables(where, document)
+        measuring = configuration.Parts(settings, *configuration.unpacked(sensor.parts))
     else:
-        parts = configuration.Configuration(
-            sensor.layout,
-            settings,
-            Calibration.from_tables(where, document),
-            configuration.psf_of(where, document),
-            configuration.score_of(where, document),
-        )
+        measuring = configuration.Parts.from_tables(where, document)
+    parts = configuration.Configuration(sensor.layout, *measuring)
     listed = " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
     return parts, f"{listed} of {first}", sensor.reference
 

@@ -163,7 +163,7 @@ def write_page(page: Page, path: str | Path) -> list[Path]:
     """
     path = Path(path)
     drawn = _drawn(page)
-    write_report(path, _render(page, drawn))
+    write_atomically(path, _render(page, drawn))
     contents = {
         f"{figure.name}.{ending}": content
         for of_section in drawn.values()
@@ -179,17 +179,6 @@ def write_page(page: Page, path: str | Path) -> list[Path]:
     for name, content in contents.items():
         write_atomically(folder / name, content)
     return [path, *(folder / name for name in contents)]
-
-
-def write_report(path: str | Path, html: str) -> None:
-    """Write a page in one step; an existing file is replaced.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
-    """
-    write_atomically(path, html)
 
 
 def data_uri(ending: str, content: bytes) -> str:
