@@ -24,7 +24,7 @@ def pseudo_open_loop_slopes(
     centroid_gain: ArrayLike = 1.0,
     delay_frames: int = 0,
 ) -> Floats:
-    """Return the slopes of the air alone: residual slopes without what the mirror held during their frame.
+    """Return open-loop slopes: residual slopes plus the slopes of the mirror during their frame.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def pseudo_open_loop_slopes(
 
 
 def open_loop_slopes(record: LoopRecord) -> Floats:
-    """Return the slopes of the air alone that a run saw, (frames, 2 n) px.
+    """Return the slopes of the turbulence alone that a run saw, (frames, 2 n) px.
 
     A run in open loop has measured just them; only the centroid gain is taken out.
     """

@@ -21,7 +21,7 @@ class TelemetryAnalysis:
     """Turbulence estimated from recorded telemetry of a loop."""
 
     slopes_px: Floats
-    """(frames, 2 n): slopes of the air alone."""
+    """(frames, 2 n): slopes of the turbulence alone."""
     seeing: Seeing
     """From all frames."""
     segments: tuple[Seeing, ...]

@@ -34,7 +34,7 @@ def command(slopes: tuple[str, ...], output: str | None, recording: tuple[str, .
 
     The store of a study (`faintspot study`), finished or not, gives the page with its figures and verdicts.
     So does the folder of a closed-loop experiment (`faintspot loop`). Telemetry (`faintspot realtime record`)
-    gives rates, latencies, lost frames, slopes, settings that changed, and what arms in turn differ by.
+    gives rates, latencies, lost frames, slopes, changed settings, and differences between methods.
 
     \b
     Examples:

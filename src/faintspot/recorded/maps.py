@@ -190,7 +190,7 @@ def _scatter(axes: Axes, arms: Sequence[MeasuredSlopes], jitters: Sequence[Jitte
     axes.set_aspect("equal")
     axes.set_xlabel(f"jitter, {arms[1].name} (px)")
     axes.set_ylabel(f"jitter, {arms[0].name} (px)")
-    axes.set_title("Below the line: the first arm is steadier", fontsize=12)
+    axes.set_title("Below the line: the first method is steadier", fontsize=12)
 
 
 def _panels(rows: int, columns: int, layout: Layout) -> tuple[Figure, Any]:

@@ -15,7 +15,7 @@ from faintspot.io.telemetry import Telemetry
 Floats = NDArray[np.float64]
 
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
-_TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the air changes slowly
+_TURNS_TOGETHER = 10  # neighbouring turns of the bootstrap's blocks: the turbulence changes slowly
 
 
 @dataclass(frozen=True)

@@ -156,9 +156,9 @@ def _arms(telemetry: Telemetry) -> Section:
             difference = "–" if arm.difference is None else _in_words(arm.difference)
             rows.append([name, arm.arm, _with_error(arm.mean), difference])
     first = next(iter(found.values()))[0].arm
-    header = ["", "arm", "mean ± standard error", f"less {first!r} (95 %)"]
+    header = ["", "method", "mean ± standard error", f"less {first!r} (95 %)"]
     text = [_TEXT["arms.text"]]
-    return Section("arms", "Arms in turn", text, [Table(header, rows)], [arms_figure(telemetry, found)])
+    return Section("arms", "Methods in turn", text, [Table(header, rows)], [arms_figure(telemetry, found)])
 
 
 def _in_words(estimate: Estimate) -> str:
