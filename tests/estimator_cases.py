@@ -55,8 +55,11 @@ class Case:
         if score is not None and score.index is not None:
             score = replace(score, index=score.index[places])
         prior = None if self.prior is None else self.prior[places]
-        settings = self.settings.replace(**per_image)
-        return Case(self.images[places], settings, self.calibration, psf, score, prior)
+        settings, calibration = self.settings.replace(**per_image), self.calibration
+        if isinstance(calibration.read_noise_e, np.ndarray):
+            noise = calibration.read_noise_e.reshape(self.images.shape)[places]
+            calibration = replace(calibration, read_noise_e=noise.reshape(-1, noise.shape[2]))
+        return Case(self.images[places], settings, calibration, psf, score, prior)
 
 
 # Cases ------------------------------------------------------------------------------------------------
@@ -187,6 +190,16 @@ def random_case(
     score = random_score(rng, n) if estimator == "trained" else None
     prior = places + rng.normal(0.0, 0.3, (n, 2)) if rng.random() < 0.5 else None
     return Case(images, settings, calibration, psf if estimator in NEED_PSF else None, score, prior)
+
+
+def with_noise_map(case: Case, seed: int) -> Case:
+    """The same with a read noise of each pixel: a tail, noiseless and very noisy pixels, a few bad ones."""
+    rng = np.random.default_rng(seed)
+    n, ny, nx = case.images.shape
+    noise = case.calibration.read_noise_e * rng.lognormal(0.0, 0.7, (n * ny, nx))
+    for share, value in ((0.02, 0.0), (0.01, 100.0), (0.01, np.nan)):
+        noise[rng.random(noise.shape) < share] = value
+    return replace(case, calibration=replace(case.calibration, read_noise_e=noise))
 
 
 # Slopes ---------------------------------------------------------------------------------------------

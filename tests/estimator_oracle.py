@@ -17,6 +17,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import erfc
 from tests import naive
 from tests import naive_estimators as oracle
 from tests.estimator_cases import Case, assert_sane
@@ -62,14 +63,14 @@ def tasks(case: Case) -> list[Task]:
     own = {
         name: _each(case, name) for name in ("weight_floor", "model_error", "prior_std_px", "weight_fwhm_px")
     }
-    noise = (calibration.read_noise_e or 0.0) / calibration.em_gain
+    noises = pixel_noises(case)
     excess = 2.0 if calibration.em_gain > 1 else 1.0
     search = np.nan_to_num(case.each("search_range_px"), nan=max(nx, ny) / 2)
     made = []
     for s in range(n):
         made.append(
             Task(
-                variance=noise**2 + excess * calibration.background_e,
+                variance=noises[s] ** 2 + excess * calibration.background_e,
                 excess=excess,
                 weight_floor=own["weight_floor"][s],
                 model_error=own["model_error"][s],
@@ -87,6 +88,20 @@ def tasks(case: Case) -> list[Task]:
     return made
 
 
+def pixel_noises(case: Case) -> list[NDArray[np.float64]]:
+    """Read noise of each image, one number or one of each pixel; bad ones have the mean variance."""
+    noise = case.calibration.read_noise_e
+    if not isinstance(noise, np.ndarray):
+        return [np.asarray((noise or 0.0) / case.calibration.em_gain)] * len(case.images)
+    noise = noise.reshape(case.images.shape) / case.calibration.em_gain
+    usual = np.nanmean(noise**2)
+    found = []
+    for own in noise:
+        mean = usual if np.isnan(own).all() else np.nanmean(own**2)
+        found.append(np.sqrt(np.where(np.isnan(own), mean, own**2)))
+    return found
+
+
 def _each(case: Case, name: str) -> NDArray[np.float64]:
     """Values of an option for all images; NaN where the estimator has no such option."""
     if name in case.settings.declared():
@@ -101,16 +116,15 @@ def spot_tasks(case: Case) -> list[Task]:
     spots, index = spots_of(case.psf, tabulated=True), case.psf.index_of(n)
     width = case.psf.fwhm_px
     reach = start_reach(width.max(), (ny, nx))
-    noise = case.calibration.read_noise_e or 0.0
-    whole = noise < 0.25 and case.calibration.em_gain == 1 and case.calibration.background_e == 0
+    counts = case.calibration.em_gain == 1 and case.calibration.background_e == 0
     background = case.settings.local_background == "on"
-    whole = whole and case.settings.estimator.name != "matched" and not background
+    counts = counts and case.settings.estimator.name != "matched" and not background
     made = []
-    for task, kind in zip(tasks(case), index, strict=True):
+    for task, kind, noise in zip(tasks(case), index, pixel_noises(case), strict=True):
         task = replace(task, background=background)
-        variance = task.variance
-        if whole:  # what rounding leaves: one electron more or less where the noise is beyond a half
-            variance = math.erfc(0.5 / (noise * math.sqrt(2))) if noise else 0.0
+        whole = counts & (noise < 0.25)
+        # What rounding leaves: one electron more or less where the noise is beyond a half.
+        variance = np.where(whole, erfc(0.5 / (np.maximum(noise, 1e-9) * math.sqrt(2))), task.variance)
         fwhm = (width[kind, 0], width[kind, 1])
         known = replace(task, spot=spots[kind], fwhm=fwhm, reach=reach, variance=variance)
         made.append(replace(known, whole_electrons=whole))
@@ -139,8 +153,7 @@ def begin(case: Case, s: int, g: Floats, task: Task) -> Estimate:
         reach = start_reach(widest, (g.shape[0], g.shape[1]))
         return oracle.start(g, replace(task, spot=spot, fwhm=fwhm, reach=reach))
     spot = exact_spots(case.psf)[case.psf.index_of(len(case.images))[s]]
-    image = np.rint(g) if task.whole_electrons else g
-    return oracle.start(image, replace(task, spot=spot))
+    return oracle.start(task.counted(g), replace(task, spot=spot))
 
 
 @cache
@@ -159,14 +172,14 @@ def by_posterior(case: Case, s: int, g: Floats, task: Task) -> Estimate:
     """
     assert case.psf is not None
     ny, nx = g.shape
-    g = np.rint(g) if task.whole_electrons else g
+    g = task.counted(g)
     search = case.each("search_range_px")
     reach = float(np.where(np.isnan(search), np.inf, search).max())
     grid, spacing = posterior_grid(reach, float(case.psf.fwhm_px.min()), (ny, nx))
     flux = max(case.each("flux_e")[s], 1.0)
     g = g - (g.sum() - flux) / g.size if task.background else g
     spot = exact_spots(case.psf)[case.psf.index_of(len(case.images))[s]]
-    variance = max(task.variance + task.weight_floor * flux, oracle.LEAST_VARIANCE)
+    variance = np.maximum(task.variance + task.weight_floor * flux, oracle.LEAST_VARIANCE)
     known = replace(task, spot=spot, variance=variance)
     broad = oracle.grid_posterior(g, known, flux, np.unique(grid[:, 0]), np.unique(grid[:, 1]), spacing)
     broad = replace(

@@ -197,6 +197,9 @@ def calibrate(frame: ArrayLike, calibration: fs.Calibration) -> Floats:
         level = np.asarray(0.0 if calibration.dark is None else calibration.dark)
         dark = level[i, j] if level.ndim else level
         flat = 1.0 if calibration.flat is None else calibration.flat[i, j]
+        noise = calibration.read_noise_e
+        if isinstance(noise, np.ndarray) and np.isnan(noise[i, j]):
+            continue
         if not (np.isfinite(raw[i, j]) and np.isfinite(dark) and np.isfinite(flat) and flat > 0):
             continue
         value = (raw[i, j] - dark) * calibration.gain_e_per_adu / (calibration.em_gain * flat)

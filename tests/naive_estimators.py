@@ -31,8 +31,8 @@ class Task:
 
     spot: Spot | None = None
     fwhm: tuple[float, float] = (2.0, 2.0)
-    variance: float = 0.01
-    """Read noise and the noise of the background that is taken off, of a pixel."""
+    variance: Any = 0.01
+    """Read noise and the noise of the background that is taken off, of a pixel or of each, (ny, nx)."""
     excess: float = 1.0
     weight_floor: float = 1e-3
     model_error: float = 0.0
@@ -43,7 +43,8 @@ class Task:
     """Of the taps of the start's smoothing, px; None is 2.5 standard deviations on each axis."""
     steps: int | None = None
     error_scale: float = 1.0
-    whole_electrons: bool = False
+    whole_electrons: Any = False
+    """Whether pixels are rounded, one answer or one for each."""
     background: bool = False
     """Whether a constant is a fourth parameter of the fit."""
     prior: tuple[float, float] = (0.0, 0.0)
@@ -64,6 +65,14 @@ class Task:
         if self.rounding is None:
             return total
         return total + float(np.finfo(np.float32).eps * np.abs(values).sum() * self.rounding.uniform(-1, 1))
+
+    @property
+    def mean_variance(self) -> float:
+        return float(np.mean(self.variance))
+
+    def counted(self, g: ArrayLike) -> Floats:
+        """The image with the pixels of low noise rounded."""
+        return np.where(self.whole_electrons, np.rint(g), np.asarray(g, np.float64))
 
     def limits(self, shape: tuple[int, int]) -> list[tuple[float, float]]:
         """Lowest and highest x, and y."""
@@ -120,10 +129,14 @@ def smoothed(g: ArrayLike, std_x: float, std_y: float, reach: int | None = None)
 def start(g: ArrayLike, task: Task) -> Estimate:
     """The largest pixel of the smoothed image within the search range, and the flux that explains it.
 
-    With a background unknown, image and spot are taken as what exceeds their mean.
+    With a background unknown, image and spot are taken as what exceeds their mean. Pixels noisier than the
+    mean count less, by the ratio of the variances.
     """
-    g = np.asarray(g, np.float64)
-    g = g - g.mean() if task.background else g
+    g = np.array(g, np.float64)
+    g -= g.mean() if task.background else 0.0
+    if np.ndim(task.variance):
+        mean = max(task.mean_variance, LEAST_VARIANCE)
+        g *= np.minimum(mean / np.maximum(task.variance, LEAST_VARIANCE), 1.0)
     std_x, std_y = (START_STD_PER_FWHM * width for width in task.fwhm)
     blurred = smoothed(g, std_x, std_y, task.reach)
     (low_x, high_x), (low_y, high_y) = task.limits(g.shape)
@@ -172,12 +185,16 @@ def largest_move(fwhm_x: float, fwhm_y: float) -> float:
 
 def weights(m: Floats, task: Task, first_flux: float, name: str) -> Floats:
     """Inverse of the variance that the likelihood ascribes to every pixel."""
-    if name == "matched":
+    if name == "matched" and not np.ndim(task.variance):
         return np.ones_like(m)
+    if name == "matched":
+        assert task.spot is not None
+        photons = task.excess * first_flux * np.sum(task.spot.images(0.0, 0.0, m.shape)[0] ** 2)
+        return np.asarray(1.0 / np.maximum(task.variance + photons, LEAST_VARIANCE))
     flux = np.maximum(m, 0.0)  # a spline may dip below zero
-    floor = max(task.variance + task.weight_floor * first_flux, LEAST_VARIANCE)
+    floor: Any = np.maximum(task.variance + task.weight_floor * first_flux, LEAST_VARIANCE)
     model_error_squared = min(task.model_error**2, MOST_MODEL_ERROR_E / first_flux)
-    return 1.0 / (floor + task.excess * flux + model_error_squared * flux**2)
+    return np.asarray(1.0 / (floor + task.excess * flux + model_error_squared * flux**2))
 
 
 def believed_flux(g: ArrayLike, expected: float, task: Task) -> float:
@@ -187,7 +204,7 @@ def believed_flux(g: ArrayLike, expected: float, task: Task) -> float:
     edges = g.size - inner.size
     ratio = inner.size / edges
     seen = inner.sum() - ratio * (g.sum() - inner.sum())
-    noise = inner.size * max(task.variance, 0.0) + task.excess * max(inner.sum(), 0.0)
+    noise = inner.size * task.mean_variance + task.excess * max(inner.sum(), 0.0)
     return seen if seen > 2 * expected + 3 * math.sqrt((1 + ratio) * noise) else expected
 
 
@@ -210,7 +227,7 @@ def fisher(g: ArrayLike, task: Task, name: str = "ml", begin: Estimate | None = 
     information on the place it stays.
     """
     assert task.spot is not None
-    g = np.rint(g) if task.whole_electrons and name in ("ml", "map") else np.asarray(g, np.float64)
+    g = task.counted(g) if name in ("ml", "map") else np.asarray(g, np.float64)
     begin = start(g, task) if begin is None else begin
     limits, margin = task.limits(g.shape), begin.margin
     x, y, flux = clamp(begin.x, *limits[0]), clamp(begin.y, *limits[1]), begin.flux
@@ -328,7 +345,7 @@ def weighted(g: ArrayLike, task: Task, begin: Estimate | None = None) -> Estimat
         moves += (max(abs(move_x), abs(move_y)),)
         x, y = clamp(x + move_x, *limits[0]), clamp(y + move_y, *limits[1])
     noise = w**2 * (task.variance + task.excess * g)
-    least = w**2 * max(task.variance, 1e-4)  # whatever noise has made of the flux
+    least = w**2 * np.maximum(task.variance, LEAST_VARIANCE)  # whatever noise has made of the flux
     errors = [
         math.sqrt(max(np.sum(noise * away**2), np.sum(least * away**2))) / total for away in (u - x, v - y)
     ]
@@ -390,7 +407,7 @@ def smoothed_brightest(
 
 
 def gravity_error(
-    image: ArrayLike, g: ArrayLike, variance: float, excess: float = 1.0, every_pixel: bool = False
+    image: ArrayLike, g: ArrayLike, variance: ArrayLike, excess: float = 1.0, every_pixel: bool = False
 ) -> tuple[float, float]:
     """Standard error of the centre of gravity of an image left by a background subtraction.
 
@@ -399,12 +416,13 @@ def gravity_error(
     known where in a pixel the flux fell.
     """
     image, g = np.asarray(image, np.float64), np.asarray(g, np.float64)
+    variances = np.broadcast_to(variance, g.shape)
     x, y = naive.centre_of_gravity(image)
     total, var_x, var_y = 0.0, 0.0, 0.0
     for j, v in enumerate(pixel_centres(g.shape[0])):
         for i, u in enumerate(pixel_centres(g.shape[1])):
             if every_pixel or image[j, i] > 0:
-                noise = variance + excess * max(g[j, i], 0.0)
+                noise = variances[j, i] + excess * max(g[j, i], 0.0)
                 total += image[j, i]
                 var_x += ((u - x) ** 2 + 1 / 12) * noise
                 var_y += ((v - y) ** 2 + 1 / 12) * noise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -11,7 +12,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests import naive_estimators as oracle
-from tests.estimator_cases import FIELDS, Case, assert_same, one_psf, random_case, settings_of
+from tests.estimator_cases import (
+    FIELDS,
+    Case,
+    assert_same,
+    assert_sane,
+    one_psf,
+    random_case,
+    settings_of,
+    with_noise_map,
+)
 from tests.estimator_oracle import assert_equals_oracle
 from tests.naive_spots import spots_of
 
@@ -40,6 +50,26 @@ class TestAgainstOracle:
     @settings(max_examples=10)
     def test_random_spots(self, estimator: str, seed: int) -> None:
         case = random_case(seed, estimator)
+        assert_equals_oracle(case, case.measure())
+
+    @pytest.mark.parametrize("estimator", QUICK)
+    @given(seed=SEEDS)
+    @settings(max_examples=10)
+    def test_random_spots_with_a_noise_map(self, estimator: str, seed: int) -> None:
+        case = with_noise_map(random_case(seed, estimator), seed)
+        assert_equals_oracle(case, case.measure())
+
+    @pytest.mark.parametrize("estimator", ["matched", "ml"])
+    @given(seed=SEEDS)
+    @settings(max_examples=5)
+    def test_noise_map_on_an_unknown_background(self, estimator: str, seed: int) -> None:
+        case = on_unknown_background(with_noise_map(random_case(seed, estimator), seed), seed)
+        assert_equals_oracle(case, case.measure())
+
+    @given(seed=SEEDS)
+    @settings(max_examples=4)
+    def test_posterior_with_a_noise_map(self, seed: int) -> None:
+        case = with_noise_map(random_case(seed, "map", n=2), seed)
         assert_equals_oracle(case, case.measure())
 
     @pytest.mark.portable
@@ -163,6 +193,79 @@ class TestIndependence:
         used, fresh = measured.pipeline(), measured.pipeline()
         used(np.stack([frame * scale for scale in (9.0, 0.1, 3.0)]))
         assert_same(used(frame), fresh(frame))
+
+
+class TestNoiseMap:
+    @EVERY
+    def test_constant_map_is_the_number(self, estimator: str) -> None:
+        """Of one variance, so that only the order of roundings may differ; the matched filter's weights are
+        another constant, which its flux and errors do not depend on.
+        """
+        case = random_case(21, estimator, n=9)
+        number = case.calibration.read_noise_e
+        shape = case.layout.frame_shape
+        same = replace(case.calibration, read_noise_e=np.full(shape, number))
+        found, expected = replace(case, calibration=same).measure(), case.measure()
+        assert np.array_equal(found.flags, expected.flags)
+        for name in ("x", "y", "flux", "standard_error_x", "standard_error_y"):
+            values = getattr(expected, name)
+            np.testing.assert_allclose(getattr(found, name), values, rtol=1e-5, atol=1e-5, err_msg=name)
+
+    @EVERY
+    def test_images_and_widths(self, estimator: str) -> None:
+        """Calibrated images and other SIMD widths give what the frames give."""
+        case = with_noise_map(random_case(22, estimator, n=9), 1)
+        case = replace(case, images=np.nan_to_num(case.images, nan=1.0))
+        pipeline, expected = case.pipeline(), case.measure()
+        frame = case.images.reshape(-1, case.images.shape[2])
+        calibrated = pipeline.explain(frame).calibrated.reshape(frame.shape)
+        narrow = pipeline.with_width(4)(frame, case.prior)
+        for found in (narrow, pipeline.for_images()(calibrated, case.prior)):
+            for name in ("x", "y", "standard_error_x"):
+                values = getattr(expected, name)
+                np.testing.assert_allclose(getattr(found, name), values, rtol=1e-4, atol=1e-4, err_msg=name)
+
+    @pytest.mark.parametrize("estimator", ["ml", "matched"])
+    def test_noisy_pixels_count_less(self, estimator: str) -> None:
+        """A pixel of 30 e- beside the spot, whose noise is assumed to be 1 e- or is known."""
+        rng = np.random.default_rng(4)
+        noise = np.ones((60, 10, 10))
+        noise[:, 4, 6] = 30.0
+        mean = one_psf().images(np.zeros((60, 2)), (10, 10), 200.0)
+        images = rng.poisson(np.maximum(mean, 0.0)) + noise * rng.standard_normal(noise.shape)
+        chosen = settings_of(estimator, search_range_px=3.0)
+        found = {}
+        for known in (1.0, noise.reshape(-1, 10)):
+            calibration = fs.Calibration(dark=0.0, read_noise_e=known)
+            slopes = Case(images.astype(np.float32), chosen, calibration, one_psf()).measure()
+            found[np.ndim(known)] = slopes
+        rms = {kind: float(np.sqrt(np.mean(slopes.x**2))) for kind, slopes in found.items()}
+        assert rms[2] < 0.5 * rms[0]
+        # 60 slopes give their rms to 9 %; three of these.
+        assert rms[2] == pytest.approx(float(np.mean(found[2].standard_error_x)), rel=0.3)
+
+    def test_automatic_settings_follow_the_mean_variance(self) -> None:
+        """Of the pixels of each sub-aperture."""
+        case = random_case(23, "tv", n=4, window=(8, 8))
+        settings = fs.Settings("tv", noise_std="auto", keep_brightest="auto", flux_e=200.0, spot_fwhm_px=2.0)
+        levels = np.array([0.5, 1.0, 2.0, 4.0])
+        noise = np.repeat(levels, 8)[:, None] * np.tile([1.0, 0.2], (32, 4))
+        mapped = fs.Calibration(dark=0.0, read_noise_e=noise)
+        table = replace(case, settings=settings, calibration=mapped).pipeline().plan.settings[0]
+        for s, level in enumerate(levels * math.sqrt((1.0 + 0.04) / 2)):
+            plain = fs.Calibration(dark=0.0, read_noise_e=level)
+            own = replace(case, settings=settings, calibration=plain).pipeline().plan.settings[0]
+            np.testing.assert_allclose(table[:, s], own[:, s], rtol=1e-6)
+
+    def test_hostile_maps(self) -> None:
+        """Noiseless, noisier than any camera, and all pixels but one bad."""
+        for estimator in estimators():
+            case = random_case(24, estimator, n=3, window=(6, 7))
+            noise = np.full(case.images.shape, 1e6)
+            noise[0], noise[2] = 0.0, np.nan
+            noise[2, 3, 3] = 1.0
+            mapped = replace(case.calibration, read_noise_e=noise.reshape(-1, 7))
+            assert_sane(replace(case, calibration=mapped).measure())
 
 
 class TestLocalBackground:

@@ -18,6 +18,7 @@ from tests.estimator_cases import (
     random_case,
     random_score,
     settings_of,
+    with_noise_map,
     with_options,
 )
 from tests.refusals import refused
@@ -91,6 +92,8 @@ class TestImages:
         if measured:
             chosen = with_options(chosen.replace(flux_e=None), normalisation="frame")
         chosen = with_options(chosen, local_background=str(rng.choice(["on", "off"])))
+        if rng.random() < 0.3:
+            case = with_noise_map(case, seed)
         assert_sane(replace(case, images=images, settings=chosen).measure())
 
     @EVERY

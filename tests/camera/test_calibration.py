@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -108,6 +110,11 @@ def test_equality() -> None:
         ("bad_pixels", {"bad_pixels": [[1, 2], [3]]}),
         ("bad_pixels", {"bad_pixels": np.zeros(3, bool)}),
         ("dark (3, 4), flat (4, 3)", {"dark": np.zeros((3, 4)), "flat": np.ones((4, 3))}),
+        ("read_noise_e = -1", {"read_noise_e": np.array([[1.0, -1.0], [np.nan, 1.0]])}),
+        ("read_noise_e", {"read_noise_e": np.full((3, 4), np.nan)}),
+        ("read_noise_e", {"read_noise_e": np.full((3, 4), np.inf)}),
+        ("read_noise_e", {"read_noise_e": np.ones(4)}),
+        ("dark (3, 4), read_noise_e (4, 3)", {"dark": np.zeros((3, 4)), "read_noise_e": np.ones((4, 3))}),
         ("bad_pixels (3, 3)", {"dark": np.zeros((3, 4)), "bad_pixels": np.zeros((3, 3), bool)}),
     ],
 )
@@ -119,5 +126,41 @@ def test_bad_values(words: str, arguments: dict[str, Any]) -> None:
 def test_maps_of_another_frame() -> None:
     with refused("calibration.flat", "(5, 5)", "(3, 4)"):
         fs.Calibration(flat=np.ones((3, 4))).maps((5, 5))
+    with refused("calibration.read_noise_e", "(5, 5)", "(3, 4)"):
+        fs.Calibration(read_noise_e=np.ones((3, 4))).maps((5, 5))
     with refused("calibration.bad_pixels", "(3, 0) is outside (3, 4)"):
         fs.Calibration(bad_pixels=[[0, 0], [3, 0]]).maps((3, 4))
+
+
+class TestNoiseMap:
+    def test_bad_pixels_have_no_noise(self) -> None:
+        """NaN in the map marks a bad pixel, and bad pixels of other maps are NaN in what the map gives."""
+        noise = np.full((3, 4), 6.0)
+        noise[0, 1] = np.nan
+        calibration = fs.Calibration(em_gain=2.0, bad_pixels=[[2, 3]], read_noise_e=noise)
+        expected = np.full((3, 4), 3.0)
+        expected[0, 1] = expected[2, 3] = np.nan
+        np.testing.assert_array_equal(calibration.read_noise_map((3, 4)), expected)
+        np.testing.assert_array_equal(np.isnan(calibration.maps((3, 4))[1]), np.isnan(expected))
+        assert fs.Calibration(read_noise_e=6.0).read_noise_map((3, 4)) is None
+
+    def test_typical_is_the_root_mean_square(self) -> None:
+        calibration = fs.Calibration(em_gain=5.0, read_noise_e=np.array([[3.0, 4.0], [5.0, np.nan]]))
+        assert calibration.typical_read_noise_e == pytest.approx(math.sqrt(50 / 3))
+        assert calibration.read_noise_photoelectrons == pytest.approx(math.sqrt(2 / 3))
+
+    def test_is_stored_beside_the_file(self, tmp_path: Path) -> None:
+        noise = np.random.default_rng(1).lognormal(0.0, 0.5, (3, 4))
+        calibration = fs.Calibration(read_noise_e=noise)
+        calibration.save(tmp_path / "faintspot.toml")
+        assert fs.Calibration.load(tmp_path / "faintspot.toml") == calibration
+
+    def test_is_read_from_a_file_that_is_named(self, tmp_path: Path) -> None:
+        np.save(tmp_path / "noise.npy", np.ones((3, 4)))
+        np.save(tmp_path / "cube.npy", np.ones((2, 3, 4)))
+        table = tmp_path / "faintspot.toml"
+        table.write_text('[calibration]\nread_noise_e = "noise.npy"\n', encoding="utf-8")
+        assert fs.Calibration.load(table) == fs.Calibration(read_noise_e=np.ones((3, 4)))
+        table.write_text('[calibration]\nread_noise_e = "cube.npy"\n', encoding="utf-8")
+        with refused("cube.npy", "one map"):
+            fs.Calibration.load(table)

@@ -170,6 +170,9 @@ def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     np.testing.assert_allclose(calibration.dark, dark)
     np.testing.assert_allclose(calibration.flat, flat / flat.mean())
     assert calibration.read_noise_e == 3.0
+    np.save("noise.npy", flat)
+    run.ok("layout", "a.npy", "-o", "noise.toml", "--read-noise-e", "noise.npy", "--pixels", 16)
+    np.testing.assert_allclose(np.asarray(Calibration.load("noise.toml").read_noise_e), flat)
     assert len(Layout.load("new.toml")) == 49
     run.ok("layout", "a.npy", "-o", "other.toml", *options, "--bad-pixels", "list.npy")
     assert np.asarray(Calibration.load("other.toml").bad_pixels).tolist() == [[3, 5], [40, 41]]

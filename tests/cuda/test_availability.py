@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib.util
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.refusals import refused
 
@@ -36,3 +37,14 @@ def test_without_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     with refused('use device="cpu", or set NUMBA_ENABLE_CUDASIM=1'):
         check_cuda()
+
+
+def test_noise_map_is_refused() -> None:
+    """The kernel of the GPU has one variance for each sub-aperture."""
+    pytest.importorskip("numba_cuda", reason="needs the extra gpu")
+    from faintspot.pipeline.device import DevicePipeline
+
+    calibration = fs.Calibration(read_noise_e=np.ones(LAYOUT.frame_shape))
+    plan = fs.SlopePipeline(LAYOUT, SETTINGS, calibration).plan
+    with refused("calibration.read_noise_e", 'device="cpu"'):
+        DevicePipeline(LAYOUT, calibration, plan)

@@ -29,6 +29,8 @@ SETTINGS = {
     "thresholded": fs.Settings("thresholded", threshold_e=2.0),
     "ml": fs.Settings(estimator="ml", search_range_px=1.5),
     "map": fs.Settings(estimator="map", flux_e=200.0),
+    "with a noise map": fs.Settings(estimator="ml", search_range_px=1.5),
+    "plain with a noise map": fs.Settings("brightest", keep_brightest=9),
 }
 
 
@@ -39,9 +41,9 @@ def frames(n: int, dtype: Any = np.uint16) -> NDArray[Any]:
 
 
 def pipeline(name: str) -> fs.SlopePipeline:
-    return fs.SlopePipeline(
-        LAYOUT, SETTINGS[name], fs.Calibration(100.0, read_noise_e=1.0), psf=fs.PSF.analytic()
-    )
+    noise = np.random.default_rng(5).lognormal(0.0, 0.5, LAYOUT.frame_shape)
+    calibration = fs.Calibration(100.0, read_noise_e=noise if "noise map" in name else 1.0)
+    return fs.SlopePipeline(LAYOUT, SETTINGS[name], calibration, psf=fs.PSF.analytic())
 
 
 class Source:

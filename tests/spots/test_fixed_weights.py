@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.refusals import refused
 
 import faintspot as fs
 from faintspot.estimators.window import Window
@@ -52,6 +53,22 @@ def test_the_best_linear_weights_beat_every_gaussian_window(learnt: fs.FixedWeig
     gaussian = [errors(window(fwhm))[0] for fwhm in (1.5, 2.0, 2.5, 3.0, 4.0)]
     assert best < 1.01 * min(gaussian)
     assert gain == pytest.approx(1.0, abs=0.02)  # 20,000 spots of .5 px with errors of about 1 px: +-.01
+
+
+def test_noisy_pixels_get_smaller_weights() -> None:
+    """With a map the weights are those of a number where it is constant, and small in a noisy pixel."""
+    clean, truth = spots_of_a_loop(2000, 8)
+    noise = np.full((SIDE, SIDE), NOISE_E)
+
+    def best(read_noise_e: Any) -> fs.FixedWeights:
+        return fs.FixedWeights.best_linear(clean, truth, flux_e=FLUX_E, read_noise_e=read_noise_e)
+
+    np.testing.assert_allclose(best(noise).x, best(NOISE_E).x, rtol=1e-9)
+    row, column = np.argwhere(np.abs(best(NOISE_E).x[0]) == np.abs(best(NOISE_E).x[0]).max())[0]
+    noise[row, column] = 100 * NOISE_E
+    assert np.abs(best(noise).x[0, row, column]) < 0.01 * np.abs(best(NOISE_E).x[0, row, column])
+    with refused("read_noise_e", f"({SIDE}, {SIDE})"):
+        best(np.ones(3))
 
 
 def test_weights_equal_a_sum_over_the_pixels(learnt: fs.FixedWeights) -> None:

@@ -27,8 +27,10 @@ def electrons_of(frames_adu: NDArray[np.floating], calibration: Calibration) -> 
 def calibration_of_electrons(calibration: Calibration) -> Calibration:
     """Return the calibration that remains for frames from `electrons_of`."""
     plain = replace(calibration, dark=0.0, flat=None, gain_e_per_adu=1.0, em_gain=1.0, saturation_adu=None)
-    noise = calibration.read_noise_photoelectrons
-    return replace(plain, bad_pixels=None, read_noise_e=noise)
+    noise = calibration.read_noise_e
+    return replace(
+        plain, bad_pixels=None, read_noise_e=None if noise is None else noise / calibration.em_gain
+    )
 
 
 def shifted_gain(

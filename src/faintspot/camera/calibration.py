@@ -27,7 +27,7 @@ from faintspot.config.tables import (
 from faintspot.io.frames import open_frames, read_array
 
 _BLOCK_PIXELS = 1 << 22  # processed at a time
-_MAPS = ("dark", "flat", "bad_pixels")
+_MAPS = ("dark", "flat", "bad_pixels", "read_noise_e")
 # Limit of values that the kernels square in float32, with a wide margin; no camera reaches it.
 _GAINS = 1e-9, 1e9
 _LARGEST_READ_NOISE_E, _LARGEST_BACKGROUND_E, _LARGEST_ADU = 1e6, 1e9, 1e30
@@ -60,10 +60,10 @@ class Calibration:
     saturation_adu : float, optional
         Raw value at which a pixel is saturated. Default: the largest value of the integer dtype of the
         frames; none for floating-point frames.
-    read_noise_e : float, optional
+    read_noise_e : float or (h, w) array, optional
         Standard deviation of the read noise in electrons at the camera's output, after multiplication; in
-        photo-electrons it is read_noise_e / em_gain. Required for standard errors and for the estimators "ml"
-        and "map".
+        photo-electrons it is read_noise_e / em_gain. A map gives that of each pixel; NaN marks a bad pixel.
+        Required for standard errors and for the estimators "ml" and "map".
     background_e : float
         Mean background of sky and dark current per pixel and frame [photo-electrons], whose mean is
         subtracted with `dark` and whose noise remains.
@@ -87,7 +87,7 @@ class Calibration:
     em_gain: float = 1.0
     bad_pixels: Any = None
     saturation_adu: float | None = None
-    read_noise_e: float | None = None
+    read_noise_e: Any = None
     background_e: float = 0.0
     rough_dark: bool = False
 
@@ -102,8 +102,7 @@ class Calibration:
         for name in ("gain_e_per_adu", "em_gain"):
             put(self, name, number_between(f"calibration.{name}", getattr(self, name), *_GAINS))
         if self.read_noise_e is not None:
-            noise = number_between("calibration.read_noise_e", self.read_noise_e, 0.0, _LARGEST_READ_NOISE_E)
-            put(self, "read_noise_e", noise)
+            put(self, "read_noise_e", _read_noise(self.read_noise_e))
         background = number_between("calibration.background_e", self.background_e, 0.0, _LARGEST_BACKGROUND_E)
         put(self, "background_e", background)
         if self.saturation_adu is not None:
@@ -141,9 +140,31 @@ class Calibration:
         return self.dark is not None and not self.rough_dark
 
     @property
+    def typical_read_noise_e(self) -> float | None:
+        """Read noise as one number: the root mean square of a map; None if unknown."""
+        noise = self.read_noise_e
+        if isinstance(noise, np.ndarray):
+            return math.sqrt(float(np.nanmean(np.square(noise))))
+        return noise  # type: ignore[no-any-return]
+
+    @property
     def read_noise_photoelectrons(self) -> float | None:
-        """Read noise divided by the multiplication gain; None if unknown."""
-        return None if self.read_noise_e is None else self.read_noise_e / self.em_gain
+        """`typical_read_noise_e` divided by the multiplication gain; None if unknown."""
+        noise = self.typical_read_noise_e
+        return None if noise is None else noise / self.em_gain
+
+    def read_noise_map(self, frame_shape: tuple[int, int]) -> NDArray[np.float64] | None:
+        """Return the read noise of each pixel [photo-electrons], NaN in bad ones; None if it is one number.
+
+        Raises
+        ------
+        InputError
+            If the map does not fit the frame.
+        """
+        if not isinstance(self.read_noise_e, np.ndarray):
+            return None
+        good = np.isfinite(self.maps(frame_shape)).all(axis=0)
+        return np.where(good, self.read_noise_e / self.em_gain, np.nan)
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
@@ -175,7 +196,7 @@ class Calibration:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Maps with the size of a frame."""
-        arrays = {"dark": self.dark, "flat": self.flat, "bad_pixels": self.bad_pixels}
+        arrays = {name: getattr(self, name) for name in _MAPS}
         return {
             name: value
             for name, value in arrays.items()
@@ -190,11 +211,7 @@ class Calibration:
         InputError
             If a map or a bad pixel does not fit into the frame.
         """
-        for name, array in self._arrays().items():
-            if array.shape != frame_shape:
-                raise InputError(
-                    f"calibration.{name}: expected the frame's shape {frame_shape}, got {array.shape}"
-                )
+        self._check_shapes(frame_shape)
         maps = np.empty((2, *frame_shape), np.float32)
         with np.errstate(over="ignore"):  # values that overflow float32 become infinite: bad pixels
             maps[0] = 0.0 if self.dark is None else self.dark
@@ -204,6 +221,8 @@ class Calibration:
                 gain = np.divide(gain, self.flat, where=usable, out=np.full(frame_shape, np.nan))
             if self.bad_pixels is not None:
                 gain[self._bad_mask(frame_shape)] = np.nan
+            if isinstance(self.read_noise_e, np.ndarray):
+                gain[np.isnan(self.read_noise_e)] = np.nan
             maps[1] = gain
         return maps
 
@@ -213,6 +232,14 @@ class Calibration:
             return self.saturation_adu
         # Not infinity, which an infinite pixel would reach.
         return _largest(dtype) if dtype.kind in "iu" else math.nan
+
+    def _check_shapes(self, frame_shape: tuple[int, int]) -> None:
+        """Raise an error if a map does not have the frame's shape."""
+        for name, array in self._arrays().items():
+            if array.shape != frame_shape:
+                raise InputError(
+                    f"calibration.{name}: expected the frame's shape {frame_shape}, got {array.shape}"
+                )
 
     def _bad_mask(self, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
         if self.bad_pixels.dtype == np.bool_:
@@ -241,6 +268,19 @@ def _scalar_or_map(name: str, value: Any) -> Any:
     return _map(name, value)
 
 
+def _read_noise(value: Any) -> Any:
+    """Return a number, or a map whose values are in range or NaN, not all of them NaN."""
+    name = "calibration.read_noise_e"
+    if real_array(name, value).ndim == 0:
+        return number_between(name, value, 0.0, _LARGEST_READ_NOISE_E)
+    noise = _map(name, value)
+    known = noise[~np.isnan(noise)]
+    if known.size == 0:
+        raise InputError(f"{name}: expected the noise of at least one pixel, every value is NaN")
+    numbers_between(name, known, 0.0, _LARGEST_READ_NOISE_E)
+    return noise
+
+
 def _mask_or_list(value: Any) -> NDArray[Any]:
     """Return a boolean mask, or rows and columns as (n, 2) int64."""
     try:
@@ -264,7 +304,7 @@ def _mask_or_list(value: Any) -> NDArray[Any]:
 
 
 def read_map(key: str, location: str | Path) -> NDArray[Any]:
-    """Read `dark` or `flat` (the mean of several frames), or `bad_pixels`.
+    """Read `dark` or `flat` (the mean of several frames), `read_noise_e` (one map), or `bad_pixels`.
 
     Bad pixels are a map of nonzero values, or rows of (row, column).
 
@@ -275,6 +315,8 @@ def read_map(key: str, location: str | Path) -> NDArray[Any]:
     """
     if key != "bad_pixels":
         with open_frames([location]) as frames:
+            if key == "read_noise_e" and frames.n_frames > 1:
+                raise InputError(f"{location}: expected one map of the read noise, got {frames.n_frames}")
             total = np.zeros(frames.shape)
             for _, block in frames.blocks(0, frames.n_frames, max(1, _BLOCK_PIXELS // total.size)):
                 total += block.sum(axis=0, dtype=np.float64)

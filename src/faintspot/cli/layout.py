@@ -130,7 +130,12 @@ _OPTIONS = {
     show_default="1, frames in electrons",
     section=_CAMERA,
 )
-@option("--read-noise-e", type=float, metavar="E", help="Read noise.", section=_CAMERA)
+@option(
+    "--read-noise-e",
+    metavar="E|FILE",
+    help="Read noise, a number or a map of each pixel as FILE[:ARRAY].",
+    section=_CAMERA,
+)
 @PIXEL_SCALE
 @SUBAPERTURE
 @DIAMETER
@@ -162,7 +167,7 @@ def command(
     flat: str | None,
     bad_pixels: str | None,
     gain_e_per_adu: float | None,
-    read_noise_e: float | None,
+    read_noise_e: str | None,
     mask_hot_pixels: bool,
     pixel_scale_arcsec: float | None,
     subaperture_m: float | None,
@@ -231,7 +236,7 @@ def command(
     unit = "ADU" if gain_e_per_adu is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
     if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
-        likely = float(f"{(calibration.read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
+        likely = float(f"{(calibration.typical_read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
         notes.append(f"  gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed")
         calibration = replace(calibration, gain_e_per_adu=likely)
         unit, seen = "e-", first_settings(layout, calibration, first)

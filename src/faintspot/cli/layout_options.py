@@ -74,7 +74,8 @@ def calibration(target: Path, **given: Any) -> Calibration:
     """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
     known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
     maps: dict[str, Callable[[str], Any]] = {
-        "dark": dark_level,
+        "dark": partial(number_or_map, "dark"),
+        "read_noise_e": partial(number_or_map, "read_noise_e"),
         "flat": flat_field,
         "bad_pixels": partial(read_map, "bad_pixels"),
     }
@@ -108,12 +109,12 @@ def largest_window_note(layout: Layout) -> list[str]:
     ]
 
 
-def dark_level(text: str) -> Any:
-    """Return a dark level in ADU: a number, or a frame, the mean of several."""
+def number_or_map(name: str, text: str) -> Any:
+    """Return a value of the calibration: a number, or the map in a file."""
     try:
         return float(text)
     except ValueError:
-        return read_map("dark", text)
+        return read_map(name, text)
 
 
 def flat_field(text: str) -> NDArray[np.float64]:

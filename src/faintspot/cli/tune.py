@@ -216,7 +216,9 @@ def _sensor(grid: str | None, layout_file: str | None, target: Path, given: dict
         calibration: Calibration = configuration.load(source, "calibration")
         found["calibration"] = calibration
         default = Calibration()
-        for name in ("read_noise_e", "gain_e_per_adu", "em_gain", "background_e"):
+        if calibration.read_noise_e is not None:
+            found["read_noise_e"] = calibration.typical_read_noise_e
+        for name in ("gain_e_per_adu", "em_gain", "background_e"):
             if getattr(calibration, name) != getattr(default, name):
                 found[name] = getattr(calibration, name)
         # The target may have no layout yet; a file that was named for its layout must.

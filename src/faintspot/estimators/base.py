@@ -263,8 +263,8 @@ class EstimatorPlan:
     """Whether the kernel only calibrates the images, and `locate_frame` finds the positions."""
     fewer_lanes_are_faster: bool = False
     """Whether an incomplete group is measured faster with a narrower SIMD vector."""
-    variance: float
-    """Variance of a dark pixel [electrons^2]."""
+    pixel_variance: Floats
+    """Variance of each dark pixel [electrons^2], (n, ny, nx), or (n, 1, 1) where it is the same in all."""
     faults: int = 0
     """Number of frames in which `locate` failed."""
     fault: str = ""
@@ -272,7 +272,12 @@ class EstimatorPlan:
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         self.estimator, self.sensor = estimator, sensor
-        self.variance = sensor.variance
+        self.pixel_variance = sensor.pixel_variance
+
+    @property
+    def variance(self) -> Floats:
+        """Mean variance of the dark pixels of each sub-aperture [electrons^2], (n,)."""
+        return self.pixel_variance.mean(axis=(1, 2))  # type: ignore[no-any-return]
 
     def each(self, name: str) -> NDArray[Any]:
         """Return an option's value for each sub-aperture."""

@@ -189,7 +189,7 @@ class GravityPlan(EstimatorPlan):
         reach = sensor.search_range_px.astype(np.float32)
         return {
             "flux_e": flux_e,
-            "read_noise_e": sensor.calibration.read_noise_photoelectrons,
+            "read_noise_e": sensor.read_noise_e,
             "pixels": sensor.pixels,
             "excess_noise": sensor.excess_noise,
             "background_e": sensor.calibration.background_e,

@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from faintspot.config.options import option
 from faintspot.estimators.base import Need, Style
 from faintspot.estimators.registry import register
@@ -13,6 +16,7 @@ from faintspot.estimators.scene import Scene
 from faintspot.estimators.sensor import Sensor
 from faintspot.estimators.spots import BLURS, PSFPlan
 from faintspot.estimators.stepping import Stepping
+from faintspot.kernels import spot_fits
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -47,7 +51,10 @@ class Fitted(Stepping):
 @register
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Matched(Fitted):
-    """Matched filter: least-squares fit of position and flux, all pixels weighted equally."""
+    """Matched filter: least-squares fit of position and flux.
+
+    All pixels are weighted equally, or with a map of the read noise by it and the spot's mean photon noise.
+    """
 
     name = "matched"
     label = "matched filter"
@@ -57,4 +64,18 @@ class Matched(Fitted):
 
     def prepared(self, sensor: Sensor) -> PSFPlan:
         """See `Estimator`."""
-        return PSFPlan(self, sensor)
+        return _Plan(self, sensor)
+
+
+class _Plan(PSFPlan):
+    """Weights that differ only by the read noise, so that the filter stays linear in the image."""
+
+    def fill(self, table: NDArray[np.float32]) -> None:
+        """See `EstimatorPlan`."""
+        super().fill(table)
+        sensor = self.sensor
+        if sensor.has_noise_map:
+            planes = np.arange(len(self.psf.samples))
+            spots = self.psf.images(np.zeros((len(planes), 2)), sensor.window, which=planes)
+            mean_photons = np.square(spots).sum(axis=(1, 2))[self.psf.index_of(sensor.n)]
+            table[spot_fits.WEIGHT_FLOOR] = sensor.excess_noise * mean_photons

@@ -150,7 +150,7 @@ class _Plan(LikelihoodPlan):
             self.psf,
             kinds[:, 0].astype(np.int64),
             kinds[:, 1],
-            self.variance + kinds[:, 2] * kinds[:, 1],
+            self.pixel_variance[kinds[:, 3].astype(np.int64)] + (kinds[:, 2] * kinds[:, 1])[:, None, None],
             sensor.excess_noise,
             self._grid,
             self._spacing,
@@ -161,7 +161,9 @@ class _Plan(LikelihoodPlan):
         table[spot_fits.KIND] = before + which
 
     def _kinds(self, flux_e: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Return PSF, flux and floor of each kind of sub-aperture, (n_kinds, 3), and the kind of each one."""
-        columns = [self.psf.index_of(self.sensor.n), flux_e, self.each("weight_floor")]
+        """Return PSF, flux, floor and index of the noise of each kind, (n_kinds, 4), and each one's kind."""
+        sensor = self.sensor
+        noise = np.arange(sensor.n) * sensor.has_noise_map
+        columns = [self.psf.index_of(sensor.n), flux_e, self.each("weight_floor"), noise]
         kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
         return kinds, which.reshape(-1)

@@ -21,7 +21,6 @@ from faintspot.kernels import spot_fits
 
 _MODEL_ERRORS = (0.3, 0.0, 1.0)  # for speckled spots
 _LEARNT_WEIGHT_FLOOR = 1e-3
-_WHOLE_ELECTRONS_BELOW = 0.25  # read noise (e-) that rounding to whole electrons nearly removes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,21 +75,21 @@ class MaximumLikelihood(Likelihood):
 
 
 class LikelihoodPlan(PSFPlan):
-    """Tables of a weighted fit; images with low read noise are rounded to whole electrons."""
+    """Tables of a weighted fit; pixels with low read noise are rounded to whole electrons."""
 
     def __init__(self, estimator: Estimator, sensor: Sensor) -> None:
         super().__init__(estimator, sensor)
-        noise = sensor.calibration.read_noise_photoelectrons
-        if self.rounds_electrons and noise is not None:
-            # Residual of the rounding: one electron more or less where the noise exceeds one half.
-            self.variance = math.erfc(0.5 / (noise * math.sqrt(2.0))) if noise > 0 else 0.0
+        if self.rounds_electrons:
+            noise = sensor.pixel_noise_e
+            rounded = noise < spot_fits.WHOLE_ELECTRONS_BELOW
+            self.pixel_variance = np.where(rounded, _rounding_variance(noise), self.pixel_variance)
 
     @property
     def rounds_electrons(self) -> bool:
         """See `SpotPlan`."""
         camera = self.sensor.calibration
-        noise = camera.read_noise_photoelectrons
-        low = noise is not None and noise < _WHOLE_ELECTRONS_BELOW
+        known = camera.read_noise_e is not None
+        low = known and bool(np.any(self.sensor.pixel_noise_e < spot_fits.WHOLE_ELECTRONS_BELOW))
         whole = camera.em_gain == 1 and camera.background_e == 0 and not self.fits_background
         return low and whole
 
@@ -100,3 +99,9 @@ class LikelihoodPlan(PSFPlan):
         table[spot_fits.WEIGHT_FLOOR] = self.each("weight_floor")
         table[spot_fits.WEIGHT_EXCESS] = self.sensor.excess_noise
         table[spot_fits.MODEL_ERROR] = self.each("model_error")
+
+
+@np.vectorize
+def _rounding_variance(noise_e: float) -> float:
+    """Return the variance after rounding: one electron more or less where the noise exceeds one half."""
+    return math.erfc(0.5 / (noise_e * math.sqrt(2.0))) if noise_e > 0 else 0.0

@@ -68,11 +68,39 @@ class Sensor:
         return self.calibration.excess_noise
 
     @property
-    def variance(self) -> float:
-        """Variance of a dark pixel [photo-electrons^2]; 0 if the read noise is unknown."""
-        noise = self.calibration.read_noise_photoelectrons
+    def has_noise_map(self) -> bool:
+        """Whether the read noise differs from pixel to pixel."""
+        return isinstance(self.calibration.read_noise_e, np.ndarray)
+
+    @cached_property
+    def pixel_noise_e(self) -> Floats:
+        """Read noise [photo-electrons] of each pixel, (n, ny, nx), or of all, (n, 1, 1); 0 if it is unknown.
+
+        Bad pixels, which are filled in, count with the mean variance of their window.
+        """
+        usual = self.calibration.read_noise_photoelectrons or 0.0
+        noise = self.calibration.read_noise_map(self.layout.frame_shape)
+        if noise is None:
+            return np.full((self.n, 1, 1), usual)
+        squares = np.square(self.layout.images(noise))
+        known = ~np.isnan(squares)
+        count = known.sum(axis=(1, 2))
+        total = np.where(known, squares, 0.0).sum(axis=(1, 2))
+        mean = np.where(count > 0, total / np.maximum(count, 1), usual**2)
+        return np.sqrt(np.where(known, squares, mean[:, None, None]))
+
+    @property
+    def read_noise_e(self) -> Floats:
+        """Read noise of each sub-aperture [photo-electrons], (n,): the root mean square of its pixels."""
+        return np.asarray(np.sqrt(np.square(self.pixel_noise_e).mean(axis=(1, 2))))
+
+    @property
+    def pixel_variance(self) -> Floats:
+        """Variance [photo-electrons^2] of each dark pixel, shaped as `pixel_noise_e`; 0 if it is unknown."""
+        if self.calibration.read_noise_e is None:
+            return np.zeros((self.n, 1, 1))
         background = self.calibration.excess_noise * self.calibration.background_e
-        return 0.0 if noise is None else noise**2 + background
+        return np.asarray(np.square(self.pixel_noise_e) + background)
 
     @cached_property
     def spot_fwhm_px(self) -> Floats:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.sizes import check_size
+from faintspot.kernels.pixel_noise import SMALLEST_VARIANCE
 from faintspot.kernels.profiles import MARGIN, PHASES
-from faintspot.kernels.spot_fits import SMALLEST_VARIANCE
 from faintspot.spots.psf import PSF
 from faintspot.spots.score import TrainedScore
 
@@ -283,16 +283,21 @@ def posterior_tables(
     window: tuple[int, int],
     width: int,
 ) -> PosteriorGrid:
-    """Compute the tables of the grid for each triple of a PSF, a flux and a variance of a dark pixel."""
+    """Compute the tables of the grid for each triple of a PSF, a flux and variances of the dark pixels.
+
+    Those are (n, ny, nx), or (n, 1, 1) where they are the same in all pixels.
+    """
     nx = window[1]
+    variance = np.maximum(variance, SMALLEST_VARIANCE)
     tables = np.zeros((len(flux_e), *posterior_shape(len(grid), window, width)), np.float32)
     constants = np.empty((len(flux_e), len(grid)), np.float32)
     block = max(1, _BLOCK_NUMBERS // (window[0] * nx))
-    for i, (plane, flux, v) in enumerate(zip(planes, flux_e, variance, strict=True)):
-        v = max(v, SMALLEST_VARIANCE)
-        for start in range(0, len(grid), block):
-            part = slice(start, start + block)
-            mean = np.maximum(psf.images(grid[part], window, flux, which=int(plane)), 0.0)
+    for start in range(0, len(grid), block):
+        part, known = slice(start, start + block), None
+        for i, (plane, flux, v) in enumerate(zip(planes, flux_e, variance, strict=True)):
+            if known != (plane, flux):  # sub-apertures that differ in their noise alone follow each other
+                known = plane, flux
+                mean = np.maximum(psf.images(grid[part], window, flux, which=int(plane)), 0.0)
             logarithm = np.log1p(excess * mean / v)
             tables[i, part, :, :nx] = logarithm / excess
             constants[i, part] = (v / excess**2 * logarithm - mean / excess).sum(axis=(1, 2))

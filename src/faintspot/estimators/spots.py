@@ -14,9 +14,11 @@ from faintspot.estimators.spot_tables import SpotModel
 from faintspot.estimators.stepping import Stepping
 from faintspot.kernels import spot_fits
 from faintspot.kernels.groups import RANGE
+from faintspot.kernels.pixel_noise import SMALLEST_VARIANCE
 
 Floats = NDArray[np.float64]
 
+_LEVEL = 0.05  # step of the logarithm of variances for which the flux of likely outliers is computed
 _LARGEST_MOVE = 0.25  # in a step, in units of the FWHM; 1 px for narrow spots
 
 BLURS = (0.4, 0.0, 0.8, 1.2)
@@ -95,12 +97,15 @@ class SpotPlan(EstimatorPlan):
             spots, index = spot_tables.gaussian_psf(widths), index.reshape(-1)
         else:
             spots, index = self.psf, self.psf.index_of(sensor.n)
-        table: Floats = np.column_stack([index, search_range_px])
-        pairs, which = np.unique(table, axis=0, return_inverse=True)
+        variance = self.variance
+        if sensor.has_noise_map:
+            variance = np.exp(_LEVEL * np.rint(np.log(np.maximum(variance, SMALLEST_VARIANCE)) / _LEVEL))
+        table: Floats = np.column_stack([index, search_range_px, variance])
+        kinds, which = np.unique(table, axis=0, return_inverse=True)
         side = max(sensor.window)
         flux = [
-            spot_tables.least_flux(spots, int(plane), self.variance, sensor.excess_noise, float(reach), side)
-            for plane, reach in pairs
+            spot_tables.least_flux(spots, int(plane), float(level), sensor.excess_noise, float(reach), side)
+            for plane, reach, level in kinds
         ]
         least: Floats = np.array(flux)[which.reshape(-1)]
         return least

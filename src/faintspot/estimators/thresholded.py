@@ -88,7 +88,12 @@ class _Plan(GravityPlan):
         maps = np.ascontiguousarray(self.sensor.calibration.maps(self.sensor.layout.frame_shape), np.float32)
         columns = self.sensor.window[1]
         ramp = np.arange(columns, dtype=np.float32) - np.float32(0.5 * (columns - 1))
-        return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables)
+        variances = None
+        noise = self.sensor.calibration.read_noise_map(self.sensor.layout.frame_shape)
+        if noise is not None:
+            background = self.sensor.excess_noise * self.sensor.calibration.background_e
+            variances = (np.square(noise) + background).astype(np.float32)
+        return RowTables(lanes_for(np.float32, max(self._widths)), maps, ramp, tables, variances)
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:
         """See `EstimatorPlan`."""

@@ -260,7 +260,7 @@ class _Plan(EstimatorPlan):
             strict=True,
         )
         for dark, photon, maps in rows:
-            table[dark] = self.variance * np.square(maps).sum(axis=(1, 2))[kinds]
+            table[dark] = (self.pixel_variance * np.square(maps)[kinds]).sum(axis=(1, 2))
             table[photon] = (photons * np.square(maps)).sum(axis=(1, 2))[kinds]
 
     def fill_flux(self, table: NDArray[np.float32], flux_e: Floats) -> None:

@@ -136,11 +136,12 @@ class Answer:
         """The camera, with the maps that the question brought along."""
         question = self.question
         base = Calibration() if question.calibration is None else question.calibration
+        same_noise = base.typical_read_noise_e == question.read_noise_e
         return replace(
             base,
             gain_e_per_adu=question.gain_e_per_adu,
             em_gain=question.em_gain,
-            read_noise_e=question.read_noise_e,
+            read_noise_e=base.read_noise_e if same_noise else question.read_noise_e,
             background_e=question.background_e,
         )
 

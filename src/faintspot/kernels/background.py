@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 from faintspot.kernels.compiling import compiled
+from faintspot.kernels.pixel_noise import variance_of, weight_variance_of
 from faintspot.kernels.simd import (
     load,
     maximum,
@@ -65,7 +66,9 @@ def subtract_background(lanes: Any, image: Any, pixels: Any, flux: Any) -> None:
 
 
 @compiled
-def eliminate_background(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
+def eliminate_background(
+    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
+) -> None:
     """Turn the sums of a fit of x, y and the flux into those of a fit that has a constant as well.
 
     Parameters as `likelihood.fit_group`; SCORE_*, I_* and J_* are read and written.
@@ -92,11 +95,13 @@ def eliminate_background(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any
                 my = multiply_add(fx, load(lanes, profiles, (across + padded) * width), my)
             m = flux * m
             expected = maximum(m, zero)
-            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), wv))
-            s = multiply_add(w, load(lanes, image, (y * nx + x) * width) - m, s)
+            at = (y * nx + x) * width
+            own = weight_variance_of(lanes, variances, place + at, v, wv)
+            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
+            s = multiply_add(w, load(lanes, image, at) - m, s)
             i, im = i + w, multiply_add(w, m, im)
             ix, iy = multiply_add(w, mx, ix), multiply_add(w, my, iy)
-            wt = w * (w * multiply_add(expected, e, v))
+            wt = w * (w * multiply_add(expected, e, variance_of(lanes, variances, place + at, v)))
             j, jm = j + wt, multiply_add(wt, m, jm)
             jx, jy = multiply_add(wt, mx, jx), multiply_add(wt, my, jy)
     inverse = splat(lanes, 1.0) / maximum(i, splat(lanes, 1e-30))

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from faintspot.kernels.compiling import compiled, inlined
+from faintspot.kernels.pixel_noise import variance_of
 from faintspot.kernels.simd import (
     absolute,
     any_lane,
@@ -241,10 +242,13 @@ def centre_of_gravity(lanes: Any, image: Any, ny: Any, nx: Any, lane_values: Any
 
 
 @compiled
-def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, lane_values: Any) -> None:
+def centre_and_error(
+    lanes: Any, measured: Any, variances: Any, place: Any, image: Any, ny: Any, nx: Any, lane_values: Any
+) -> None:
     """Write the centre of gravity and its standard error, the propagated noise of the remaining pixels.
 
-    That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured; `image` may be denoised.
+    That of a pixel is VARIANCE + EXCESS max(m, 0), with m as measured and, if given, `variances` in place of
+    VARIANCE; `image` may be denoised.
     """
     width = width_of(lanes)
     zero = splat(lanes, 0.0)
@@ -260,7 +264,8 @@ def centre_and_error(lanes: Any, measured: Any, image: Any, ny: Any, nx: Any, la
             g = load(lanes, image, here)
             left = select(g >= threshold, g - offset, zero)
             row, row_x = row + left, multiply_add(left, column, row_x)
-            variance = multiply_add(maximum(load(lanes, measured, here), zero), e, v)
+            own = variance_of(lanes, variances, place + here, v)
+            variance = multiply_add(maximum(load(lanes, measured, here), zero), e, own)
             variance = select(absolute(left) > zero, variance, zero)
             away = variance * column
             part, part_x, part_xx = part + variance, part_x + away, multiply_add(away, column, part_xx)

@@ -93,7 +93,8 @@ def locate_gravity(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
         store_stage(width, denoised, stages[DENOISED, group.frame], first)
     _set_threshold(lanes, denoised, ny * nx, own.centroid)
     if settings[VARIANCE, first] >= 0.0:
-        _centre_and_error(lanes, scratch.image, denoised, ny, nx, own.centroid)
+        place = first * ny * nx
+        _centre_and_error(lanes, scratch.image, group.variances, place, denoised, ny, nx, own.centroid)
     else:
         _centre_of_gravity(lanes, denoised, ny, nx, own.centroid)
     if stages.shape[0] > 0:

@@ -74,6 +74,8 @@ class Task(NamedTuple):
     """(1 or n_frames, 2, n_subapertures) float32: predicted x and y, px from the reference position."""
     tables: Any
     """Further tables of the estimator's kernel: a NamedTuple."""
+    variances: Any
+    """(n_groups, pixels, W) float32: variance of each dark pixel [e-^2]; None: that of the settings."""
 
 
 class Group(NamedTuple):
@@ -90,6 +92,8 @@ class Group(NamedTuple):
     """(rows, n_subapertures)."""
     predicted: Any
     """(2, n_subapertures), px from the reference position."""
+    variances: Any
+    """See `Task`; those of the group begin at element `first * pixels`."""
 
 
 class Scratch(NamedTuple):
@@ -261,7 +265,7 @@ def measure_groups(
         for stage in range(stages.shape[0]):
             store_stage(width, scratch.image, stages[stage, f], first)
         predicted = task.prior[min(f, task.prior.shape[0] - 1)]
-        group = Group(lanes, source.ny, source.nx, f, first, settings, predicted)
+        group = Group(lanes, source.ny, source.nx, f, first, settings, predicted, task.variances)
         locate(group, task.tables, scratch, stages)
         _store_group(width, n, group, scratch, slopes)
     restore_control(control)

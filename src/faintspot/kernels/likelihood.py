@@ -13,6 +13,7 @@ from typing import Any
 
 from faintspot.kernels.background import eliminate_background
 from faintspot.kernels.compiling import compiled
+from faintspot.kernels.pixel_noise import variance_of, weight_variance_of
 from faintspot.kernels.profiles import look_up
 from faintspot.kernels.simd import (
     absolute,
@@ -71,7 +72,9 @@ LEAST_FLUX_E = 1e-2
 
 
 @compiled
-def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
+def _separable_sums(
+    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
+) -> None:
     """Sum score, information and the score's covariance of every lane for a PSF of one separable term."""
     width = width_of(lanes)
     padded = profiles.shape[3]
@@ -93,12 +96,14 @@ def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lan
             fx, dx = load(lanes, profiles, x * width), load(lanes, profiles, (padded + x) * width)
             m = fx * fy
             expected = maximum(m, zero)
-            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), wv))
-            r = load(lanes, image, (y * nx + x) * width) - m
+            at = (y * nx + x) * width
+            own = weight_variance_of(lanes, variances, place + at, v, wv)
+            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
+            r = load(lanes, image, at) - m
             wf, wd = w * fx, w * dx
             s0, s1 = multiply_add(r, wf, s0), multiply_add(r, wd, s1)
             i0, i1, i2 = multiply_add(wf, fx, i0), multiply_add(wd, fx, i1), multiply_add(wd, dx, i2)
-            wt = w * multiply_add(expected, e, v)
+            wt = w * multiply_add(expected, e, variance_of(lanes, variances, place + at, v))
             tf, td = wt * wf, wt * wd
             j0, j1, j2 = multiply_add(tf, fx, j0), multiply_add(td, fx, j1), multiply_add(td, dx, j2)
         sx, sy, sf = multiply_add(s1, fy, sx), multiply_add(s0, dy, sy), multiply_add(s0, fy, sf)
@@ -112,7 +117,9 @@ def _separable_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lan
 
 
 @compiled
-def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any) -> None:
+def _general_sums(
+    lanes: Any, image: Any, variances: Any, place: Any, ny: Any, nx: Any, profiles: Any, lane_values: Any
+) -> None:
     """Sum as `_separable_sums`, for a PSF of several separable terms."""
     width = width_of(lanes)
     rank, padded = profiles.shape[1], profiles.shape[3]
@@ -142,13 +149,15 @@ def _general_sums(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, lane_
                 m, mx, my = multiply_add(fx, fy, m), multiply_add(dx, fy, mx), multiply_add(fx, dy, my)
             m, mx, my = flux * m, flux * mx, flux * my
             expected = maximum(m, zero)
-            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), wv))
-            wr = w * (load(lanes, image, (y * nx + x) * width) - m)
+            at = (y * nx + x) * width
+            own = weight_variance_of(lanes, variances, place + at, v, wv)
+            w = reciprocal(multiply_add(expected, multiply_add(expected, model_error, we), own))
+            wr = w * (load(lanes, image, at) - m)
             sx, sy, sf = multiply_add(wr, mx, sx), multiply_add(wr, my, sy), multiply_add(wr, m, sf)
             wx, wy, wm = w * mx, w * my, w * m
             ixx, iyy, iff = multiply_add(wx, mx, ixx), multiply_add(wy, my, iyy), multiply_add(wm, m, iff)
             ixy, ixf, iyf = multiply_add(wx, my, ixy), multiply_add(wx, m, ixf), multiply_add(wy, m, iyf)
-            wt = w * multiply_add(expected, e, v)
+            wt = w * multiply_add(expected, e, variance_of(lanes, variances, place + at, v))
             wx, wy, wm = wt * wx, wt * wy, wt * wm
             jxx, jyy, jff = multiply_add(wx, mx, jxx), multiply_add(wy, my, jyy), multiply_add(wm, m, jff)
             jxy, jxf, jyf = multiply_add(wx, my, jxy), multiply_add(wx, m, jxf), multiply_add(wy, m, jyf)
@@ -292,6 +301,8 @@ def _store_errors(width: Any, lane: Any, flux: Any, lane_values: Any) -> None:
 def fit_group(
     lanes: Any,
     image: Any,
+    variances: Any,
+    place: Any,
     ny: Any,
     nx: Any,
     tables: Any,
@@ -307,6 +318,8 @@ def fit_group(
     Parameters
     ----------
     image : (ny * nx * W,)
+    variances, place
+        See `pixel_noise`; in place of VARIANCE, also in the weights.
     tables, which, starts, profiles
         See `look_up`.
     steps : int
@@ -321,11 +334,11 @@ def fit_group(
     for step in range(steps):
         look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
         if profiles.shape[1] == 1:
-            _separable_sums(lanes, image, ny, nx, profiles, lane_values)
+            _separable_sums(lanes, image, variances, place, ny, nx, profiles, lane_values)
         else:
-            _general_sums(lanes, image, ny, nx, profiles, lane_values)
+            _general_sums(lanes, image, variances, place, ny, nx, profiles, lane_values)
         if background:
-            eliminate_background(lanes, image, ny, nx, profiles, lane_values)
+            eliminate_background(lanes, image, variances, place, ny, nx, profiles, lane_values)
         if step == steps - 1:
             for lane in range(width):
                 _store_errors(width, lane, float(lane_values[FLUX * width + lane]), lane_values)

@@ -24,8 +24,9 @@ from faintspot.kernels.groups import (
 )
 from faintspot.kernels.host import aligned_zeros
 from faintspot.kernels.likelihood import fit_group
+from faintspot.kernels.pixel_noise import SMALLEST_VARIANCE, variance_of, without_noisy_pixels
 from faintspot.kernels.posterior import posterior_of_group
-from faintspot.kernels.simd import Lanes, load, rounded, splat, store, width_of
+from faintspot.kernels.simd import Lanes, load, rounded, select, splat, store, width_of
 from faintspot.kernels.smoothing import gather_taps
 from faintspot.kernels.start import LEAST_FLUX_E, find_start
 from faintspot.kernels.trained import apply_score
@@ -43,8 +44,8 @@ OUTLIER_LIKELY = int(SubapertureFlag.OUTLIER_LIKELY)
 NOT_CONVERGED = int(SubapertureFlag.NOT_CONVERGED)
 LEAST_SIGNIFICANCE = 1.0
 """A spot less significant than this many standard deviations counts as no flux."""
-SMALLEST_VARIANCE = 1e-4
-"""Electrons squared: keeps the weights finite where there is no noise."""
+WHOLE_ELECTRONS_BELOW = 0.25
+"""Read noise [e-] that rounding to whole electrons nearly removes."""
 MOST_MODEL_ERROR_E = 300.0
 """Electrons: the squared model error is limited to this value over the flux. At high flux, the dark wings,
 where a PSF is least known, then do not dominate the weights.
@@ -135,6 +136,8 @@ def locate_weighted(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
     weigh_group(
         group.lanes,
         scratch.image,
+        group.variances,
+        group.first * group.ny * group.nx,
         group.ny,
         group.nx,
         tables.model,
@@ -230,11 +233,15 @@ def locate_scored(group: Any, tables: Any, scratch: Any, stages: Any) -> None:
 
 @compiled
 def _round(group: Any, round_electrons: Any, image: Any) -> None:
-    """Round images to whole electrons, where that is asked for."""
-    width = width_of(group.lanes)
+    """Round pixels of low noise to whole electrons, where that is asked for."""
+    lanes, pixels = group.lanes, group.ny * group.nx
+    width, place = width_of(lanes), group.first * pixels
+    low, limit = splat(lanes, 0.0), splat(lanes, WHOLE_ELECTRONS_BELOW**2)
     if round_electrons:
-        for i in range(group.ny * group.nx):
-            store(image, i * width, rounded(load(group.lanes, image, i * width)))
+        for i in range(pixels):
+            value = load(lanes, image, i * width)
+            countable = variance_of(lanes, group.variances, place + i * width, low) < limit
+            store(image, i * width, select(countable, rounded(value), value))
 
 
 @compiled
@@ -276,7 +283,11 @@ def _begin_at_peak(group: Any, taps: Any, scratch: Any) -> None:
     lanes, own = group.lanes, scratch.own
     gather_taps(width_of(lanes), group.first, taps, own.taps)
     reach = taps.shape[2] - 1
-    find_start(lanes, scratch.image, group.ny, group.nx, reach, own.taps, scratch.spare, own.lane_values)
+    mean = load(lanes, own.lane_values, spot_rows.VARIANCE * width_of(lanes))
+    pixels = group.ny * group.nx
+    place = group.first * pixels
+    image = without_noisy_pixels(lanes, group.variances, place, pixels, mean, scratch.image, scratch.spare)
+    find_start(lanes, image, group.ny, group.nx, reach, own.taps, own.rows, own.lane_values)
 
 
 @compiled
@@ -295,6 +306,8 @@ def _fit(group: Any, tables: Any, scratch: Any) -> None:
     fit_group(
         group.lanes,
         scratch.image,
+        group.variances,
+        group.first * group.ny * group.nx,
         group.ny,
         group.nx,
         tables.model,

@@ -38,7 +38,7 @@ def find_start(
     image : (ny * nx * W,)
     reach, taps
         See `smooth_pixel`.
-    smoothed : (ny * nx * W,)
+    smoothed : (>= ny * nx * W,), flat
         Scratch.
     """
     width = width_of(lanes)

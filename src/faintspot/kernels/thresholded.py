@@ -15,6 +15,7 @@ from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.gravity import FLOOR, LEVEL, gravity_of_groups, lightless
 from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, Task, store_slope
+from faintspot.kernels.pixel_noise import variance_of
 from faintspot.kernels.simd import (
     absolute,
     any_lane,
@@ -44,6 +45,8 @@ class RowTables(NamedTuple):
     """(nx,) float32: positions of a window's columns, px from its middle."""
     gravity: Any
     """GravityTables, for groups with bad pixels."""
+    variances: Any
+    """(h, w) float32: variance of each pixel of the frame in the dark [e-^2]; None: that of the settings."""
 
 
 @compiled
@@ -64,7 +67,7 @@ def thresholded_in_rows(
             whole = _measure(source, task.tables, f, s, settings, slopes) and whole
         if whole:
             continue
-        filled = Task(task.settings, task.variants, task.prior, task.tables.gravity)
+        filled = Task(task.settings, task.variants, task.prior, task.tables.gravity, task.variances)
         gravity_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
         for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
             _measure(source, task.tables, f, s, settings, slopes)
@@ -99,7 +102,8 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
             left = select(value >= threshold, value - threshold, zero)
             flux = flux + left
             flux_y = multiply_add(left, row, flux_y)
-            variance = select(left > zero, multiply_add(maximum(value, zero), e, v), zero)
+            own = variance_of(pixels, tables.variances, here, v)
+            variance = select(left > zero, multiply_add(maximum(value, zero), e, own), zero)
             part = part + variance
             variance_y = variance * row
             part_y = part_y + variance_y

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from faintspot.kernels.compiling import compiled
+from faintspot.kernels.pixel_noise import SMALLEST_VARIANCE, relative_variance, variance_of
 from faintspot.kernels.profiles import look_up
 from faintspot.kernels.simd import (
     absolute,
@@ -39,7 +40,6 @@ from faintspot.kernels.spot_rows import (
     Y,
 )
 
-SMALLEST_VARIANCE = 1e-4  # of a pixel, electrons squared
 LEAST_FRACTION = 0.05  # of the flux at the start: less under the weight would only amplify noise
 
 
@@ -78,9 +78,17 @@ def _move(lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, l
 
 @compiled
 def _store_errors(
-    lanes: Any, image: Any, ny: Any, nx: Any, profiles: Any, floor: Any, lane_values: Any
+    lanes: Any,
+    image: Any,
+    variances: Any,
+    place: Any,
+    ny: Any,
+    nx: Any,
+    profiles: Any,
+    floor: Any,
+    lane_values: Any,
 ) -> None:
-    """Propagate the pixels' noise, VARIANCE + EXCESS * g, through the last step."""
+    """Propagate the pixels' noise, VARIANCE (or `variances`) + EXCESS * g, through the last step."""
     width = width_of(lanes)
     padded = profiles.shape[3]
     zero = splat(lanes, 0.0)
@@ -92,16 +100,18 @@ def _store_errors(
         away_y = splat(lanes, y - 0.5 * (ny - 1)) - y0
         for x in range(nx):
             weight = weight_y * load(lanes, profiles, x * width)
-            g = load(lanes, image, (y * nx + x) * width)
+            at = (y * nx + x) * width
+            g = load(lanes, image, at)
             away_x = splat(lanes, x - 0.5 * (nx - 1)) - x0
             total = multiply_add(weight, g, total)
             square = weight * weight
-            variance = square * multiply_add(g, e, v)
+            variance = square * multiply_add(g, e, variance_of(lanes, variances, place + at, v))
             noise = noise + variance
             noise_x = multiply_add(variance * away_x, away_x, noise_x)
             noise_y = multiply_add(variance * away_y, away_y, noise_y)
-            dark_x = multiply_add(square * away_x, away_x, dark_x)
-            dark_y = multiply_add(square * away_y, away_y, dark_y)
+            dark = square * relative_variance(lanes, variances, place + at, v)
+            dark_x = multiply_add(dark * away_x, away_x, dark_x)
+            dark_y = multiply_add(dark * away_y, away_y, dark_y)
     least = splat(lanes, SMALLEST_VARIANCE)
     illuminated = total > floor
     inverse = splat(lanes, 1.0) / maximum(total, floor)
@@ -126,6 +136,8 @@ def _store_errors(
 def weigh_group(
     lanes: Any,
     image: Any,
+    variances: Any,
+    place: Any,
     ny: Any,
     nx: Any,
     tables: Any,
@@ -144,4 +156,4 @@ def weigh_group(
     for _ in range(steps):
         look_up(lanes, tables, which, ny, nx, lane_values, starts, profiles)
         _move(lanes, image, ny, nx, profiles, floor, lane_values)
-    _store_errors(lanes, image, ny, nx, profiles, floor, lane_values)
+    _store_errors(lanes, image, variances, place, ny, nx, profiles, floor, lane_values)

@@ -168,7 +168,7 @@ def window_in_rows(
             whole = _measure(source, task.tables, f, s, settings, slopes) and whole
         if whole:
             continue
-        filled = Task(task.settings, task.variants, task.prior, task.tables.whole)
+        filled = Task(task.settings, task.variants, task.prior, task.tables.whole, task.variances)
         window_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
         for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
             _measure(source, task.tables, f, s, settings, slopes)

@@ -113,6 +113,10 @@ class DevicePipeline:
     """
 
     def __init__(self, layout: Layout, calibration: Calibration, plan: Plan) -> None:
+        if plan.sensor.has_noise_map:
+            raise InputError(
+                'calibration.read_noise_e: expected a number with device="cuda", got a map; use device="cpu"'
+            )
         if not plan.estimator.runs_on_gpu:
             able = ", ".join(repr(name) for name, kind in estimators().items() if kind.runs_on_gpu)
             raise InputError(

@@ -35,10 +35,16 @@ def packed_calibration(layout: Layout, calibration: Calibration, width: int) -> 
 
     The shape is (n_groups, pixels, 2, W); the last group is padded with its last sub-aperture.
     """
-    n_groups = -(-len(layout) // width)
-    windows = layout.images(calibration.maps(layout.frame_shape)).reshape(2, len(layout), layout.pixels)
-    lanes = windows[:, np.minimum(np.arange(n_groups * width), len(layout) - 1)]
-    return np.ascontiguousarray(lanes.reshape(2, n_groups, width, layout.pixels).transpose(1, 3, 0, 2))
+    return _packed(layout.images(calibration.maps(layout.frame_shape)), width)
+
+
+def _packed(windows: NDArray[Any], width: int) -> NDArray[np.float32]:
+    """Return windows of several maps (k, n, ny, nx) as (n_groups, pixels, k, W)."""
+    count, n = windows.shape[:2]
+    n_groups = -(-n // width)
+    lanes = windows.reshape(count, n, -1)[:, np.minimum(np.arange(n_groups * width), n - 1)]
+    groups = lanes.reshape(count, n_groups, width, -1).transpose(1, 3, 0, 2)
+    return np.ascontiguousarray(groups, np.float32)
 
 
 class Plan:
@@ -90,6 +96,10 @@ class Plan:
         self.estimator.check(self.sensor)
         own = self.estimator.prepared(self.sensor)
         self.prepared: EstimatorPlan = PythonPlan(self.estimator, self.sensor) if own is None else own
+        self.variances: NDArray[np.float32] | None = None
+        """Variance of each dark pixel for the kernel, if it differs: see `faintspot.kernels.groups.Task`."""
+        if self.sensor.has_noise_map:
+            self.variances = _packed(self.prepared.pixel_variance[None], width)[:, :, 0]
         self.expected = self._expected(settings)
         """Expected range of the spot positions; spots outside are flagged."""
         self.no_prior = np.zeros((1, 2, n), np.float32)
@@ -143,7 +153,8 @@ class Plan:
             Predicted slopes. Default: 0.
         """
         settings, tables, _ = self._arguments()
-        return Task(settings, variants, self.no_prior if prior is None else prior, tables)
+        predicted = self.no_prior if prior is None else prior
+        return Task(settings, variants, predicted, tables, self.variances)
 
     def _arguments(self) -> tuple[NDArray[np.float32], Any, Any]:
         """Return settings, tables and scratch function, rebuilt only for a new flux level."""
@@ -197,7 +208,7 @@ class Plan:
         table[groups.ZERO_X], table[groups.ZERO_Y] = sensor.zero.T
         table[groups.RANGE] = sensor.search_range_px
         table[groups.MOST_BAD] = np.floor(each("max_bad_fraction") * sensor.pixels)
-        known = sensor.calibration.read_noise_photoelectrons is not None
+        known = sensor.calibration.read_noise_e is not None
         table[groups.VARIANCE] = self.prepared.variance if known else -1.0
         table[groups.EXCESS], table[groups.ERROR_SCALE] = sensor.excess_noise, each("error_scale")
         self.prepared.fill(table)

@@ -219,13 +219,20 @@ class SlopePipeline:
             rough_dark=camera.rough_dark,
             gain_e_per_adu=camera.em_gain,
             em_gain=camera.em_gain,
-            read_noise_e=camera.read_noise_e,
+            read_noise_e=self._noise_of_images(),
             background_e=camera.background_e,
         )
         other._calibration = packed_calibration(other.layout, other.calibration, self.width)
         other.plan = other._prepared()
         other.device, other.on_device = "cpu", None
         return other
+
+    def _noise_of_images(self) -> Any:
+        """Return the read noise of `for_images`."""
+        if not self.plan.sensor.has_noise_map:
+            return self.calibration.read_noise_e
+        noise = self.plan.sensor.pixel_noise_e * self.calibration.em_gain
+        return noise.reshape(-1, self.layout.window[1])
 
     @property
     def needs_flux(self) -> bool:
@@ -234,10 +241,12 @@ class SlopePipeline:
 
     def fingerprint(self) -> bytes:
         """Return bytes that identify the pipeline: they differ if slopes of the same frame may differ."""
-        parts = (self.layout.corners, self.calibration.maps(self.layout.frame_shape))
+        parts = [self.layout.corners, self.calibration.maps(self.layout.frame_shape)]
+        if self.plan.sensor.has_noise_map:
+            parts.append(self.plan.sensor.pixel_noise_e)
         calibration = self.calibration
         text = (
-            f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_e} "
+            f"{self.layout.window} {calibration.saturation_adu} {calibration.read_noise_photoelectrons} "
             f"{calibration.background_e} {calibration.em_gain} {calibration.vouches_for_dark} "
             f"{configuration.to_text(self.settings)}"
         )

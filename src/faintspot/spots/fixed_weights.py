@@ -169,7 +169,7 @@ class FixedWeights(NpzFile):
         positions: ArrayLike,
         *,
         flux_e: float,
-        read_noise_e: float,
+        read_noise_e: ArrayLike,
         excess_noise: float = 1.0,
         background_e: float = 0.0,
     ) -> FixedWeights:
@@ -186,8 +186,10 @@ class FixedWeights(NpzFile):
             high flux.
         positions : (n_spots, 2) array
             Positions of these spots, px from the reference: the slopes to be measured.
-        flux_e, read_noise_e : float
-            Flux of a spot and read noise for which the weights are optimised [photo-electrons].
+        flux_e : float
+            Flux of a spot for which the weights are optimised [photo-electrons].
+        read_noise_e : float or (ny, nx) array
+            Read noise, the same in all pixels or that of each [photo-electrons].
         excess_noise : float
             Factor on the variance of the photon noise.
         background_e : float
@@ -207,8 +209,10 @@ class FixedWeights(NpzFile):
                 f"got {spots.shape} and {truth.shape}"
             )
         expected = number_between("flux_e", flux_e, 0.0, low_open=True)
-        noise = number_between("read_noise_e", read_noise_e, 0.0)
-        dark = noise**2 + excess_noise * number_between("background_e", background_e, 0.0)
+        noise = numbers_between("read_noise_e", read_noise_e, 0.0)
+        if noise.shape not in ((), spots.shape[1:]):
+            raise InputError(f"read_noise_e: expected shape {spots.shape[1:]}, got {noise.shape}")
+        dark = noise.ravel() ** 2 + excess_noise * number_between("background_e", background_e, 0.0)
         total = spots.sum(axis=(1, 2)).mean()
         if total <= 0:
             raise InputError(f"images: expected flux, got a mean sum of {total:g}")
