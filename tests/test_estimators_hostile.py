@@ -283,25 +283,6 @@ class TestRefused:
         with refused(name):
             fs.Settings(**{"estimator": whose, **own, name: value})
 
-    def test_options_of_another_estimator(self) -> None:
-        with refused("threshold_e: an option of 'thresholded', not of 'ml'"):
-            fs.Settings("ml", threshold_e=1.0)
-
-    @pytest.mark.parametrize(
-        ("estimator", "words"),
-        [
-            ("matched", ("psf", "'matched'")),
-            ("ml", ("psf", "'ml'")),
-            ("map", ("psf", "'map'")),
-            ("trained", ("score", "TrainedScore")),
-            ("weighted", ("spot_fwhm_px", "'weighted'")),
-            ("thresholded", ("threshold_e", "'thresholded'")),
-        ],
-    )
-    def test_what_an_estimator_lacks(self, estimator: str, words: tuple[str, ...]) -> None:
-        with refused(words[0], *words[1:]):
-            measure_images(self.IMAGES, fs.Settings(estimator=estimator), calibration=self.NOISE)
-
     @pytest.mark.parametrize("estimator", ["ml", "map"])
     def test_read_noise_must_be_known(self, estimator: str) -> None:
         with refused("calibration.read_noise_e", estimator):

@@ -83,7 +83,7 @@ def test_lenslets_that_are_not_a_whole_number_of_pixels_wide() -> None:
     odd, settings = sensor(pixels=81), EVERYTHING.replace(keep_brightest=121)
     image, mask = image_through(odd), inner(odd)
     estimator = SlopeEstimator(odd.mla_grid, odd.mla_index, mask, settings=settings)
-    layout = estimator.pipeline.layout
+    layout = estimator.measured.pipeline.layout
     assert layout.window == (11, 11)
     assert np.ptp(layout.offsets) > 0.8
     slopes = np.asarray(estimator.estimate([image]))
@@ -141,14 +141,14 @@ def test_last_estimate_says_how_good_it_is(optics: Any) -> None:
     calibration = fs.Calibration(read_noise_e=1.0)
     estimator = SlopeEstimator(optics.mla_grid, optics.mla_index, settings=FAINT, calibration=calibration)
     with pytest.raises(InputError, match="measure one first"):
-        _ = estimator.flags
+        _ = estimator.measured.last.flags
     image = image_through(optics) / 100
     image[optics.mla_index == 3] = 0.0
     slopes = np.asarray(estimator.estimate([image]))
-    assert estimator.flags[3] & fs.SubapertureFlag.NO_FLUX
-    assert not estimator.flags[4] & INVALID
+    assert estimator.measured.last.flags[3] & fs.SubapertureFlag.NO_FLUX
+    assert not estimator.measured.last.flags[4] & INVALID
     np.testing.assert_array_equal(slopes[:, 3], 0.0)
-    np.testing.assert_allclose(estimator.slopes.x, slopes[0] / PIXEL_M, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(estimator.measured.last.x, slopes[0] / PIXEL_M, rtol=1e-6, atol=1e-7)
     errors = np.asarray(estimator.standard_errors)
     assert errors.shape == slopes.shape
     assert np.isinf(errors[:, 3]).all()

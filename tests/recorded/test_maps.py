@@ -9,7 +9,6 @@ import pytest
 from tests.recorded.recorded_cases import sensor, simulated, two_arms
 
 from faintspot.recorded import maps
-from faintspot.recorded.page import slopes_report
 from faintspot.recorded.statistics import MeasuredSlopes, jitter, summarise, valid_in_all
 from faintspot.sensor.layout import Layout
 
@@ -27,21 +26,6 @@ def test_arrows_are_cut_where_a_few_are_wild() -> None:
     assert longest == pytest.approx(0.15)
     assert number == 1
     assert maps.longest_arrow([summarise(slopes(usual=0.0))]) == (1.0, 0)
-
-
-@pytest.mark.usefixtures("undrawn_pictures")
-def test_arrows_that_are_cut_are_said_to_be() -> None:
-    layout = Layout.grid((10, 10), pixels=8)
-    for wild, said in ((0.0, False), (50.0, True)):
-        html = slopes_report(
-            [slopes(wild)],
-            layout=layout,
-            stages=None,
-            title="",
-            facts={},
-            configurations={"Configuration": ""},
-        )
-        assert ("Arrows longer than 0.15 px" in html) == said
 
 
 def test_drawn_arrows_are_no_longer_than_the_limit() -> None:

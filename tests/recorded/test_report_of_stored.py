@@ -82,13 +82,6 @@ def test_two_stores_are_two_arms(tmp_path: Path) -> None:
     assert page.ids[-2:] == ["configuration-of-tv-denoising", "configuration-of-brightest-pixels"]
 
 
-def test_notes_say_which_run_they_are_of(tmp_path: Path) -> None:
-    paths = [store(tmp_path / name, sensor()) for name in ("a.csv", "b.csv")]
-    text = Page(report_of_stored(paths)).text
-    for name in ("a.csv", "b.csv"):
-        assert f"{name}: {name} does not say with which configuration" in text
-
-
 def test_standard_errors_are_shown_where_they_are_known(tmp_path: Path) -> None:
     x, y = np.full((2, 5, 9), np.inf)
     unknown = store(tmp_path / "a.npz", sensor(), errors={"standard_error_x": x, "standard_error_y": y})
@@ -121,12 +114,6 @@ def test_stores_of_different_sensors_are_refused_in_one_line(tmp_path: Path) -> 
     for paths in ([], [first] * 3):
         with pytest.raises(InputError, match="one file or two"):
             report_of_stored(paths)
-
-
-def test_frames_counts_that_differ_are_said(tmp_path: Path) -> None:
-    first = store(tmp_path / "a.npz", sensor())
-    second = store(tmp_path / "b.npz", sensor(), PLAIN, n_frames=3)
-    assert "hold 5 and 3 frames: the first 3 are compared" in Page(report_of_stored([first, second])).text
 
 
 def test_csv_without_attributes_still_gives_numbers(tmp_path: Path) -> None:
@@ -251,19 +238,6 @@ def test_an_analytic_psf_is_read_from_the_configuration(tmp_path: Path) -> None:
     measure_recorded([tmp_path / "frames.npy"], configured, path, overwrite=True)
     (tmp_path / "ml.psf.npz").unlink()
     assert "Not drawn" not in Page(report_of_stored([path])).text
-
-
-def test_slopes_without_sources_are_not_said_to_have_others(tmp_path: Path) -> None:
-    first = store(tmp_path / "a.npz", sensor())
-    second = store(tmp_path / "b.csv", sensor(), PLAIN)
-    other = store(tmp_path / "c.npz", sensor(), PLAIN, sources=["other.npy"])
-    assert "different sources" not in Page(report_of_stored([first, second])).text
-    assert "different sources" in Page(report_of_stored([first, other])).text
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"gone\.zarr"):
-        report_of_stored([tmp_path / "gone.zarr"])
 
 
 def test_slopes_relative_to_a_reference_are_said_to_be(tmp_path: Path) -> None:

@@ -13,8 +13,6 @@ from faintspot.base.checks import finite_array, number_between
 from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.camera.calibration import Calibration
 from faintspot.pipeline.settings import Settings
-from faintspot.pipeline.slope_pipeline import SlopePipeline
-from faintspot.pipeline.slopes import Slopes
 from faintspot.sensor.window_size import LARGEST_WINDOW, SMALLEST_WINDOW
 
 try:
@@ -113,7 +111,7 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
         -------
         hcipy.Field
             (2, n), x then y: spot position from the centre of its lenslet, m on the detector, in the order
-            and on the grid of HCIPy's estimator; 0 where `flags` marks it as invalid.
+            and on the grid of HCIPy's estimator; 0 where `measured.last.flags` marks it as invalid.
 
         Raises
         ------
@@ -131,21 +129,6 @@ class SlopeEstimator(hcipy.WavefrontSensorEstimator):  # type: ignore[misc]
     def calibrating(self, flux_e: float | None = None) -> Any:
         """Measure noise-free images in a `with` block; see `ToolSlopes.calibrating`."""
         return self.measured.calibrating(flux_e)
-
-    @property
-    def pipeline(self) -> SlopePipeline:
-        """Slope pipeline; its layout has the windows."""
-        return self.measured.pipeline
-
-    @property
-    def slopes(self) -> Slopes:
-        """Last estimate in pixels, with flux, flags and iterations."""
-        return self.measured.last
-
-    @property
-    def flags(self) -> NDArray[np.uint8]:
-        """Bits of `faintspot.SubapertureFlag` for the last estimate, (n,)."""
-        return self.measured.last.flags
 
     @property
     def standard_errors(self) -> Any:

@@ -48,7 +48,7 @@ def attach(
     Returns
     -------
     Attached
-        `calibrating`, `slopes`, `flags`; `detach()` restores OOPAO's own centroiding.
+        `calibrating`, `measured`; `detach()` restores OOPAO's own centroiding.
 
     Raises
     ------

@@ -60,7 +60,7 @@ class Detector:
     Raises
     ------
     InputError
-        If a value is not finite, out of range or of the wrong shape.
+        If a value is not finite or out of range, or maps have different shapes.
 
     Examples
     --------

@@ -152,7 +152,7 @@ def write_page(page: Page, path: str | Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The files written, the page first.
+        The page, then the figures' files.
 
     Raises
     ------

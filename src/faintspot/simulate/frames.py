@@ -93,13 +93,9 @@ def subapertures(
     phase_rng = spawn(rng, 1)[0] if turbulence else None
     truth = _true_positions(positions, position_range_px, (n, 2), position_rng)
     camera = _camera(detector)
-    spot = {
-        "size": per_spot("size", size, n),
-        "elongation": per_spot("elongation", elongation, n),
-        "angle_deg": per_spot("angle_deg", angle_deg, n),
-    }
-    flux = per_spot("flux_e", flux_e, n)
-    spot["flux_e"] = _whole_flux(flux, (ny, nx), profile, *spot.values())
+    spot = _values_of_spots(
+        n, (ny, nx), profile, flux_e, size=size, elongation=elongation, angle_deg=angle_deg
+    )
     if turbulence and (profile != "diffraction" or np.any(spot["elongation"] != 1)):
         raise InputError(f"d_over_r0 = {turbulence:g}: expected profile 'diffraction' and elongation 1")
     images = np.empty((n, ny, nx), dtype=np.float32)
@@ -194,44 +190,30 @@ def sensor_frames(
     position_rng, noise_rng = spawn(rng, 2)
     truth = _true_positions(positions, position_range_px, (n_frames, n, 2), position_rng)
     camera = _camera(detector)
-    shape_of_spots = {
-        "size": per_spot("size", size, n),
-        "elongation": per_spot("elongation", elongation, n),
-        "angle_deg": per_spot("angle_deg", angle_deg, n),
-    }
-    flux = per_spot("flux_e", flux_e, n)
-    shape_of_spots["flux_e"] = _whole_flux(flux, window_shape, profile, *shape_of_spots.values())
+    spot = _values_of_spots(
+        n, window_shape, profile, flux_e, size=size, elongation=elongation, angle_deg=angle_deg
+    )
     blocks = []
     block = max(1, _BLOCK_PIXELS // max(rows * columns, pixels.size))
     for start in range(0, n_frames, block):
         part = truth[start : start + block]
-        repeated = {name: np.tile(value, len(part)) for name, value in shape_of_spots.items()}
+        repeated = {name: np.tile(value, len(part)) for name, value in spot.items()}
         images = spots(part.reshape(-1, 2), shape=window_shape, profile=profile, **repeated)
         mean_e = _place_windows(images.reshape(len(part), -1), pixels, (rows, columns))
         blocks.append(camera.expose(mean_e, spawn(noise_rng, 1)[0]))
     return np.concatenate(blocks), truth
 
 
-def _whole_flux(
-    flux_e: NDArray[np.float64],
-    shape: tuple[int, int],
-    profile: str,
-    size: NDArray[np.float64],
-    elongation: NDArray[np.float64],
-    angle_deg: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the flux of the infinite spots that have `flux_e` within their image when centred."""
-    kinds, which = np.unique(np.stack([size, elongation, angle_deg], axis=1), axis=0, return_inverse=True)
-    centred = spots(
-        np.zeros((len(kinds), 2)),
-        shape=shape,
-        profile=profile,
-        size=kinds[:, 0],
-        elongation=kinds[:, 1],
-        angle_deg=kinds[:, 2],
-    )
-    whole: NDArray[np.float64] = flux_e / centred.sum(axis=(1, 2))[which]
-    return whole
+def _values_of_spots(
+    n: int, shape: tuple[int, int], profile: str, flux_e: ArrayLike, **form: ArrayLike
+) -> dict[str, NDArray[np.float64]]:
+    """Return size, elongation, angle and whole flux of n spots with `flux_e` in their image when centred."""
+    values = {name: per_spot(name, value, n) for name, value in form.items()}
+    flux = per_spot("flux_e", flux_e, n)
+    kinds, which = np.unique(np.stack(list(values.values()), axis=1), axis=0, return_inverse=True)
+    one_of_each = dict(zip(values, kinds.T, strict=True))
+    centred = spots(np.zeros((len(kinds), 2)), shape=shape, profile=profile, **one_of_each)
+    return {**values, "flux_e": flux / centred.sum(axis=(1, 2))[which]}
 
 
 def _camera(detector: Any) -> Detector:

@@ -56,7 +56,7 @@ class FixedWeights(NpzFile):
     Raises
     ------
     InputError
-        If a value is not finite or out of range, or arrays are inconsistent.
+        If a value is out of range, shapes differ, or the mean spot has no flux in pixels with weights.
 
     Examples
     --------

@@ -97,7 +97,7 @@ def speckled_spots(
     Raises
     ------
     InputError
-        If a value is not finite, out of range or of the wrong shape.
+        If a value is not finite or out of range, or `positions` have another shape.
 
     Examples
     --------

@@ -37,18 +37,7 @@ _COUNTABLE_E = 0.25  # read noise below which images hold whole electrons
 
 @dataclass(frozen=True)
 class LearntPSF:
-    """A learnt PSF, and what was found on the way.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from faintspot.simulate import subapertures
-    >>> from faintspot.training import learn_psf_from_images
-    >>> images, truth = subapertures(600, shape=(12, 12), flux_e=150.0, rng=np.random.default_rng(1))
-    >>> learnt = learn_psf_from_images(images, rng=np.random.default_rng(2))
-    >>> print(f"R = {np.abs(learnt.positions - truth).mean():.2f} px")
-    R = 0.05 px
-    """
+    """A learnt PSF, and what was found on the way."""
 
     psf: PSF
     background_e: NDArray[np.float64]
