@@ -33,7 +33,7 @@ def in_lanes(pipeline: fs.SlopePipeline, frame: np.ndarray) -> fs.Slopes:
     other = copy.copy(pipeline)
     other.plan = copy.copy(pipeline.plan)
     changed: Any = copy.copy(prepared)
-    changed.kernel, changed.tables = gravity_of_groups, prepared.tables.gravity
+    changed.kernel, changed.tables = gravity_of_groups, prepared.tables.gathered
     other.plan.prepared = changed
     other.plan._made, other.plan._kernels = None, {}
     return other(frame)

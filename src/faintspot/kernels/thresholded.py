@@ -14,8 +14,9 @@ import numpy as np
 from faintspot.base.checks import LARGEST_FLOAT32
 from faintspot.kernels.compiling import compiled
 from faintspot.kernels.gravity import FLOOR, LEVEL, gravity_of_groups, lightless
-from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, Task, store_slope
+from faintspot.kernels.groups import EXCESS, SATURATED, VARIANCE, store_slope
 from faintspot.kernels.pixel_noise import variance_of
+from faintspot.kernels.row_driver import rows_driver_of
 from faintspot.kernels.simd import (
     absolute,
     any_lane,
@@ -29,7 +30,6 @@ from faintspot.kernels.simd import (
     widened,
     width_of,
 )
-from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 _WITHIN = 1.0 / 12.0  # of the flux in a pixel, where in it is not known: px^2
 
@@ -43,35 +43,10 @@ class RowTables(NamedTuple):
     """(2, h, w) float32: dark and scale of every pixel of the frame."""
     ramp: Any
     """(nx,) float32: positions of a window's columns, px from its middle."""
-    gravity: Any
+    gathered: Any
     """GravityTables, for groups with bad pixels."""
     variances: Any
     """(h, w) float32: variance of each pixel of the frame in the dark [e-^2]; None: that of the settings."""
-
-
-@compiled
-def thresholded_in_rows(
-    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
-) -> None:
-    """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
-    width = width_of(source.lanes)
-    n = source.corners.shape[0]
-    n_groups = (n + width - 1) // width
-    control = flush_subnormals()
-    for item in range(start, stop):
-        f, group = item // n_groups, item % n_groups
-        first, last = group * width, min((group + 1) * width, n)
-        settings = task.settings[task.variants[f]]
-        whole = stages.shape[0] == 0
-        for s in range(first, last):
-            whole = _measure(source, task.tables, f, s, settings, slopes) and whole
-        if whole:
-            continue
-        filled = Task(task.settings, task.variants, task.prior, task.tables.gravity, task.variances)
-        gravity_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
-        for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
-            _measure(source, task.tables, f, s, settings, slopes)
-    restore_control(control)
 
 
 @compiled
@@ -144,3 +119,6 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
 def _root(square: Any) -> Any:
     """Square root of what round-off may have left below 0."""
     return math.sqrt(max(square, np.float32(0.0)))
+
+
+thresholded_in_rows = rows_driver_of(_measure, gravity_of_groups)

@@ -20,10 +20,10 @@ from faintspot.kernels.groups import (
     NO_FLUX,
     SATURATED,
     TOO_MANY_BAD_PIXELS,
-    Task,
     driver_of,
     store_slope,
 )
+from faintspot.kernels.row_driver import rows_driver_of
 from faintspot.kernels.simd import (
     Lanes,
     absolute,
@@ -38,10 +38,9 @@ from faintspot.kernels.simd import (
     widened,
     width_of,
 )
-from faintspot.kernels.subnormals import flush_subnormals, restore_control
 
 # Rows of the settings' table that follow the common ones: what the sums are divided by (0: the frame's own
-# light; negative: not measurable); position of a sum of 0; what a flux of 1 e- at the reference adds to the
+# flux; negative: not measurable); position of a sum of 0; what a flux of 1 e- at the reference adds to the
 # sums; variance of the sums in the dark and for a flux of 1 e-; the same of the flux under the weights.
 DIVISOR, HOME_X, HOME_Y, OFFSET_X, OFFSET_Y = range(COMMON_ROWS, COMMON_ROWS + 5)
 DARK_X, DARK_Y, PHOTON_X, PHOTON_Y, DARK_FLUX, PHOTON_FLUX = range(COMMON_ROWS + 5, COMMON_ROWS + 11)
@@ -80,7 +79,7 @@ class RowTables(NamedTuple):
     """(n_subapertures,) bool: whether a pixel that counts is masked."""
     top: Any
     left: Any
-    whole: Any
+    gathered: Any
     """WindowTables, for groups with bad pixels."""
 
 
@@ -151,31 +150,6 @@ window_of_groups = driver_of(locate_window)
 
 
 @compiled
-def window_in_rows(
-    source: Any, task: Any, start: Any, stop: Any, scratch: Any, slopes: Any, stages: Any
-) -> None:
-    """Compute the slopes of the groups [start, stop) of a block of frames; see `groups.measure_groups`."""
-    width = width_of(source.lanes)
-    n = source.corners.shape[0]
-    n_groups = (n + width - 1) // width
-    control = flush_subnormals()
-    for item in range(start, stop):
-        f, group = item // n_groups, item % n_groups
-        first, last = group * width, min((group + 1) * width, n)
-        settings = task.settings[task.variants[f]]
-        whole = stages.shape[0] == 0
-        for s in range(first, last):
-            whole = _measure(source, task.tables, f, s, settings, slopes) and whole
-        if whole:
-            continue
-        filled = Task(task.settings, task.variants, task.prior, task.tables.whole, task.variances)
-        window_of_groups(source, filled, item, item + 1, scratch, slopes, stages)
-        for s in range(first, last):  # those without bad pixels once more: slopes depend on no neighbour
-            _measure(source, task.tables, f, s, settings, slopes)
-    restore_control(control)
-
-
-@compiled
 def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: Any) -> Any:
     """Measure one sub-aperture; False, and nothing written, where a pixel that counts is bad."""
     if tables.bad[s]:
@@ -214,3 +188,6 @@ def _measure(source: Any, tables: Any, f: Any, s: Any, settings: Any, slopes: An
     slopes.flux[f, s] = seen
     store_slope(f, s, settings, x, y, error_x, error_y, bits, slopes)
     return True
+
+
+window_in_rows = rows_driver_of(_measure, window_of_groups)
