@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -46,14 +45,16 @@ def test_page_is_served_until_it_is_ended(tmp_path: Path, end: signal.Signals) -
     store = TelemetryStore(tmp_path / "night.zarr", made.dtype, images, attributes)
     store.append(made, np.empty(0, images), {})
     command = [*COMMAND, "night.zarr", "--port", "0"]
-    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True, env=os.environ)
-    assert process.stdout is not None
-    url, _, token = process.stdout.readline().strip().partition("#")
-    assert len(token) >= 32
-    with urllib.request.urlopen(url) as page:
-        assert b"<title>faintspot</title>" in page.read()
-    with pytest.raises(urllib.error.HTTPError, match="403"):
-        urllib.request.urlopen(urllib.request.Request(url, headers={"Host": "example.org"}))
-    process.send_signal(end)
-    process.communicate(timeout=60)
-    assert process.returncode == 0
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url, _, token = process.stdout.readline().strip().partition("#")
+            assert len(token) >= 32
+            with urllib.request.urlopen(url) as page:
+                assert b"<title>faintspot</title>" in page.read()
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(urllib.request.Request(url, headers={"Host": "example.org"}))
+            process.send_signal(end)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()

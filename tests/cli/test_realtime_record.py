@@ -31,10 +31,8 @@ pytestmark = [
 def engine() -> Iterator[Engine]:
     """Writes frames."""
     name = f"faintspot-test-{secrets.token_hex(6)}"
-    running = Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS))
-    running.start()
-    yield running
-    running.stop()
+    with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS)) as running:
+        yield running
 
 
 def said(command: click.Command, *arguments: str) -> str:
@@ -77,6 +75,6 @@ def test_what_cannot_be_done_is_said(engine: Engine, tmp_path: Path) -> None:
         record, str(tmp_path / "night.zarr"), "--name", f"{name}-other"
     )
     (tmp_path / "there.fits").touch()
-    assert "exists already" in refused(record, str(tmp_path / "there.fits"), "--name", name)
+    assert "already exists" in refused(record, str(tmp_path / "there.fits"), "--name", name)
     assert "ends in .fits" in refused(export, str(tmp_path / "a.zarr"), str(tmp_path / "b"))
     assert "no such file" in refused(export, str(tmp_path / "a.zarr"), str(tmp_path / "b.fits"))

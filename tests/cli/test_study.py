@@ -72,11 +72,6 @@ def test_bad_input(folder: Path, run: Commands) -> None:
     assert not list(folder.glob("*.zarr"))
 
 
-def test_help_has_examples(run: Commands) -> None:
-    for arguments in (["study"], ["study", "run"], ["study", "paper"]):
-        assert "Examples:" in run.ok(*arguments, "--help").out
-
-
 def test_killed_and_started_again(folder: Path, run: Commands) -> None:
     Path("slow.toml").write_text(SLOW)
     store = folder / "slow.zarr"

@@ -80,20 +80,6 @@ class Group(click.Group):
         return "" if found is None else found.get_short_help_str(limit=100)
 
 
-class WindowSide(click.ParamType[int]):
-    """A number of pixels; for two of them the message names the option that takes them."""
-
-    name = "N"
-
-    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> int:
-        """Return the number."""
-        try:
-            return int(value)
-        except ValueError:
-            also = "; --window NY,NX is for windows that are not square" if "," in str(value) else ""
-            self.fail(f"expected a number of pixels, got {value!r}{also}", parameter, context)
-
-
 def _range_in_words(kind: Any) -> str:
     if None not in (kind.min, kind.max) and not (kind.min_open or kind.max_open):
         return f"{kind.min:g} to {kind.max:g}"

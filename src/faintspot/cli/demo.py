@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from faintspot.base.errors import InputError
 from faintspot.base.files import write_atomically
 from faintspot.cli.commands import option
 from faintspot.cli.needs import can_make
+from faintspot.cli.output import results_table
 from faintspot.cli.progress import progress_bar
 from faintspot.experiments import demonstration
 from faintspot.experiments.demonstration import Comparison
@@ -26,6 +25,8 @@ from faintspot.pipeline.slope_pipeline import SlopePipeline
 from faintspot.recorded import measure_recorded
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from faintspot.recorded.statistics import MeasuredSlopes
 
 
@@ -73,7 +74,7 @@ def command(output: str, frames: int, seed: int) -> None:
 
 
 def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
-    """Return the slope errors of both arms and the flux gain as a table."""
+    """Return the slope errors with and without denoising and the flux gain as a table."""
     gain = comparison.flux_gain(rng)
     saved_mag = gain.in_magnitudes
     saved = (
@@ -81,15 +82,9 @@ def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
         if 0 < gain.factor < np.inf
         else "no flux that was simulated gives the same error with denoising"
     )
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
-        title=f"Slope error R (mean |error| per axis, px), {comparison.mode}",
-        caption=f"At {demonstration.SHOWN_FLUX_E:g} e-, {saved}",
-    )
-    for heading in ("e-", "R without", "R with TV", "difference", "k", "k, TV", "strength"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = results_table("e-", "R without", "R with TV", "difference", "k", "k, TV", "strength")
+    table.title = f"Slope error R (mean |error| per axis, px), {comparison.mode}"
+    table.caption = f"At {demonstration.SHOWN_FLUX_E:g} e-, {saved}"
     for i, flux in enumerate(demonstration.FLUXES_E):
         without, denoised = comparison.without[i], comparison.denoised[i]
         table.add_row(
@@ -108,7 +103,7 @@ def comparison_table(comparison: Comparison, rng: np.random.Generator) -> Table:
 def write_files(
     folder: Path, comparison: Comparison, n_frames: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Write new frames at one flux, measure them in both arms with what was chosen; return what it shows."""
+    """Write new frames at one flux, measure them with and without denoising; return what it shows."""
     from faintspot.recorded.statistics import MeasuredSlopes
 
     layout = demonstration.demonstration_layout()

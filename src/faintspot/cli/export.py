@@ -22,13 +22,7 @@ def command() -> None:
 @option("--output", "-o", metavar="FOLDER", default="darc", help="A new folder.")
 @REFERENCE
 @option("--no-control", is_flag=True, help="Without the control matrix of [control].")
-@option(
-    "--format",
-    "form",
-    type=click.Choice(["fits", "npy"]),
-    default="fits",
-    help="Format of arrays.",
-)
+@option("--format", "form", type=click.Choice(["fits", "npy"]), default="fits", help="Format of arrays.")
 def darc(config: str, output: str, reference: str | None, no_control: bool, form: str) -> None:
     """Write the parameters that users of DARC set by hand.
 

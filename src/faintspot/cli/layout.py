@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintspot.base.errors import InputError
-from faintspot.base.files import derived
 from faintspot.camera.calibration import Calibration
 from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.cli import layout_grid, layout_options
-from faintspot.cli.commands import SectionedCommand, WindowSide, option
+from faintspot.cli.commands import SectionedCommand, option
 from faintspot.cli.layout_options import plain
-from faintspot.cli.needs import can_make, suggested_slopes
-from faintspot.cli.shared_options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
+from faintspot.cli.needs import suggested_slopes
+from faintspot.cli.output import picture_file
+from faintspot.cli.shared_options import DIAMETER, KEY, PIXEL_SCALE, SUBAPERTURE
 from faintspot.experiments.first_settings import ASSUMED_NOISE_E, FirstSettings, first_settings
 from faintspot.io.frames import FrameSource, open_frames
 from faintspot.pipeline import configuration
@@ -32,7 +33,11 @@ _MOST_FRAMES = 200  # averaged to find the spots
 _MOST_NAMED = 12  # sub-apertures in one line
 _FIRST_FRAMES = 20  # measured for the settings
 _FEWEST_E = 10.0  # electrons of a spot that is seen in a single frame
-_ARRAY, _WINDOWS, _CAMERA = "Lenslet array", "Windows", "Camera"
+_array = partial(option, section="Lenslet array")
+_windows = partial(option, section="Windows")
+_camera = partial(option, section="Camera")
+_CALIBRATION = ("dark", "flat", "bad_pixels", "gain_e_per_adu", "read_noise_e")
+_OPTICS = ("pixel_scale_arcsec", "subaperture_m", "diameter_m")
 # What the finder calls what these options give.
 _OPTIONS = {
     "pitch_px": "--pitch-px",
@@ -45,101 +50,75 @@ _OPTIONS = {
     cls=SectionedCommand, short_help="Find the sub-apertures in a frame and write a configuration."
 )
 @click.argument("frames", nargs=-1, required=True, metavar="FRAME...")
-@option(
-    "--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", help="Packing.", section=_ARRAY
-)
-@option("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets.", section=_ARRAY)
-@option(
+@_array("--geometry", type=click.Choice(["auto", *GEOMETRIES]), default="auto", help="Packing.")
+@_array("--pitch-px", type=float, metavar="PX", help="Distance of neighbouring lenslets.")
+@_array(
     "--grid",
     metavar="ROWSxCOLUMNS",
     help="Rows and columns of an array that fills the frame or --roi, such as quad cells; then only which "
     "lenslets are illuminated is searched for.",
-    section=_ARRAY,
 )
-@option(
+@_array(
     "--roi",
     metavar="X0,Y0,X1,Y1",
     help="Look only at columns X0 to X1 - 1 and rows Y0 to Y1 - 1 of the frame.",
-    section=_ARRAY,
 )
-@option(
+@_array(
     "--illuminated-fraction",
     type=float,
     metavar="PART",
     help="Least flux of an illuminated lenslet, as a part of the median.",
     show_default="where fewest are, 0.18 to 0.5; with --grid 0.3",
-    section=_ARRAY,
 )
-@option(
+@_array(
     "--pupil",
     metavar="X,Y,R[,INNER]",
     help="Centre and radius [px] of the disk, or annulus, whose lenslets are taken, illuminated or not.",
-    section=_ARRAY,
 )
-@option(
+@_array(
     "--exclude",
     metavar="LIST",
     help="Sub-apertures to leave out, such as 3,17,40-45: their numbers in the picture drawn without this.",
-    section=_ARRAY,
 )
-@option(
+@_windows(
     "--pixels",
-    type=WindowSide(),
-    help="Side of a window.",
+    metavar="N|NY,NX",
+    help="Side of a window, or its height and width [px].",
     show_default="the largest without overlap",
-    section=_WINDOWS,
 )
-@option(
-    "--window",
-    metavar="NY,NX",
-    help="Height and width [px] of a window that is not square.",
-    section=_WINDOWS,
-)
-@option(
+@_windows(
     "--move-windows",
     is_flag=True,
     help="Move all windows alike, off their spots, to keep lenslets at the frame's edge.",
-    section=_WINDOWS,
 )
-@option(
+@_camera(
     "--dark",
     metavar="FILE|ADU",
     help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU.",
-    section=_CAMERA,
 )
-@option(
-    "--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.", section=_CAMERA
+@_camera("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
+@_camera(
+    "--bad-pixels", metavar="FILE", help="Map that is not 0 where a pixel is bad, or rows of row, column."
 )
-@option(
-    "--bad-pixels",
-    metavar="FILE",
-    help="Map that is not 0 where a pixel is bad, or rows of row, column.",
-    section=_CAMERA,
-)
-@option(
+@_camera(
     "--mask-hot-pixels",
     is_flag=True,
     help="Enter isolated bright pixels and pairs as bad pixels. Not for spots sharper than Nyquist sampling.",
-    section=_CAMERA,
 )
-@option(
+@_camera(
     "--gain-e-per-adu",
     type=float,
     metavar="E/ADU",
     help="Electrons per ADU.",
     show_default="1, frames in electrons",
-    section=_CAMERA,
 )
-@option(
-    "--read-noise-e",
-    metavar="E|FILE",
-    help="Read noise, a number or a map of each pixel as FILE[:ARRAY].",
-    section=_CAMERA,
+@_camera(
+    "--read-noise-e", metavar="E|FILE", help="Read noise, a number or a map of each pixel as FILE[:ARRAY]."
 )
 @PIXEL_SCALE
 @SUBAPERTURE
 @DIAMETER
-@option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@KEY
 @option("--output", "-o", metavar="TOML", default="faintspot.toml", help="Configuration to write.")
 @option(
     "--picture", metavar="PNG", help="Picture of frame and grid to write.", show_default="beside the output"
@@ -153,27 +132,12 @@ def command(
     frames: tuple[str, ...],
     output: str,
     picture: str | None,
-    geometry: str,
     grid: str | None,
-    pitch_px: float | None,
-    pixels: int | None,
-    window: str | None,
-    illuminated_fraction: float | None,
-    pupil: str | None,
     exclude: str | None,
-    roi: str | None,
-    move_windows: bool,
-    dark: str | None,
-    flat: str | None,
-    bad_pixels: str | None,
-    gain_e_per_adu: float | None,
-    read_noise_e: str | None,
     mask_hot_pixels: bool,
-    pixel_scale_arcsec: float | None,
-    subaperture_m: float | None,
-    diameter_m: float | None,
     key: str | None,
     overwrite: bool,
+    **options: Any,
 ) -> None:
     """Find the sub-apertures in a frame and write a configuration.
 
@@ -200,27 +164,20 @@ def command(
     target = Path(output)
     keeps_settings = configuration.has(target, "settings") and not configuration.has(target, "layout")
     if target.exists() and not overwrite and not keeps_settings:
-        raise InputError(f"{output}: exists already; --overwrite replaces its layout and settings")
-    options = {
-        "geometry": geometry,
-        "pitch_px": pitch_px,
-        "pixels": layout_options.window(pixels, window),
-        "illuminated_fraction": illuminated_fraction,
-        "pupil": layout_options.numbers("--pupil", pupil, (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
-        "roi": layout_options.numbers("--roi", roi, (4,), "X0,Y0,X1,Y1 in pixels"),
-        "move_windows": move_windows,
-    }
-    optics = layout_options.optics(target, pixel_scale_arcsec, subaperture_m, diameter_m)
-    with_picture = can_make("picture", "web", "matplotlib", asked=picture is not None)
+        raise InputError(f"{output}: already exists; --overwrite replaces its layout and settings")
+    for name, counts, expected in (
+        ("pupil", (3, 4), "X,Y,R or X,Y,R,INNER in pixels"),
+        ("roi", (4,), "X0,Y0,X1,Y1 in pixels"),
+        ("pixels", (1, 2), "a number of pixels, or height and width, such as 12,16"),
+    ):
+        options[name] = layout_options.numbers(f"--{name}", options[name], counts, expected)
+    if options["pixels"] is not None and len(options["pixels"]) == 1:
+        (options["pixels"],) = options["pixels"]
+    optics = layout_options.optics(target, {name: options.pop(name) for name in _OPTICS})
+    of_camera = {name: options.pop(name) for name in _CALIBRATION}
+    drawing = picture_file(target, picture, ".png")
     with open_frames(frames, key=key) as source:
-        calibration = layout_options.calibration(
-            target,
-            dark=dark,
-            flat=flat,
-            bad_pixels=bad_pixels,
-            gain_e_per_adu=gain_e_per_adu,
-            read_noise_e=read_noise_e,
-        )
+        calibration = layout_options.calibration(target, of_camera)
         mean = _mean_frame(source, calibration)
         hot = find_hot_pixels(mean) if mask_hot_pixels else np.empty((0, 2), int)
         mean[tuple(hot.T)] = np.nan
@@ -233,7 +190,7 @@ def command(
         layout = replace(found.layout[kept], **optics)
         first = source.block(0, min(_FIRST_FRAMES, source.n_frames))
     calibration, notes = _completed(calibration, found, layout, mean, hot)
-    unit = "ADU" if gain_e_per_adu is None and calibration.gain_e_per_adu == 1.0 else "e-"
+    unit = "ADU" if of_camera["gain_e_per_adu"] is None and calibration.gain_e_per_adu == 1.0 else "e-"
     seen = first_settings(layout, calibration, first)
     if unit == "ADU" and 0 < seen.flux < _FEWEST_E:
         likely = float(f"{(calibration.typical_read_noise_e or ASSUMED_NOISE_E) / seen.noise:.3g}")
@@ -243,12 +200,13 @@ def command(
     settings = configuration.load(target, "settings") if keeps_settings else seen.settings
     if keeps_settings:
         notes.append(f"  the settings that {output} has are kept")
-    marks = {}
+    marks: dict[str, Any] = {}
     if isinstance(found, FoundLayout):
         marks = {"outside": found.outside, "doubtful": (found.clipped | found.unlike)[kept]}
-    drawn = with_picture and _draw(
-        np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, marks, picture, target
-    )
+    if drawing is not None:
+        from faintspot.recorded.layout_picture import layout_picture
+
+        layout_picture(np.where(np.isnan(mean), np.nanmedian(mean), mean), layout, drawing, **marks)
     # The layout last: it may be long, and whatever is saved after it reads it again.
     for item in (settings, calibration, layout):
         configuration.save(target, item)
@@ -262,8 +220,8 @@ def command(
         click.echo(
             "  gain unknown (--gain-e-per-adu): these settings do not depend on it, standard errors do"
         )
-    if drawn:
-        click.echo(f"  {drawn}")
+    if drawing is not None:
+        click.echo(f"  picture: {drawing}")
     arguments = [*frames, *(["--key", key] if key else []), "--config", output, "-o", suggested_slopes()]
     click.echo(f"Next: faintspot slopes {shlex.join(arguments)}")
 
@@ -375,17 +333,6 @@ def _mean_frame(source: FrameSource, calibration: Calibration) -> NDArray[np.flo
     mean = np.divide(total, count, where=count > 0, out=np.full(source.shape, np.nan))
     electrons: NDArray[np.float64] = (mean - dark) * electrons_per_adu
     return electrons
-
-
-def _draw(
-    frame: NDArray[Any], layout: Layout, marks: dict[str, Any], picture: str | None, target: Path
-) -> str:
-    """Draw frame and windows, and say where."""
-    from faintspot.recorded.layout_picture import layout_picture
-
-    path = picture or str(derived(target, ".png"))
-    layout_picture(frame, layout, path, **marks)
-    return f"picture: {path}"
 
 
 def _completed(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,16 +30,6 @@ def numbers(option: str, text: str | None, counts: tuple[int, ...], expected: st
     if len(values) not in counts or not np.isfinite(values).all():
         raise InputError(f"{option} {text}: expected {expected}")
     return values
-
-
-def window(pixels: int | None, text: str | None) -> int | tuple[int, int] | None:
-    """Return the window's side, or its height and width, of the two options that say it."""
-    if text is None:
-        return pixels
-    if pixels is not None:
-        raise InputError("--pixels, --window: expected one of them, got both")
-    height, width = numbers("--window", text, (2,), "height and width in pixels, such as 12,16") or (0, 0)
-    return (height, width)  # type: ignore[return-value]  # checked for whole numbers where windows are made
 
 
 def grid_shape(text: str) -> tuple[int, int]:
@@ -70,7 +60,7 @@ def kept(count: int, text: str | None) -> NDArray[np.bool_]:
     return kept
 
 
-def calibration(target: Path, **given: Any) -> Calibration:
+def calibration(target: Path, given: Mapping[str, Any]) -> Calibration:
     """Return the calibration that the configuration has already, with what was given now (None: nothing)."""
     known: Calibration = configuration.load(target, "calibration") if target.exists() else Calibration()
     maps: dict[str, Callable[[str], Any]] = {
@@ -89,11 +79,8 @@ def calibration(target: Path, **given: Any) -> Calibration:
     return replace(known, **changes)
 
 
-def optics(
-    target: Path, pixel_scale: float | None, subaperture_size: float | None, diameter: float | None
-) -> dict[str, Any]:
+def optics(target: Path, given: Mapping[str, float | None]) -> dict[str, Any]:
     """Return the scales of a layout that were given, or else those that the configuration has already."""
-    given = {"pixel_scale_arcsec": pixel_scale, "subaperture_m": subaperture_size, "diameter_m": diameter}
     known = read_tables(target).get("layout", {}) if target.exists() else {}
     return {name: known.get(name) if value is None else value for name, value in given.items()}
 

@@ -15,7 +15,7 @@ import click
 from faintspot.base.extras import require, require_linux
 from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
-from faintspot.cli.shared_options import ENGINE_NAME
+from faintspot.cli.shared_options import ENGINE_NAME, PORT
 
 if TYPE_CHECKING:
     from faintspot.live_page.server import LiveServer
@@ -27,18 +27,8 @@ _NICENESS = 5  # the engine comes first
 @click.command(short_help="Show a running engine, or a recording, as a web page.")
 @click.argument("recording", type=click.Path(path_type=Path), required=False, metavar="[RECORDING]")
 @ENGINE_NAME
-@option(
-    "--bind",
-    default="127.0.0.1",
-    metavar="ADDRESS",
-    help="Address of this machine to listen on.",
-)
-@option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8642,
-    help="Port of the page; 0: any that is free.",
-)
+@option("--bind", default="127.0.0.1", metavar="ADDRESS", help="Address of this machine to listen on.")
+@PORT
 @option("--private", is_flag=True, help="Watching needs the token also on this machine.")
 @option(
     "--output",
@@ -62,7 +52,7 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
       faintspot live night.zarr
     """
     from faintspot.cli.realtime_camera import stop_on_signal
-    from faintspot.live_page.serving import serve_engine, serve_recording
+    from faintspot.live_page.serving import serve
 
     if recording is None:
         require_linux("live without a recording")
@@ -70,10 +60,8 @@ def command(recording: Path | None, name: str, bind: str, port: int, private: bo
     if hasattr(os, "sched_setscheduler"):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # pushes nobody aside when it wakes
     with stop_on_signal() as stop:
-        if recording is not None:
-            serve_recording(recording, stop, _say, address=bind, port=port, private=private)
-        else:
-            serve_engine(name, stop, _say, address=bind, port=port, private=private, folder=folder)
+        shown = name if recording is None else recording
+        serve(shown, stop, _say, address=bind, port=port, private=private, folder=folder)
 
 
 @contextmanager

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,12 +13,7 @@ from faintspot.cli.commands import Group, option
 from faintspot.cli.loop_tune import tune
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from faintspot.experiments.running import WorkerPool
-
+from faintspot.cli.shared_options import WORKERS
 
 _needs_loop = needs("loop", "hcipy", "zarr", "matplotlib", "jinja2")
 
@@ -31,20 +25,10 @@ def _experiment_options(command: Callable[..., Any]) -> Callable[..., Any]:
         option(
             "--scheduler", metavar="ADDRESS", help="Running Dask scheduler to use instead: tls://HOST:PORT."
         ),
-        option(
-            "--workers",
-            type=click.IntRange(0),
-            metavar="N",
-            help="Processes on this machine; 0: this process alone.",
-            show_default="all processors",
-        ),
+        WORKERS,
         option("--quick", is_flag=True, help="Fewer and shorter runs: a few minutes."),
         option(
-            "--output",
-            "-o",
-            metavar="FOLDER",
-            help="Where results go.",
-            show_default="NAME, or NAME-quick",
+            "--output", "-o", metavar="FOLDER", help="Where results go.", show_default="NAME, or NAME-quick"
         ),
         click.argument("configuration", metavar="[CONFIG]", default="canary"),
     ):
@@ -99,7 +83,7 @@ def show(name: str) -> None:
 @_needs_loop
 @command.command(short_help="Observe alternately with and without denoising.")
 @_experiment_options
-def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **where: Any) -> None:
+def run(configuration: str, **options: Any) -> None:
     """Observe alternately with and without TV denoising, as on the sky.
 
     Four sets: two at full multiplication gain of the camera and two at 75 %; in each, a measurement without
@@ -110,16 +94,9 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
       faintspot loop run --quick
       faintspot loop run mine.toml -o mine
     """
-    from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.interleaved import run_interleaved
-    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
 
-    loop = load_loop(configuration)
-    folder = output or _folder(loop.name, quick)
-    with _worker_pool(**where) as place:
-        result = run_interleaved(loop, folder, quick=quick, place=place, overwrite=overwrite)
-    click.echo(loop_summary(LoopResults(interleaved=result)))
-    _report(folder)
+    _measure(configuration, "interleaved", run_interleaved, **options)
 
 
 @_needs_loop
@@ -132,15 +109,7 @@ def run(configuration: str, output: str | None, quick: bool, overwrite: bool, **
     help="Fluxes with commas, photo-electrons per sub-aperture and frame.",
     show_default="four times to an eighth of the configuration's",
 )
-def magnitude(
-    configuration: str,
-    output: str | None,
-    quick: bool,
-    overwrite: bool,
-    methods: str | None,
-    flux_e: str | None,
-    **where: Any,
-) -> None:
+def magnitude(configuration: str, methods: str | None, flux_e: str | None, **options: Any) -> None:
     """Measure the Strehl ratio of any list of methods against the star's magnitude.
 
     Each method is tuned at each flux, its settings and the loop gain together, on other turbulence. Methods:
@@ -155,27 +124,17 @@ def magnitude(
       faintspot loop magnitude diffraction_limit --methods map_predicted,map+kalman --flux-e 20
       faintspot loop magnitude camera_3e --methods brightest,smoothed,tv,ml --flux-e 60,200,640
     """
-    from faintspot.ao_loop.configuration import load_loop
-    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
     from faintspot.experiments.magnitude import run_magnitude
 
-    loop = load_loop(configuration)
-    folder = output or _folder(loop.name, quick)
     fluxes = None if flux_e is None else [_number(text) for text in _listed(flux_e)]
-    names = None if methods is None else _methods(methods)
-    with _worker_pool(**where) as place:
-        result = run_magnitude(loop, folder, names, fluxes, quick=quick, place=place, overwrite=overwrite)
-    click.echo(loop_summary(LoopResults(magnitude=result)))
-    _report(folder)
+    _measure(configuration, "magnitude", run_magnitude, _methods(methods), fluxes, **options)
 
 
 @_needs_loop
 @command.command(short_help="Measure what limits the Strehl ratio.")
 @_experiment_options
 @option("--methods", metavar="NAMES", help="Methods, with commas.", show_default="brightest,smoothed,tv")
-def budget(
-    configuration: str, output: str | None, quick: bool, overwrite: bool, methods: str | None, **where: Any
-) -> None:
+def budget(configuration: str, methods: str | None, **options: Any) -> None:
     """Measure what limits the Strehl ratio, by switching off one term of the error after another.
 
     At the configuration's own flux, each method is tuned and then runs without photon and read noise, without
@@ -186,17 +145,9 @@ def budget(
     Examples:
       faintspot loop budget camera_3e --quick
     """
-    from faintspot.ao_loop.configuration import load_loop
     from faintspot.experiments.budget import run_budget
-    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
 
-    loop = load_loop(configuration)
-    folder = output or _folder(loop.name, quick)
-    names = None if methods is None else _methods(methods)
-    with _worker_pool(**where) as place:
-        result = run_budget(loop, folder, names, quick=quick, place=place, overwrite=overwrite)
-    click.echo(loop_summary(LoopResults(budget=result)))
-    _report(folder)
+    _measure(configuration, "budget", run_budget, _methods(methods), **options)
 
 
 @needs("loop", "hcipy")
@@ -232,27 +183,44 @@ def engine(configuration: str, output: str, control: str, frame_rate_hz: float |
     click.echo(f"{path} written; next: faintspot realtime run --config {shlex.quote(str(path))} --close-loop")
 
 
-@contextmanager
-def _worker_pool(workers: int | None, scheduler: str | None) -> Iterator[WorkerPool]:
-    """Yield where the work is done, with a progress bar."""
+def _measure(
+    configuration: str,
+    name: str,
+    run: Callable[..., Any],
+    *what: Any,
+    output: str | None,
+    quick: bool,
+    overwrite: bool,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Run an experiment with a progress bar, print the summary of its result and write its page."""
+    from faintspot.ao_loop.configuration import load_loop
+    from faintspot.experiments.loop_page import write_loop_report
+    from faintspot.experiments.loop_verdict import LoopResults, loop_summary
     from faintspot.experiments.running import WorkerPool
 
+    loop = load_loop(configuration)
+    folder = output or (f"{loop.name}-quick" if quick else loop.name)
     with progress_bar("loop") as advance:
-        yield WorkerPool(workers, scheduler, advance, lambda text: click.echo(text, err=True))
-
-
-def _folder(name: str, quick: bool) -> str:
-    return f"{name}-quick" if quick else name
+        place = WorkerPool(workers, scheduler, advance, lambda text: click.echo(text, err=True))
+        result = run(loop, folder, *what, quick=quick, place=place, overwrite=overwrite)
+    click.echo(loop_summary(LoopResults(**{name: result})))
+    page = Path(folder) / "report.html"
+    write_loop_report(folder, page)
+    click.echo(f"{shlex.quote(str(page))}: open it in a browser")
 
 
 def _listed(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
 
 
-def _methods(text: str) -> list[str]:
+def _methods(text: str | None) -> list[str] | None:
     """Return the methods that are asked for; name those that could use the loop's prediction but do not."""
     from faintspot.experiments.loop_arms import arm_kind
 
+    if text is None:
+        return None
     names = _listed(text)
     for name in names:
         kind = arm_kind(name)
@@ -270,12 +238,3 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise InputError(f"--flux-e: expected numbers with commas, got {text!r}") from None
-
-
-def _report(folder: str) -> None:
-    """Write the page of a folder of results."""
-    from faintspot.experiments.loop_page import write_loop_report
-
-    page = Path(folder) / "report.html"
-    write_loop_report(folder, page)
-    click.echo(f"{shlex.quote(str(page))}: open it in a browser")

@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from faintspot.base.errors import InputError
 from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
+from faintspot.cli.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.progress import progress_bar
-from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
+from faintspot.cli.shared_options import WORKERS
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from faintspot.experiments.loop_answer import LoopAnswer
     from faintspot.experiments.loop_question import LoopQuestion
 
@@ -61,12 +62,7 @@ if TYPE_CHECKING:
 @option(
     "--minutes", type=float, metavar="M", help="Begin no further candidate after this time.", show_default="5"
 )
-@option(
-    "--workers",
-    type=click.IntRange(0),
-    help="Processes on this machine; 0: this process alone.",
-    show_default="all processors",
-)
+@WORKERS
 @option(
     "--results", metavar="FOLDER", help="Folder of finished work, to continue from.", show_default="NAME-tune"
 )
@@ -89,7 +85,7 @@ def tune(
     """
     target = Path(output)
     check_target(target, overwrite)
-    drawing = picture_file(target, picture)
+    drawing = picture_file(target, picture, "-tune.png")
     question = _question(configuration, options)
     from faintspot.ao_loop.engine_files import CONFIGURATION as ENGINE_FILE
     from faintspot.experiments.loop_tuning import tune_loop
@@ -144,12 +140,11 @@ def strehl_table(answer: LoopAnswer) -> Table:
     """Return the Strehl ratios of all candidates at all measured magnitudes as a table."""
     from faintspot.experiments.words import plain_number
 
-    table = _table()
-    for flux in reversed(range(len(answer.photons))):
-        heading = f"{answer.magnitudes[flux]:.2f}\n{plain_number(answer.photons[flux])} e-"
-        table.add_column(heading, justify="right", no_wrap=True)
+    fluxes = list(reversed(range(len(answer.photons))))
+    stars = (f"{answer.magnitudes[flux]:.2f}\n{plain_number(answer.photons[flux])} e-" for flux in fluxes)
+    table = results_table("method", *stars)
     for name in answer.kinds:
-        values = [answer.strehl(name, flux) for flux in reversed(range(len(answer.photons)))]
+        values = [answer.strehl(name, flux) for flux in fluxes]
         texts = [f"{each.value:.3f}±{each.standard_error:.3f}".removesuffix("±nan") for each in values]
         table.add_row(name, *texts, style="bold" if name == answer.best.name else None)
     table.caption = "Strehl ratio and its standard error, at magnitudes that were measured."
@@ -160,9 +155,7 @@ def gain_table(answer: LoopAnswer) -> Table:
     """Return limiting magnitudes and what is gained over both references as a table."""
     from faintspot.experiments import loop_text
 
-    table = _table()
-    for heading in ("limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = results_table("method", "limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest")
     for name in answer.kinds:
         cells = [loop_text.limit_in_words(answer, name)]
         for reference in loop_text.REFERENCES:
@@ -178,20 +171,11 @@ def sky_table(answer: LoopAnswer) -> Table:
     from faintspot.experiments import loop_text
     from faintspot.experiments.loop_question import PLACES
 
-    table = _table()
-    for place in PLACES:
-        table.add_column(f"{place}\n%", justify="right", no_wrap=True)
+    table = results_table("method", *(f"{place}\n%" for place in PLACES))
     for name in answer.kinds:
         found = [answer.coverage(name, place) for place in PLACES]
         cells = [loop_text.coverage_in_words(each) for each in found if each is not None]
         table.add_row(name, *cells, style="bold" if name == answer.best.name else None)
-    return table
-
-
-def _table() -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("method", no_wrap=True)
-    table.caption_justify = "left"
     return table
 
 

@@ -6,33 +6,35 @@ from typing import ClassVar
 
 import click
 
-from faintspot.cli import (
-    realtime_advise,
-    realtime_calibrate,
-    realtime_camera,
-    realtime_control,
-    realtime_control_loop,
-    realtime_demo,
-    realtime_estimators,
-    realtime_learn,
-    realtime_record,
-    realtime_run,
-    realtime_sources,
-    realtime_telescope,
-)
 from faintspot.cli.commands import Group
 from faintspot.cli.needs import needs_linux
+from faintspot.cli.realtime_advise import advise
+from faintspot.cli.realtime_calibrate import calibrate
+from faintspot.cli.realtime_camera import camera
+from faintspot.cli.realtime_control import control, get, interleave, set_settings, status, stop_engine, top
+from faintspot.cli.realtime_demo import demo
+from faintspot.cli.realtime_estimators import load, swap, unload
+from faintspot.cli.realtime_learn import learn
+from faintspot.cli.realtime_record import export, record
+from faintspot.cli.realtime_run import run
+from faintspot.cli.realtime_sources import bridge, replay
+from faintspot.cli.realtime_telescope import telescope
+
+_SECTIONS = {
+    "Engine": (run, status, top, get, set_settings, interleave, control, stop_engine),
+    "Estimators": (load, swap, unload),
+    "Sources of frames": (camera, replay, bridge, telescope, demo),
+    "Calibration and control": (calibrate, learn),
+    "Telemetry": (record, export, advise),
+}
+_OF_RECORDINGS = (learn, advise, export)
 
 
 class _RealTime(Group):
     """Lists its commands by what they are for."""
 
     sections: ClassVar = {
-        "Engine": ("run", "status", "top", "get", "set", "interleave", "control", "stop"),
-        "Estimators": ("load", "swap", "unload"),
-        "Sources of frames": ("camera", "replay", "bridge", "telescope", "demo"),
-        "Calibration and control": ("calibrate", "learn"),
-        "Telemetry": ("record", "export", "advise"),
+        heading: [str(each.name) for each in listed] for heading, listed in _SECTIONS.items()
     }
 
 
@@ -48,26 +50,6 @@ def command() -> None:
     """
 
 
-for each in (
-    realtime_run.run,
-    realtime_camera.camera,
-    realtime_sources.replay,
-    realtime_sources.bridge,
-    realtime_telescope.telescope,
-    realtime_demo.demo,
-    realtime_control.status,
-    realtime_control.top,
-    realtime_control.get,
-    realtime_control.set_settings,
-    realtime_control.interleave,
-    realtime_control.stop_engine,
-    realtime_control_loop.control,
-    realtime_calibrate.calibrate,
-    realtime_estimators.load,
-    realtime_estimators.swap,
-    realtime_estimators.unload,
-    realtime_record.record,
-):
-    command.add_command(needs_linux(each))
-for each in (realtime_learn.learn, realtime_advise.advise, realtime_record.export):  # of recordings
-    command.add_command(each)
+for _listed in _SECTIONS.values():
+    for _each in _listed:
+        command.add_command(_each if _each in _OF_RECORDINGS else needs_linux(_each))

@@ -23,12 +23,7 @@ if TYPE_CHECKING:
 @click.command("advise", short_help="Measure flux, noise, turbulence and centroid gain from telemetry.")
 @configuration_option("Configuration of the engine.")
 @ENGINE_NAME
-@option(
-    "--seconds",
-    type=click.FloatRange(1),
-    default=10.0,
-    help="Seconds of telemetry to look at.",
-)
+@option("--seconds", type=click.FloatRange(1), default=10.0, help="Seconds of telemetry to look at.")
 @option(
     "--from",
     "store",

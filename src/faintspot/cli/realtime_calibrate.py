@@ -24,12 +24,7 @@ from faintspot.cli.shared_options import configuration_option, name_option
     help="Actuators of the mirror.",
     show_default="as before, or as simulated",
 )
-@option(
-    "--amplitude",
-    type=float,
-    default=50.0,
-    help="Amplitude of a poke, in the mirror's unit.",
-)
+@option("--amplitude", type=float, default=50.0, help="Amplitude of a poke, in the mirror's unit.")
 @option(
     "--error",
     type=click.FloatRange(0, 1, min_open=True),
@@ -37,13 +32,10 @@ from faintspot.cli.shared_options import configuration_option, name_option
     help="Relative error of an actuator's slopes that half of the actuators must reach.",
 )
 @option("--rounds", type=click.IntRange(4), default=100, help="Most rounds.")
+@option("--settle-frames", type=click.IntRange(1), default=3, help="Frames until a command acts.")
 @option(
-    "--settle-frames",
-    type=click.IntRange(1),
-    default=3,
-    help="Frames until a command acts.",
+    "--frames-per-poke", "frames", type=click.IntRange(2), default=2, help="Frames averaged for each poke."
 )
-@option("--frames-per-poke", type=click.IntRange(2), default=2, help="Frames averaged for each poke.")
 @option("--keep-reference", is_flag=True, help="Leave the reference slopes as they are.")
 def calibrate(
     config: str,
@@ -52,9 +44,8 @@ def calibrate(
     amplitude: float,
     error: float,
     rounds: int,
-    settle_frames: int,
-    frames_per_poke: int,
     keep_reference: bool,
+    **averaging: int,
 ) -> None:
     """Poke the mirror up and down and measure what the slopes do, for [control] of the configuration.
 
@@ -86,7 +77,7 @@ def calibrate(
         raise InputError(f"--amplitude {amplitude:g}: expected at most largest_command, {stroke:g}")
     number = actuators or _known_commands(former, name)
     with (
-        StreamedMirror(name, number, settle_frames=settle_frames, frames=frames_per_poke) as mirror,
+        StreamedMirror(name, number, **averaging) as mirror,
         progress_bar("pokes", "rounds") as advance,
     ):
         total: Any = None

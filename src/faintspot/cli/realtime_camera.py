@@ -7,14 +7,20 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from faintspot.cli.commands import SectionedCommand, option
-from faintspot.cli.shared_options import configuration_option, name_option
+from faintspot.cli.shared_options import FRAMES, READOUT_FRACTION, SLOTS, configuration_option, name_option
 
-_SPOTS, _DETECTOR, _KNOWN = "Spots", "Detector", "the configuration's"
+if TYPE_CHECKING:
+    from faintspot.realtime.camera import CameraReport
+
+_KNOWN = "the configuration's"
+_spots = partial(option, section="Spots", type=float)
+_detector = partial(option, section="Detector", type=float)
 
 
 @click.command(
@@ -23,98 +29,37 @@ _SPOTS, _DETECTOR, _KNOWN = "Spots", "Detector", "the configuration's"
 @configuration_option("Configuration; its layout says where the spots are.")
 @name_option("Name of the pixel ring, in shared memory.")
 @option("--frame-rate-hz", type=float, metavar="HZ", default=500.0, help="Frame rate.")
-@option(
-    "--flux-e",
-    type=float,
-    metavar="E",
-    default=200.0,
-    help="Electrons per sub-aperture and frame.",
-    section=_SPOTS,
-)
-@option(
+@_spots("--flux-e", default=200.0, metavar="E", help="Electrons per sub-aperture and frame.")
+@_spots(
     "--profile",
     type=click.Choice(["diffraction", "gaussian"]),
     default="diffraction",
     help="Shape of the spots.",
-    section=_SPOTS,
 )
-@option(
-    "--size",
-    type=float,
-    metavar="SIZE",
-    default=1.0,
-    help="Width of the spots; 1 is Nyquist sampling.",
-    section=_SPOTS,
-)
-@option("--motion-px", type=float, metavar="PX", default=0.3, help="Rms motion per axis.", section=_SPOTS)
-@option(
-    "--motion-time-s",
-    type=float,
-    metavar="S",
-    default=0.01,
-    help="Correlation time of the motion.",
-    section=_SPOTS,
-)
-@option(
+@_spots("--size", default=1.0, metavar="SIZE", help="Width of the spots; 1 is Nyquist sampling.")
+@_spots("--motion-px", default=0.3, metavar="PX", help="Rms motion per axis.")
+@_spots("--motion-time-s", default=0.01, metavar="S", help="Correlation time of the motion.")
+@_detector(
     "--read-noise-e",
-    type=float,
     metavar="E",
     help="Read noise at the output.",
     show_default="the configuration's, else 1",
-    section=_DETECTOR,
 )
-@option(
-    "--background-e", type=float, metavar="E", default=0.0, help="Sky per pixel and frame.", section=_DETECTOR
+@_detector("--background-e", default=0.0, metavar="E", help="Sky per pixel and frame.")
+@_detector("--dark-e", default=0.0, metavar="E", help="Dark current per pixel and frame.")
+@_detector("--em-gain", metavar="G", help="EM gain; 1: none.", show_default=_KNOWN)
+@_detector("--gain-e-per-adu", metavar="E/ADU", help="Electrons per ADU.", show_default=_KNOWN)
+@_detector(
+    "--offset-adu", metavar="ADU", help="Level of every pixel.", show_default="the configuration's dark"
 )
-@option(
-    "--dark-e",
-    type=float,
-    metavar="E",
-    default=0.0,
-    help="Dark current per pixel and frame.",
-    section=_DETECTOR,
-)
-@option(
-    "--em-gain", type=float, metavar="G", help="EM gain; 1: none.", show_default=_KNOWN, section=_DETECTOR
-)
-@option(
-    "--gain-e-per-adu",
-    type=float,
-    metavar="E/ADU",
-    help="Electrons per ADU.",
-    show_default=_KNOWN,
-    section=_DETECTOR,
-)
-@option(
-    "--offset-adu",
-    type=float,
-    metavar="ADU",
-    help="Level of every pixel.",
-    show_default="the configuration's dark",
-    section=_DETECTOR,
-)
-@option(
-    "--bits",
-    type=int,
-    help="Bits of the converter, for whole ADU.",
-    show_default="continuous values",
-    section=_DETECTOR,
-)
-@option(
-    "--readout-fraction",
-    type=float,
-    metavar="PART",
-    default=0.8,
-    help="Read-out, as a part of the frame time.",
-)
+@_detector("--bits", type=int, help="Bits of the converter, for whole ADU.", show_default="continuous values")
+@READOUT_FRACTION
 @option("--rows-per-block", type=int, default=4, help="Rows published together.")
-@option("--slots", type=int, default=4, help="Frames in the ring.")
-@option("--distinct", type=int, default=200, help="Frames simulated, then repeated.")
-@option("--frames", type=int, help="Stop after this number of frames.", show_default="at Ctrl-C")
+@SLOTS
+@option("--distinct", "n_distinct", type=int, default=200, help="Frames simulated, then repeated.")
+@FRAMES
 @option("--seed", type=click.IntRange(0), help="Seed of the simulation.", show_default="another each time")
-def camera(
-    config: str, name: str, frame_rate_hz: float, frames: int | None, slots: int, **options: Any
-) -> None:
+def camera(config: str, name: str, frames: int | None, slots: int, seed: int | None, **options: Any) -> None:
     """Simulate a camera that publishes frames row by row, for `faintspot realtime run`.
 
     Spots move about the centres of the sub-apertures; rows become readable one block after the other at the
@@ -134,46 +79,34 @@ def camera(
     from faintspot.simulate import Detector
 
     layout, known = Layout.load(config), Calibration.load(config)
-    dark = 0.0 if known.dark is None else float(np.nanmean(known.dark))
-
-    def given(option: str, otherwise: float) -> float:
-        value: float | None = options[option]
-        return otherwise if value is None else value
-
-    detector = Detector(
-        given("read_noise_e", 1.0 if known.read_noise_e is None else known.read_noise_e),
-        dark_e=options["dark_e"],
-        background_e=options["background_e"],
-        em_gain=given("em_gain", known.em_gain),
-        gain_e_per_adu=given("gain_e_per_adu", known.gain_e_per_adu),
-        offset_adu=given("offset_adu", dark),
-        bits=options["bits"],
-    )
+    values = {
+        "read_noise_e": 1.0 if known.read_noise_e is None else known.read_noise_e,
+        "em_gain": known.em_gain,
+        "gain_e_per_adu": known.gain_e_per_adu,
+        "offset_adu": 0.0 if known.dark is None else float(np.nanmean(known.dark)),
+    }
+    given = {option: options.pop(option) for option in (*values, "dark_e", "background_e", "bits")}
+    detector = Detector(**values | {option: value for option, value in given.items() if value is not None})
+    motion = SpotMotion(options.pop("motion_px"), options.pop("motion_time_s"))
     dtype = readout_type(detector)
     with PixelRing.create(name, layout.frame_shape, dtype, slots=slots) as ring:
-        source = Camera(
-            layout,
-            ring,
-            frame_rate_hz=frame_rate_hz,
-            flux_e=options["flux_e"],
-            detector=detector,
-            profile=options["profile"],
-            size=options["size"],
-            motion=SpotMotion(options["motion_px"], options["motion_time_s"]),
-            readout_fraction=options["readout_fraction"],
-            rows_per_block=options["rows_per_block"],
-            n_distinct=options["distinct"],
-            rng=np.random.default_rng(options["seed"]),
-        )
+        rng = np.random.default_rng(seed)
+        source = Camera(layout, ring, detector=detector, motion=motion, rng=rng, **options)
         rows, columns = layout.frame_shape
         click.echo(
             f"{name}: {rows} x {columns} pixels ({dtype}), {len(layout)} sub-apertures, "
-            f"{frame_rate_hz:g} frames/s; Ctrl-C stops"
+            f"{options['frame_rate_hz']:g} frames/s; Ctrl-C stops"
         )
         with stop_on_signal() as stop:
             report = source.run(frames, stop)
-    click.echo(
-        f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.overruns} overruns"
+    click.echo(f"{name}: {published(report)}")
+
+
+def published(report: CameraReport) -> str:
+    """Describe what a source of frames has published."""
+    return (
+        f"{report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.late} started late, "
+        f"{report.overruns} frame times without a frame"
     )
 
 

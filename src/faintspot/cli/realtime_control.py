@@ -1,4 +1,4 @@
-"""faintspot realtime status, get, set, stop, top: talking to a running engine."""
+"""faintspot realtime status, top, get, set, interleave, control and stop: requests to a running engine."""
 
 from __future__ import annotations
 
@@ -7,23 +7,34 @@ from typing import Any
 
 import click
 
-from faintspot.cli.commands import option
-from faintspot.cli.engine_requests import asked_at_length
+from faintspot.cli.commands import Group, option
+from faintspot.cli.engine_requests import (
+    as_text,
+    asked,
+    asked_at_length,
+    loop_in_words,
+    notes,
+    summary,
+)
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.cli.shared_options import ENGINE_NAME
-from faintspot.realtime.control import request
-from faintspot.realtime.private_socket import socket_path
+from faintspot.cli.shared_options import AS_JSON, ENGINE_NAME
+from faintspot.realtime.control import since
 
 _REFRESH_S = 0.5
+_LOOP_ACTIONS = {
+    "open": "Open the loop: the mirror keeps its commands.",
+    "close": "Close the loop, starting from the mirror's present commands.",
+    "flat": "Flatten the mirror while the loop is open.",
+}
 
 
 @click.command("status")
 @ENGINE_NAME
-@option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@AS_JSON
 def status(name: str, as_json: bool) -> None:
     """Show counters, latencies and the loop of a running engine."""
-    reply = _asked(name, "status")
-    click.echo(json.dumps(reply, indent=1) if as_json else summary(reply))
+    reply = asked(name, "status")
+    click.echo(as_text(reply) if as_json else summary(reply))
 
 
 @click.command("get")
@@ -34,7 +45,7 @@ def get(name: str, settings: tuple[str, ...]) -> None:
 
     Defaults are filled in; null is what is not used, or found from the PSF or each frame.
     """
-    for key, value in _asked(name, "get", names=list(settings) or None)["settings"].items():
+    for key, value in asked(name, "get", names=list(settings) or None)["settings"].items():
         click.echo(f"{key} = {json.dumps(value)}")
 
 
@@ -81,7 +92,7 @@ def interleave(name: str, methods: str, every: int) -> None:
 @ENGINE_NAME
 def stop_engine(name: str) -> None:
     """End a running engine."""
-    _asked(name, "stop")
+    asked(name, "stop")
 
 
 @click.command("top", short_help="Watch a running engine in the terminal.")
@@ -99,19 +110,16 @@ def _table(name: str) -> Any:
     """Everything that an engine says of itself, for the terminal."""
     from rich.table import Table
 
-    reply = _asked(name, "status")
+    reply = asked(name, "status")
     source, latency = reply["source"], reply["latency"]
     grid = Table(title=f"{name}: {reply['estimator']}", title_justify="left")
     grid.add_column("")
     grid.add_column("", justify="right")
     grid.add_row("source", "none" if source is None else f"process {source['pid']}, frame {source['frame']}")
-    for words in ("source_refused", "estimator_fault"):
-        if reply[words]:
-            grid.add_row(words.replace("_", " "), f"[bold red]{reply[words]}")
+    for title, text in notes(reply).items():
+        grid.add_row(title, text, style="bold red" if title != "preparing" else None)
     if len(reply["arms"]) > 1:
-        grid.add_row("arms in turn", ", ".join(reply["arms"]))
-    if reply["preparing"]:
-        grid.add_row("preparing", _preparing(reply["preparing"]))
+        grid.add_row("methods", ", ".join(reply["arms"]))
     if reply["loop"]["state"] != "none":
         grid.add_row("loop", loop_in_words(reply["loop"]).removeprefix("loop "))
     for estimator, file in reply["loaded"].items():
@@ -129,48 +137,45 @@ def _table(name: str) -> Any:
     return grid
 
 
-def since(frame: int | None) -> str:
-    """Describe from which frame on a change is in effect."""
-    return "taken at the next frame" if frame is None else f"in effect from frame {frame}"
+@click.group("control", cls=Group, short_help="Open or close the loop of a running engine.")
+def control() -> None:
+    """Open or close the loop of a running engine, whose configuration has [control].
+
+    While it is open, the mirror keeps its commands. A guard opens it when the slopes diverge or too many are
+    not valid; status says why.
+
+    \b
+    Examples:
+      faintspot realtime control close
+      faintspot realtime control gain 0.3
+    """
 
 
-def _asked(name: str, what: str, **fields: Any) -> dict[str, Any]:
-    """Ask the engine of that name."""
-    return request(socket_path(name), what, **fields)
+@control.command("status")
+@ENGINE_NAME
+@AS_JSON
+def loop_status(name: str, as_json: bool) -> None:
+    """Show whether the loop is closed, and if not, why."""
+    loop = asked(name, "loop", action="status")["loop"]
+    click.echo(as_text(loop) if as_json else loop_in_words(loop))
 
 
-def _preparing(change: dict[str, Any]) -> str:
-    return f"{', '.join(change['changes'])} (for {change['seconds']:.0f} s)"
+@control.command("gain")
+@ENGINE_NAME
+@click.argument("gain", type=float)
+def gain(name: str, gain: float) -> None:
+    """Change the loop gain from the next frame on."""
+    click.echo(loop_in_words(asked(name, "loop", action="gain", gain=gain)["loop"]))
 
 
-def loop_in_words(loop: dict[str, Any]) -> str:
-    """Describe the state of a loop."""
-    if loop["state"] == "none":
-        return "no loop: the engine makes no commands"
-    gain = "" if loop["gain"] is None else f", gain {loop['gain']:g}"
-    text = f"loop {loop['state']}: {loop['controller']}{gain}"
-    if loop["obstacle"]:
-        return f"{text}; {loop['obstacle']}"
-    if loop["opened_because"]:
-        return f"{text}; {loop['opened_because']}"
-    return f"{text}, slopes of {loop['residual_px']:.2f} px rms"
+def _add_action(action: str, text: str) -> None:
+    """Add a command that needs nothing but the engine's name."""
+
+    @control.command(action, help=text)
+    @ENGINE_NAME
+    def act(name: str) -> None:
+        click.echo(loop_in_words(asked(name, "loop", action=action)["loop"]))
 
 
-def summary(reply: dict[str, Any]) -> str:
-    """Summarise the counters and latencies of an engine."""
-    counters, latency = reply["counters"], reply["latency"]
-    lost = counters["dropped"] + counters["skipped"]
-    lines = f"{reply['name']}: {counters['processed']} frames measured, {lost} lost, {counters['late']} late"
-    for words in ("source_refused", "estimator_fault"):
-        if reply[words]:
-            lines += f"\n  {words.replace('_', ' ')}: {reply[words]}"
-    if reply["preparing"]:
-        lines += f"\n  preparing: {_preparing(reply['preparing'])}"
-    if reply["loop"]["state"] != "none":
-        lines += f"\n  {loop_in_words(reply['loop'])}"
-    if latency["count"]:
-        lines += (
-            f"\n  from the last row to the slopes: p50 {latency['p50_us']:.0f} us, "
-            f"p99 {latency['p99_us']:.0f}, p99.9 {latency['p99_9_us']:.0f}, largest {latency['max_us']:.0f}"
-        )
-    return lines
+for _action, _text in _LOOP_ACTIONS.items():
+    _add_action(_action, _text)

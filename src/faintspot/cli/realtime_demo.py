@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from faintspot.base.errors import MissingExtraError
 from faintspot.base.extras import present
 from faintspot.cli.commands import option
+from faintspot.cli.output import results_table
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.cli.shared_options import name_option
+from faintspot.cli.shared_options import PORT, name_option
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from faintspot.experiments.statistics import Estimate
     from faintspot.live_page.demonstration import ArmShown, Shown
 
@@ -38,7 +39,7 @@ _NEEDED = {"realtime": ("pyshmem",), "live": ("tornado", "zarr"), "loop": ("hcip
     default=60.0,
     help="Time for which the loop is closed; then there is a table.",
 )
-@option("--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free.")
+@PORT
 @option("--seed", type=click.IntRange(0), default=2015, help="Seed of the simulation.")
 def demo(
     name: str, output: str, flux_e: float, frame_rate_hz: float, seconds: float, port: int, seed: int
@@ -63,10 +64,8 @@ def demo(
 
 def arms_table(arms: list[ArmShown]) -> Table:
     """Return what every arm has done as a table."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("method", no_wrap=True)
-    for heading in ("Strehl ratio", f"over {arms[0].strehl.arm}", "p50", "p99", "frames"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    columns = ("Strehl ratio", f"over {arms[0].strehl.arm}", "p50", "p99", "frames")
+    table = results_table("method", *columns)
     for arm in arms:
         difference = arm.strehl.difference
         table.add_row(
@@ -78,7 +77,6 @@ def arms_table(arms: list[ArmShown]) -> Table:
             str(arm.frames),
         )
     table.caption = "Standard errors from blocks of turns; p50, p99 from the last row to the slopes, us."
-    table.caption_justify = "left"
     return table
 
 

@@ -7,8 +7,8 @@ import click
 from faintspot.base.errors import InputError
 from faintspot.cli.commands import option
 from faintspot.cli.engine_requests import asked_at_length
-from faintspot.cli.realtime_control import since
 from faintspot.cli.shared_options import ENGINE_NAME
+from faintspot.realtime.control import since
 
 _FILE = click.argument("file", metavar="FILE", type=click.Path(dir_okay=False, resolve_path=True))
 _USE = option("--use", is_flag=True, help="Measure with it from now on, as set estimator=NAME does.")
@@ -48,9 +48,6 @@ def unload(name: str, estimator: str) -> None:
     """Unload an estimator; where it is in use, the built-in estimator before takes over."""
     frame = asked_at_length(name, "unload", estimator=estimator)["frame"]
     click.echo(f"{estimator}: unloaded{'' if frame is None else f', {since(frame)}'}")
-
-
-COMMANDS = (load, swap, unload)
 
 
 def _load(name: str, command: str, file: str, use: bool) -> None:

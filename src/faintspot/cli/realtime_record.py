@@ -17,12 +17,7 @@ if TYPE_CHECKING:
     from faintspot.realtime.recorder import RecordingReport
 
 _MODES = click.Choice(["SCAO", "SLAO", "GLAO", "MOAO", "LTAO", "MCAO"])
-_AO_MODE = option(
-    "--ao-mode",
-    type=_MODES,
-    default="SCAO",
-    help="What an AOT file says the sensor serves.",
-)
+_AO_MODE = option("--ao-mode", type=_MODES, default="SCAO", help="What an AOT file says the sensor serves.")
 
 
 @needs("realtime", "zarr")
@@ -50,7 +45,7 @@ def record(out: Path, name: str, frames: int | None, seconds: float | None, ao_m
     if out.suffix not in (".zarr", ".fits"):
         raise InputError(f"{out}: expected a name that ends in .zarr or .fits")
     if out.suffix == ".fits" and out.exists():
-        raise InputError(f"{out}: exists already: choose another name")
+        raise InputError(f"{out}: already exists; choose another name")
     if out.suffix == ".fits":
         require("realtime", "aotpy", purpose="Writing an AOT file")
     store = out.with_suffix(".zarr")

@@ -11,11 +11,11 @@ from typing import Any
 import click
 
 from faintspot.cli.commands import option
+from faintspot.cli.engine_requests import summary
 from faintspot.cli.live import page_beside
 from faintspot.cli.needs import needs
 from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.cli.realtime_control import summary
-from faintspot.cli.shared_options import configuration_option, name_option
+from faintspot.cli.shared_options import FRAMES, configuration_option, name_option
 from faintspot.realtime.private_socket import socket_path
 
 
@@ -56,30 +56,27 @@ from faintspot.realtime.private_socket import socket_path
 @option("--no-control", is_flag=True, help="Compute no commands, although the configuration has [control].")
 @option(
     "--flux-frames",
+    "mean_flux",
     type=click.FloatRange(1),
     metavar="FRAMES",
     help="Give estimators the flux of every sub-aperture, averaged over this number of frames.",
 )
-@option(
-    "--frames", type=click.IntRange(1), help="Stop after this number of frames.", show_default="at Ctrl-C"
-)
+@FRAMES
 @option("--live", is_flag=True, help="Serve the web page as well: faintspot live.")
 def run(
     config: str,
     name: str,
     stream: str | None,
-    threads: int,
     cpus: str | None,
     priority: int,
     interleave: str | None,
     every: int,
     deadline_us: float,
-    images_every: int,
     close_loop: bool,
     no_control: bool,
-    flux_frames: float | None,
     frames: int | None,
     live: bool,
+    **options: Any,
 ) -> None:
     """Measure the frames of a pixel ring and publish their slopes until Ctrl-C.
 
@@ -109,20 +106,16 @@ def run(
     if close_loop and control is None:
         raise InputError(f"--close-loop: expected [control] in {config}, which says what makes commands")
     processors = parse_subapertures(cpus) if cpus else None
-    if control is not None:
-        control.check_fits(len(layout))
     engine = Engine(
         name,
         partial(_pipeline, layout, calibration, psf, score, None if control is None else control.reference),
         settings,
-        threads=threads,
         cpus=processors,
         source=None if stream is None else _followed(stream, name),
         interleaving=None if interleave is None else Interleaving.parse(interleave, every),
         deadline_s=deadline_us * 1e-6,
-        images_every=images_every,
         control=control,
-        mean_flux=flux_frames,
+        **options,
     )
     if engine.loop is not None and close_loop:
         engine.loop.close()

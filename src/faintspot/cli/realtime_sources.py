@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,23 +14,19 @@ from faintspot.base.errors import InputError
 from faintspot.cli.commands import option
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
-from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.cli.shared_options import name_option
+from faintspot.cli.realtime_camera import published, stop_on_signal
+from faintspot.cli.shared_options import FRAMES, KEY, SLOTS, name_option
 
 if TYPE_CHECKING:
-    from faintspot.realtime.bridge import BridgeCounters
     from faintspot.realtime.stream_out import StreamOut
 
 _HEAD_START_S = 0.5
 _DEFAULT_RATE_HZ = 500.0
-_ENDS_S = 5.0  # a thread looks at whether to stop many times a second
-_RING = name_option("Name of the pixel ring.")
-_SLOTS = option("--slots", type=int, default=4, help="Frames in the ring.")
 
 
 @click.command("replay", short_help="Publish recorded frames as a camera would.")
 @click.argument("frames", nargs=-1, required=True, metavar="FRAMES...")
-@_RING
+@name_option("Name of the pixel ring.")
 @option(
     "--frame-rate-hz",
     type=float,
@@ -43,20 +40,17 @@ _SLOTS = option("--slots", type=int, default=4, help="Frames in the ring.")
 )
 @option("--first", type=int, default=0, help="First frame, counted from 0.")
 @option(
-    "--frames", "count", type=int, metavar="N", help="Number of frames from there on.", show_default="all"
+    "--frames", "n_frames", type=int, metavar="N", help="Number of frames from there on.", show_default="all"
 )
-@option("--key", metavar="NAME", help="Which array to read of files that hold several.")
-@_SLOTS
+@KEY
+@SLOTS
 def replay(
     frames: tuple[str, ...],
     name: str,
     frame_rate_hz: float | None,
-    repeat: bool,
-    rows_per_block: int | None,
-    first: int,
-    count: int | None,
     key: str | None,
     slots: int,
+    **options: Any,
 ) -> None:
     """Publish recorded frames in the pixel ring NAME, for `faintspot realtime run`.
 
@@ -80,29 +74,20 @@ def replay(
     from faintspot.realtime.replay import Replay, ring_type
     from faintspot.realtime.scheduling import quick_switching
 
+    repeat = options["repeat"]
     waits = frame_rate_hz is None and not repeat
+    rate_hz = _DEFAULT_RATE_HZ if frame_rate_hz is None else frame_rate_hz
     with (
         stop_on_signal() as stop,
         quick_switching(),
         open_frames(frames, key=key) as source,
         PixelRing.create(name, source.shape, ring_type(source.dtype), slots=slots) as ring,
-        Replay(
-            source,
-            ring,
-            frame_rate_hz=_DEFAULT_RATE_HZ if frame_rate_hz is None else frame_rate_hz,
-            first=first,
-            n_frames=count,
-            repeat=repeat,
-            rows_per_block=rows_per_block,
-            waits=waits,
-        ) as player,
+        Replay(source, ring, frame_rate_hz=rate_hz, waits=waits, **options) as player,
     ):
         rows, columns = source.shape
         often = "repeatedly" if repeat else "once"
-        played = count or source.n_frames - first
-        pace = (
-            "every one measured by an engine" if waits else f"{frame_rate_hz or _DEFAULT_RATE_HZ:g} frames/s"
-        )
+        played = options["n_frames"] or source.n_frames - options["first"]
+        pace = "every one measured by an engine" if waits else f"{rate_hz:g} frames/s"
         click.echo(
             f"{name}: {rows} x {columns} pixels ({source.dtype} as {ring.dtype}), {played} frames of "
             f"{source.description} {often}, {pace}; Ctrl-C stops"
@@ -110,32 +95,22 @@ def replay(
         if not waits:
             stop.wait(_HEAD_START_S)
         with progress_bar("replay") if not repeat else nullcontext() as advance:
-            report = player.run(None, stop, _telling(advance, played))
-    click.echo(
-        f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.late} started late, "
-        f"{report.overruns} frame times without a frame, {player.lost} not measured in time"
-    )
+            report = player.run(None, stop, None if advance is None else lambda done: advance(done, played))
+    click.echo(f"{name}: {published(report)}, {player.lost} not measured in time")
     if waits and report.frames < played and not stop.is_set():
         click.echo(f"{name}: the engine ended before the last {played - report.frames} frames", err=True)
-
-
-def _telling(advance: Callable[[int, int], None] | None, total: int) -> Callable[[int], None] | None:
-    """Return what tells a progress bar the number of frames."""
-    return None if advance is None else lambda published: advance(published, total)
 
 
 @needs("realtime", "pyshmem")
 @click.command("bridge", short_help="Connect the engine with other software's streams.")
 @click.argument("stream", required=False)
-@option("--from", "source", metavar="STREAM", help="Frames: a pyshmem stream, isio:NAME or dao:FILE.")
 @option("--to", "slopes", metavar="STREAM", help="Publish the slopes as isio:NAME or dao:FILE.")
 @option("--commands-to", "commands", metavar="STREAM", help="Publish the commands as isio:NAME or dao:FILE.")
 @name_option("Name of the pixel ring and of the engine's streams.")
-@option("--frames", type=int, metavar="N", help="Stop after this number of frames.", show_default="at Ctrl-C")
-@_SLOTS
+@FRAMES
+@SLOTS
 def bridge(
     stream: str | None,
-    source: str | None,
     slopes: str | None,
     commands: str | None,
     name: str,
@@ -144,7 +119,7 @@ def bridge(
 ) -> None:
     """Connect `faintspot realtime run` with other software's streams in shared memory.
 
-    Frames of STREAM (or --from) go into the pixel ring NAME; with --to and --commands-to the engine's slopes
+    Frames of STREAM go into the pixel ring NAME; with --to and --commands-to the engine's slopes
     (all x, then all y, px) and commands come out. Streams are pyshmem's (frames only), isio:NAME of
     ImageStreamIO (milk, cacao) in $MILK_SHM_DIR, /milk/shm or /tmp, or dao:FILE.
 
@@ -156,14 +131,11 @@ def bridge(
     \b
     Examples, for pyRTC's frames, and for a loop of cacao's:
       faintspot realtime bridge wfs_raw
-      faintspot realtime bridge --from isio:wfsim --to isio:wfsim_slopes
+      faintspot realtime bridge isio:wfsim --to isio:wfsim_slopes
     """
-    if stream and source:
-        raise InputError(f"--from {source}: expected it or STREAM, got {stream} as well")
-    source = stream or source
-    if not (source or slopes or commands):
-        raise InputError("bridge: expected a stream of frames, --to or --commands, got none")
-    if frames is not None and not source:
+    if not (stream or slopes or commands):
+        raise InputError("bridge: expected a stream of frames, --to or --commands-to, got none")
+    if frames is not None and not stream:
         raise InputError("--frames: expected a stream of frames, got none")
     from faintspot.realtime.bridge import StreamBridge
     from faintspot.realtime.scheduling import quick_switching
@@ -177,56 +149,32 @@ def bridge(
         for what, target in (("slopes", slopes), ("commands", commands))
         if target
     }
-    counters = None
-    with stop_on_signal() as stop, quick_switching() if outs else nullcontext():
-        if source and not outs:
-            counters = StreamBridge(source, name, say=say, slots=slots).run(frames, stop)
+    spins = False if outs else None  # the outputs need processors, too
+    with stop_on_signal() as stop, quick_switching() if outs else nullcontext(), _running(outs, stop):
+        if stream:
+            counters = StreamBridge(stream, name, say=say, slots=slots, spins=spins).run(frames, stop)
         else:
-            counters = _both_ways(source, name, say, slots, frames, list(outs.values()), stop)
-    if counters is not None:
+            stop.wait()
+    if stream:
         say(
-            f"{counters.frames} frames, {counters.missed} missed, {counters.incomplete} incomplete, "
+            f"{counters.taken} frames, {counters.missed} missed, {counters.incomplete} incomplete, "
             f"{counters.not_ahead} with a number not ahead; {counters.stalls} stalls, "
             f"{counters.restarts} restarts of the stream"
         )
     for what, out in outs.items():
-        say(f"{out.published} times {what}, {out.missed} missed")
+        say(f"{out.counters.taken} times {what}, {out.counters.missed} missed")
 
 
-def _both_ways(
-    source: str | None,
-    name: str,
-    say: Callable[[str], None],
-    slots: int,
-    frames: int | None,
-    outs: list[StreamOut],
-    stop: threading.Event,
-) -> BridgeCounters | None:
-    """Frames in by this thread, if there are any, the rest by a thread each; the first error ends all."""
-    from faintspot.realtime.bridge import StreamBridge
-
-    errors: list[Exception] = []
-
-    def run(out: StreamOut) -> None:
+@contextmanager
+def _running(outs: Mapping[str, StreamOut], stop: threading.Event) -> Iterator[None]:
+    """Run each output in a thread of its own until `stop` is set; the first error sets it and is raised."""
+    with ThreadPoolExecutor(max(len(outs), 1)) as threads:
+        runs = [threads.submit(out.run, stop) for out in outs.values()]
+        for each in runs:
+            each.add_done_callback(lambda _: stop.set())
         try:
-            out.run(stop)
-        except Exception as error:
-            errors.append(error)
+            yield
+        finally:
             stop.set()
-
-    threads = [threading.Thread(target=run, args=(out,), daemon=True) for out in outs]
-    for thread in threads:
-        thread.start()
-    counters = None
-    try:
-        if source is None:
-            stop.wait()
-        else:
-            counters = StreamBridge(source, name, say=say, slots=slots, spins=False).run(frames, stop)
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join(_ENDS_S)
-    if errors:
-        raise errors[0]
-    return counters
+    for each in runs:
+        each.result()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from typing import Any
 
 import click
 
 from faintspot.cli.commands import Group, option
-from faintspot.cli.realtime_camera import stop_on_signal
-from faintspot.cli.shared_options import name_option
-from faintspot.realtime.control import request
+from faintspot.cli.engine_requests import as_text
+from faintspot.cli.realtime_camera import published, stop_on_signal
+from faintspot.cli.shared_options import AS_JSON, FRAMES, READOUT_FRACTION, SLOTS, name_option
+from faintspot.realtime.control import request, since
 from faintspot.realtime.private_socket import TELESCOPE, socket_path
 
 _NAME = name_option("Name of the telescope.")
@@ -35,12 +35,7 @@ def telescope() -> None:
     metavar="KIND",
     help="Control that --write-config prepares: integrator; modal, polc or kalman, which learn for a minute.",
 )
-@option(
-    "--readout-fraction",
-    type=float,
-    default=0.8,
-    help="Read-out, as a part of the frame time.",
-)
+@READOUT_FRACTION
 @option(
     "--rows-per-block",
     type=int,
@@ -48,8 +43,8 @@ def telescope() -> None:
     help="Rows published together.",
     show_default="a sub-aperture's",
 )
-@option("--slots", type=int, default=4, help="Frames in the ring.")
-@option("--frames", type=int, metavar="N", help="Stop after this number of frames.", show_default="at Ctrl-C")
+@SLOTS
+@FRAMES
 @option(
     "--seed", type=click.IntRange(0), help="Seed of turbulence and noise.", show_default="the configuration's"
 )
@@ -104,10 +99,7 @@ def run(
                 "frames/s; Ctrl-C stops"
             )
             report = simulated.run(frames, stop)
-    click.echo(
-        f"{name}: {report.frames} frames, {report.frame_rate_hz:.1f} frames/s, {report.late} started late, "
-        f"{report.overruns} frame times without a frame"
-    )
+    click.echo(f"{name}: {published(report)}")
 
 
 @telescope.command("set", short_help="Change the star or the turbulence.")
@@ -130,19 +122,17 @@ def telescope_set(name: str, changes: tuple[str, ...]) -> None:
     from faintspot.config.written_changes import parse_changes
 
     reply = request(socket_path(name, TELESCOPE), "set", changes=parse_changes(changes))
-    frame, conditions = reply["frame"], reply["conditions"]
-    first = "taken at the next exposure" if frame is None else f"in effect from frame {frame}"
-    click.echo(f"{first}: {_in_words(conditions)}")
+    click.echo(f"{since(reply['frame'])}: {_in_words(reply['conditions'])}")
 
 
 @telescope.command("status", short_help="Show what the telescope sees, and whether it keeps its pace.")
 @_NAME
-@option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@AS_JSON
 def telescope_status(name: str, as_json: bool) -> None:
     """Show what the telescope sees, and whether it keeps its pace."""
     reply = request(socket_path(name, TELESCOPE), "status")
     if as_json:
-        click.echo(json.dumps(reply, indent=1))
+        click.echo(as_text(reply))
         return
     commands, truth = reply["commands"], reply["truth"]
     click.echo(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import click
+
 from faintspot.cli.commands import option
 
 Option = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -21,6 +23,28 @@ def name_option(what: str) -> Option:
 
 
 ENGINE_NAME = name_option("Name of the engine.")
+AS_JSON = option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+KEY = option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+FRAMES = option(
+    "--frames", type=click.IntRange(1), help="Stop after this number of frames.", show_default="at Ctrl-C"
+)
+SLOTS = option("--slots", type=int, default=4, help="Frames in the ring.")
+READOUT_FRACTION = option(
+    "--readout-fraction",
+    type=float,
+    metavar="PART",
+    default=0.8,
+    help="Read-out, as a part of the frame time.",
+)
+PORT = option(
+    "--port", type=click.IntRange(0, 65535), default=8642, help="Port of the page; 0: any that is free."
+)
+WORKERS = option(
+    "--workers",
+    type=click.IntRange(0),
+    help="Processes on this machine; 0: this process alone.",
+    show_default="all processors",
+)
 PIXEL_SCALE = option(
     "--pixel-scale-arcsec",
     type=float,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -11,7 +12,7 @@ from faintspot.base.errors import InputError, MissingExtraError
 from faintspot.base.flags import SubapertureFlag
 from faintspot.cli.commands import option
 from faintspot.cli.progress import progress_bar
-from faintspot.cli.shared_options import REFERENCE, configuration_option
+from faintspot.cli.shared_options import KEY, REFERENCE, configuration_option
 from faintspot.config.presets import PRESETS
 from faintspot.config.written_changes import parse_changes
 from faintspot.io.formats import slope_format
@@ -34,7 +35,7 @@ from faintspot.recorded import Summary, measure_recorded
 @option(
     "--set", "changes", metavar="NAME=VALUE", multiple=True, help="An option of the estimator; several times."
 )
-@option("--no-denoise", is_flag=True, help="Switch the denoising off: the other arm of a comparison.")
+@option("--no-denoise", is_flag=True, help="Switch the denoising off: the other method of a comparison.")
 @option(
     "--preset",
     type=click.Choice(PRESETS),
@@ -56,10 +57,11 @@ from faintspot.recorded import Summary, measure_recorded
     "faint stars.",
 )
 @REFERENCE
-@option("--key", metavar="NAME", help="Which array to read of files that hold several.")
+@KEY
 @option("--threads", type=click.IntRange(1), help="Most threads to use.", show_default="all processors")
 @option(
     "--block",
+    "block_frames",
     type=click.IntRange(1),
     metavar="FRAMES",
     help="Frames in memory at a time.",
@@ -73,15 +75,7 @@ def command(
     estimator: str | None,
     changes: tuple[str, ...],
     no_denoise: bool,
-    preset: str | None,
-    device: str,
-    unit: str,
-    mean_flux: bool,
-    reference: str | None,
-    key: str | None,
-    threads: int | None,
-    block: int | None,
-    overwrite: bool,
+    **options: Any,
 ) -> None:
     """Turn recorded frames into slopes.
 
@@ -107,26 +101,11 @@ def command(
     _check_format(output)
     for name in frames:
         split_location(name)  # refuses what is not there
+    changed = {} if estimator is None else {"estimator": estimator}
+    changed |= parse_changes(changes) if changes else {}
     with progress_bar("slopes") as advance:
         summary = measure_recorded(
-            frames,
-            config,
-            output,
-            changes={
-                **({} if estimator is None else {"estimator": estimator}),
-                **(parse_changes(changes) if changes else {}),
-            },
-            denoise=not no_denoise,
-            preset=preset,
-            device=device,
-            unit=unit,
-            mean_flux=mean_flux,
-            reference=reference,
-            key=key,
-            threads=threads,
-            block_frames=block,
-            overwrite=overwrite,
-            progress=advance,
+            frames, config, output, changes=changed, denoise=not no_denoise, progress=advance, **options
         )
     for line in describe(summary, output):
         click.echo(line)

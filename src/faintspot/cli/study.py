@@ -12,6 +12,7 @@ from faintspot.base.files import derived
 from faintspot.cli.commands import Group, option
 from faintspot.cli.needs import needs
 from faintspot.cli.progress import progress_bar
+from faintspot.cli.shared_options import WORKERS
 
 if TYPE_CHECKING:
     import xarray
@@ -23,13 +24,7 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that say where and how a study runs."""
     for each in (
         option("--overwrite", is_flag=True, help="Replace the store of another study."),
-        option(
-            "--workers",
-            type=click.IntRange(0),
-            metavar="N",
-            help="Processes on this machine; 0: this process alone.",
-            show_default="all processors",
-        ),
+        WORKERS,
         option(
             "--scheduler",
             metavar="ADDRESS",
@@ -64,13 +59,7 @@ def command() -> None:
     "--output", "-o", metavar="ZARR", help="Where results go.", show_default="the TOML file's name with .zarr"
 )
 @_run_options
-def run(
-    specification: str,
-    output: str | None,
-    scheduler: str | None,
-    workers: int | None,
-    overwrite: bool,
-) -> None:
+def run(specification: str, output: str | None, **where: Any) -> None:
     """Run a study of your own.
 
     TOML lists what is varied (flux, read noise, spot size and shape, elongation, sub-aperture size, range of
@@ -88,7 +77,7 @@ def run(
 
     described = StudySpecification.from_file(specification)
     target = output or str(derived(specification, ".zarr"))
-    _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
+    _measure(described, target, **where)
     click.echo(f"Next: faintspot report {shlex.quote(target)}")
 
 
@@ -106,14 +95,7 @@ def run(
     show_default="paper.zarr, or paper-quick.zarr and the like",
 )
 @_run_options
-def paper(
-    quick: bool,
-    figures: tuple[str, ...],
-    output: str | None,
-    scheduler: str | None,
-    workers: int | None,
-    overwrite: bool,
-) -> None:
+def paper(quick: bool, figures: tuple[str, ...], output: str | None, **where: Any) -> None:
     """Repeat the study of Basden et al. 2015 (arXiv:1503.06043).
 
     Every figure of the paper and a verdict on every claim, with error bars, in one report page beside the
@@ -126,14 +108,9 @@ def paper(
       faintspot study paper --figure fig4 --figure fig6
     """
     from faintspot.experiments.built_in_studies import paper_study
-    from faintspot.experiments.study_page import write_study_report
 
-    described = paper_study(quick, figures or None)
     target = output or "-".join(["paper", *(["quick"] if quick else []), *figures]) + ".zarr"
-    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
-    page = derived(target, ".html")
-    write_study_report(results, page)
-    click.echo(f"{page}: open it in a browser")
+    _measure_and_report(paper_study(quick, figures or None), target, where)
 
 
 @needs("study", "xarray", "zarr", "matplotlib", "jinja2")
@@ -147,13 +124,7 @@ def paper(
     show_default="estimators.zarr, or estimators-quick.zarr",
 )
 @_run_options
-def estimators(
-    quick: bool,
-    output: str | None,
-    scheduler: str | None,
-    workers: int | None,
-    overwrite: bool,
-) -> None:
+def estimators(quick: bool, output: str | None, **where: Any) -> None:
     """Compare all estimators with each other and with the Cramer-Rao bound.
 
     Photon efficiency, gain and outliers over signal and read noise, for round and elongated spots, and the
@@ -165,13 +136,17 @@ def estimators(
       faintspot study estimators -o estimators.zarr
     """
     from faintspot.experiments.built_in_studies import estimators_study
+
+    target = output or f"estimators{'-quick' if quick else ''}.zarr"
+    _measure_and_report(estimators_study(quick), target, where)
+
+
+def _measure_and_report(described: StudySpecification, target: str, where: dict[str, Any]) -> None:
+    """Run a study and write its page beside the store."""
     from faintspot.experiments.study_page import write_study_report
 
-    described = estimators_study(quick)
-    target = output or f"estimators{'-quick' if quick else ''}.zarr"
-    results = _measure(described, target, scheduler=scheduler, workers=workers, overwrite=overwrite)
     page = derived(target, ".html")
-    write_study_report(results, page)
+    write_study_report(_measure(described, target, **where), page)
     click.echo(f"{page}: open it in a browser")
 
 

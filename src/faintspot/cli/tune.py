@@ -9,17 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.cli.commands import SectionedCommand, option
 from faintspot.cli.layout_options import grid_shape
 from faintspot.cli.needs import suggested_slopes
+from faintspot.cli.output import check_target, picture_file, results_table, wrapped, write_picture
 from faintspot.cli.progress import progress_bar
-from faintspot.cli.tune_output import check_target, picture_file, wrapped, write_picture
 from faintspot.experiments import answer_text
 from faintspot.experiments.question import PROFILES, TABLES, read_camera
 from faintspot.io.frames import open_frames
@@ -34,6 +32,7 @@ from faintspot.simulate.photometry import (
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from rich.table import Table
 
     from faintspot.experiments.answer import Answer
     from faintspot.experiments.question import Question
@@ -141,7 +140,7 @@ def command(
     """
     target = Path(output)
     check_target(target, overwrite)
-    drawing = picture_file(target, picture)
+    drawing = picture_file(target, picture, "-tune.png")
     given = _given(camera, options)
     known = _sensor(grid, layout_file, target, given)
     given = {**known, **given, **({"layout": known["layout"]} if grid or layout_file else {})}
@@ -165,11 +164,9 @@ def command(
 
 def answer_table(answer: Answer) -> Table:
     """Return the errors of all arms at the star's flux as a table."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("estimator", ratio=1)  # long names wrap, numbers do not
     recorded = ["recorded"] if answer.promises else []
-    for heading in ("R (px)", "gain", "rms/gain", *recorded, "outliers", "cost", "mag saved"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    headings = ("R (px)", "gain", "rms/gain", *recorded, "outliers", "cost", "mag saved")
+    table = results_table("estimator", *headings, wraps=True)
     for result in answer.results:
         found, is_reference = result.statistics, result.arm.name == answer_text.BRIGHTEST
         table.add_row(
@@ -191,7 +188,6 @@ def answer_table(answer: Answer) -> Table:
         "outliers: error above 1 px. cost: 1 is TV with 20 iterations. mag saved: against brightest "
         "pixels, by R."
     )
-    table.caption_justify = "left"
     return table
 
 

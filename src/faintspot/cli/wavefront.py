@@ -11,11 +11,10 @@ import click
 from faintspot.base.errors import InputError
 from faintspot.base.extras import require
 from faintspot.cli.commands import SectionedCommand, option
-from faintspot.cli.needs import can_make
+from faintspot.cli.output import picture_file, write_picture
 from faintspot.cli.shared_options import DIAMETER, PIXEL_SCALE, SUBAPERTURE
 from faintspot.pipeline.slopes import Slopes
 from faintspot.recorded.stored_run import open_run
-from faintspot.sensor.layout import Layout
 from faintspot.wavefront import Wavefront, fit_wavefront, save_wavefront
 from faintspot.wavefront.files import check_ending
 from faintspot.wavefront.words import mode_table, remarks, rms_table
@@ -42,13 +41,7 @@ from faintspot.wavefront.words import mode_table, remarks, rms_table
 @SUBAPERTURE
 @DIAMETER
 def command(
-    slopes: str,
-    output: tuple[str, ...],
-    picture: str | None,
-    modes: int | None,
-    pixel_scale_arcsec: float | None,
-    subaperture_m: float | None,
-    diameter_m: float | None,
+    slopes: str, output: tuple[str, ...], picture: str | None, modes: int | None, **scales: float | None
 ) -> None:
     """Fit Zernike modes (Noll's order) to slopes, and draw the wavefront.
 
@@ -65,17 +58,12 @@ def command(
         check_ending(Path(name))
         if Path(name).suffix.lower() == ".fits":
             require("io", "astropy", purpose="Writing a FITS file")
-    with_picture = can_make("picture", "web", "matplotlib", asked=picture is not None)
+    drawing = picture_file(Path(slopes), picture, "_wavefront.png")
     run = open_run(Path(slopes))
     if run.layout is None:
         raise InputError(f"{slopes}: expected slopes with their layout ({' '.join(run.notes)})")
-    given = {
-        "pixel_scale_arcsec": pixel_scale_arcsec,
-        "subaperture_m": subaperture_m,
-        "diameter_m": diameter_m,
-    }
-    scales: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    layout = replace(run.layout, **scales)
+    given: dict[str, Any] = {name: value for name, value in scales.items() if value is not None}
+    layout = replace(run.layout, **given)
     try:
         wavefront = fit_wavefront(Slopes.from_variables(run.stored.variables), layout, modes=modes)
     except InputError as error:
@@ -86,8 +74,10 @@ def command(
     for name in output:
         save_wavefront(name, wavefront)
         click.echo(name)
-    if with_picture:
-        click.echo(_draw(wavefront, layout, Path(slopes), picture))
+    if drawing is not None:
+        from faintspot.wavefront.figure import wavefront_figure
+
+        write_picture(wavefront_figure(wavefront, layout, Path(slopes).name).figure, drawing)
 
 
 def _print(wavefront: Wavefront) -> None:
@@ -106,14 +96,3 @@ def _print(wavefront: Wavefront) -> None:
         console.print()
     for line in remarks(wavefront):
         click.echo(line)
-
-
-def _draw(wavefront: Wavefront, layout: Layout, slopes: Path, picture: str | None) -> str:
-    """Draw it and say where."""
-    from faintspot.base.files import derived, write_atomically
-    from faintspot.report.drawing import png
-    from faintspot.wavefront.figure import wavefront_figure
-
-    path = picture or str(derived(slopes, "_wavefront.png"))
-    write_atomically(path, png(wavefront_figure(wavefront, layout, slopes.name).figure))
-    return f"picture: {path}"

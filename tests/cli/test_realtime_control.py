@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from faintspot.cli.realtime_control import summary
-from faintspot.cli.realtime_control_loop import control
+from faintspot.cli.engine_requests import summary
+from faintspot.cli.realtime_control import control
 from faintspot.cli.realtime_run import run
 from faintspot.control.configuration import Control
 from faintspot.realtime.commands import commands_of
@@ -36,10 +36,11 @@ def said(*arguments: str) -> str:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    made = Bench(f"fs_test_{uuid4().hex[:12]}", control=Control(MATRIX))
-    with ControlServer(socket_path(made.name), commands_of(made.engine)):
+    with (
+        Bench(control=Control(MATRIX)) as made,
+        ControlServer(socket_path(made.name), commands_of(made.engine)),
+    ):
         yield made
-    made.close()
 
 
 def test_the_loop_by_the_command_line(bench: Bench) -> None:
@@ -48,10 +49,7 @@ def test_the_loop_by_the_command_line(bench: Bench) -> None:
     assert said("close", *name).startswith("loop closed: integrator, gain 0.4, slopes of")
     assert "gain 0.25" in said("gain", *name, "0.25")
     assert "gain = 2.5: expected a number from 0 to 2" in said("gain", *name, "2.5")
-    with bench.ring() as ring:
-        bench.attached()
-        for number, frame in enumerate(simulated(3)):
-            bench.send(ring, number, frame)
+    bench.measure(simulated(3))
     assert "expected it open to flatten the mirror" in said("flat", *name)
     assert said("open", *name) == "loop open: integrator, gain 0.25; asked to\n"
     assert said("flat", *name) == said("status", *name)
@@ -63,12 +61,10 @@ def test_the_loop_by_the_command_line(bench: Bench) -> None:
 
 
 def test_an_engine_without_control() -> None:
-    bench = Bench(f"fs_test_{uuid4().hex[:12]}")
-    with ControlServer(socket_path(bench.name), commands_of(bench.engine)):
+    with Bench() as bench, ControlServer(socket_path(bench.name), commands_of(bench.engine)):
         assert said("status", "--name", bench.name) == "no loop: the engine makes no commands\n"
         assert "add [control] to its configuration" in said("close", "--name", bench.name)
-    assert "loop" not in summary(bench.engine.status())
-    bench.close()
+        assert "loop" not in summary(bench.engine.status())
 
 
 @pytest.mark.parametrize(
