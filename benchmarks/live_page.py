@@ -82,9 +82,9 @@ async def _turns(
         arm = "watched" if turn % 2 else "alone"
         os.kill(server.pid, signal.SIGCONT if arm == "watched" else signal.SIGSTOP)
         await asyncio.sleep(0.5)  # the page takes up what it missed
-        before, cursor = sum(counts), reader.newest
+        before, cursor = sum(counts), reader.records.written
         await asyncio.sleep(TURN_S)
-        records, _, _ = reader.records_since(cursor)
+        records, _, _ = reader.records.since(cursor)
         found[arm].append((records["published_time_ns"] - records["last_row_time_ns"]) / 1e3)
         if arm == "watched":
             watched_s += TURN_S

@@ -24,7 +24,7 @@ from tests.realtime.bench import Bench, simulated
 from faintspot.base.checks import number_between
 from faintspot.io.telemetry import read_telemetry
 from faintspot.live_page.server import LiveServer
-from faintspot.live_page.serving import serve_engine, serve_recording
+from faintspot.live_page.serving import serve
 from faintspot.realtime.commands import LENGTHY, commands_of
 from faintspot.realtime.control import ControlServer
 from faintspot.realtime.private_socket import socket_path
@@ -91,8 +91,8 @@ def served(serve: Callable[..., None], *arguments: Any, **options: Any) -> Itera
 
     thread = threading.Thread(target=serve, args=(*arguments, stop, note), kwargs={"port": 0, **options})
     thread.start()
-    assert ready.wait(30)
     try:
+        assert ready.wait(30)
         yield found[0]
     finally:
         stop.set()
@@ -122,7 +122,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(engine: Running, folder: Path) -> Iterator[LiveServer]:
-    with served(serve_engine, engine.name, folder=folder) as server:
+    with served(serve, engine.name, folder=folder) as server:
         yield server
 
 
@@ -277,7 +277,7 @@ def test_without_the_token_one_may_only_watch(open_page: Any, server: LiveServer
 
 
 def test_private_page_shows_nothing_before_the_token(open_page: Any, engine: Running, tmp_path: Path) -> None:
-    with served(serve_engine, engine.name, folder=tmp_path, private=True) as server:
+    with served(serve, engine.name, folder=tmp_path, private=True) as server:
         page = open_page(server.url.partition("#")[0], drawn=False)
         page.locator("#token-error").filter(has_text="needs the token").wait_for()
         assert page.locator("#tiles dd").count() == 0
@@ -325,7 +325,7 @@ def test_everything_is_reached_by_keyboard_and_has_a_name(open_page: Any, server
 
 
 def test_engine_that_is_not_there_is_waited_for(open_page: Any, tmp_path: Path) -> None:
-    with served(serve_engine, "fs_test_nobody", folder=tmp_path) as server:
+    with served(serve, "fs_test_nobody", folder=tmp_path) as server:
         page = open_page(server.url)
         page.locator("#state").filter(has_text="waiting for the engine fs_test_nobody").wait_for()
 
@@ -334,7 +334,7 @@ def test_recording_is_played(open_page: Any, engine: Running, tmp_path: Path) ->
     path = tmp_path / "night.zarr"
     assert Recorder(engine.name, path).run(n_frames=200, seconds=60).ended_because == "frames"
     night = read_telemetry(path)
-    with served(serve_recording, path) as server:
+    with served(serve, path) as server:
         page = open_page(server.url)
         page.locator("#player").wait_for()
         assert page.locator("#settings-form").is_hidden()

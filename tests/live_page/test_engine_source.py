@@ -10,7 +10,6 @@ pytest.importorskip("pyshmem")
 from tests.realtime.telemetry_cases import LAYOUT, as_written, write, write_images
 
 from faintspot.live_page.engine_source import EngineSource
-from faintspot.live_page.streams import NewestOfStream
 from faintspot.realtime.shared_streams import create_stream
 from faintspot.realtime.telemetry import TelemetryRing
 from faintspot.realtime.telescope import TRUTH
@@ -68,8 +67,7 @@ def test_page_that_was_too_slow_says_what_it_missed(name: str) -> None:
     source.close()
 
 
-def test_truth_and_commands_of_streams(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.live_page.streams._LOOK_S", 0.0)
+def test_truth_and_commands_of_streams(name: str) -> None:
     source = EngineSource(name)
     with TelemetryRing.create(name, LAYOUT):
         truth, commands = (
@@ -90,19 +88,3 @@ def test_truth_and_commands_of_streams(name: str, monkeypatch: pytest.MonkeyPatc
         truth.unlink()
         commands.unlink()
     source.close()
-
-
-def test_stream_that_is_made_anew_with_another_length(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("faintspot.live_page.streams._LOOK_S", 0.0)
-    newest = NewestOfStream(name)
-    assert newest.take() is None
-    for length in (2, 5):
-        stream = create_stream(name, (length,))
-        stream.write(np.ones(length), frame_id=length)
-        taken = newest.take()
-        assert taken is not None
-        assert (taken[0], len(taken[1])) == (length, length)
-        assert newest.take() is None
-        stream.unlink()
-    assert newest.take() is None
-    newest.close()

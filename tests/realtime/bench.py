@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterable
 from typing import Any
 from uuid import uuid4
 
@@ -13,6 +14,7 @@ from tests.patience import LIMIT_S
 from tests.simulated import frames_of
 
 import faintspot as fs
+from faintspot.base.closing import Closing
 from faintspot.realtime.engine import Engine
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.telemetry import TelemetryReader
@@ -37,18 +39,20 @@ def simulated(n: int) -> NDArray[np.uint16]:
     return np.asarray(frames, np.uint16)
 
 
-class Bench:
+class Bench(Closing):
     """Every frame that the engine measures is in `records`, in the order in which it was measured."""
 
     def __init__(self, name: str | None = None, **options: Any) -> None:
         self.name = name or f"fs_test_{uuid4().hex[:12]}"
+        self._ring: PixelRing | None = None
         self.engine = Engine(self.name, make, SETTINGS, **options)
         self._thread = threading.Thread(target=self.engine.run)
         self.telemetry = TelemetryReader.attach(self.name)
         self._thread.start()
 
     def ring(self, dtype: Any = np.uint16, shape: tuple[int, int] = LAYOUT.frame_shape) -> PixelRing:
-        return PixelRing.create(self.name, shape, dtype)
+        self._ring = PixelRing.create(self.name, shape, dtype)
+        return self._ring
 
     def until(self, condition: Any) -> None:
         end = time.monotonic() + LIMIT_S
@@ -72,9 +76,16 @@ class Bench:
         ring.end()
         self.until(lambda: self.engine.counters.frames_in > before)
 
+    def measure(self, frames: NDArray[Any], numbers: Iterable[int] | None = None) -> None:
+        """Send frames one after another through a ring of their own."""
+        with self.ring(frames.dtype) as ring:
+            self.attached()
+            for number, frame in zip(numbers or range(len(frames)), frames, strict=True):
+                self.send(ring, number, frame)
+
     @property
     def records(self) -> NDArray[Any]:
-        return self.telemetry.records_since(0)[0]
+        return self.telemetry.records.since(0)[0]
 
     @property
     def slopes(self) -> dict[int, NDArray[np.float32]]:
@@ -84,4 +95,6 @@ class Bench:
     def close(self) -> None:
         self.engine.stop()
         self._thread.join(LIMIT_S)
+        if self._ring is not None:
+            self._ring.close()
         assert not self._thread.is_alive()

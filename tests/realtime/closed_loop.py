@@ -116,7 +116,7 @@ class Sky:
     def records(self) -> Any:
         """All that the engine has recorded."""
         assert self.running is not None
-        return self.running.telemetry.records_since(0)[0]
+        return self.running.telemetry.records.since(0)[0]
 
     @property
     def loop(self) -> ControlLoop:

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import multiprocessing.process
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import faintspot
 
 SOURCE = str(Path(faintspot.__file__).parents[1])
+
+
+@contextmanager
+def process(target: Callable[..., None], *arguments: Any) -> Iterator[multiprocessing.process.BaseProcess]:
+    """Run a function in a process of its own, which is killed at the end if it has not ended."""
+    started = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
+    started.start()
+    try:
+        yield started
+    finally:
+        started.kill()
+        started.join()
+        started.close()
 
 
 def start(code: str, *arguments: str, **options: Any) -> subprocess.Popen[str]:

@@ -17,9 +17,8 @@ def bench() -> Iterator[object]:
     pytest.importorskip("pyshmem")
     from tests.realtime.bench import Bench
 
-    bench = Bench()
-    yield bench
-    bench.close()
+    with Bench() as bench:
+        yield bench
 
 
 @pytest.fixture

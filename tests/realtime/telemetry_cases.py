@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -68,6 +68,13 @@ class Engine(threading.Thread):
                 write_images(self.ring, self.frames)
                 self.ring.write_change(self.frames, self.frames // 10, {"noise_std": 2.5}, None)
             self.frames += 1
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     def stop(self) -> None:
         """End it and its telemetry."""

@@ -86,7 +86,7 @@ def test_frames_arrive(name: str, running: Running, dtype: str, notify: bool) ->
         stream.write(frame(number, dtype))
         wait_for(lambda number=number: ring.last_row_time_ns(number))
         np.testing.assert_array_equal(ring.slot(number), frame(number, dtype))
-    assert (running.counters.frames, running.counters.missed, running.counters.not_ahead) == (20, 0, 0)
+    assert (running.counters.taken, running.counters.missed, running.counters.not_ahead) == (20, 0, 0)
     stream.unlink()
 
 
@@ -98,7 +98,7 @@ def test_the_producers_numbers(name: str, running: Running) -> None:
         stream.write(frame(number), frame_id=number)
         wait_for(lambda number=number: ring.progress() == (number, 6))
         np.testing.assert_array_equal(ring.slot(number), frame(number))
-    assert running.counters.frames == 6
+    assert running.counters.taken == 6
     assert running.counters.not_ahead == 1
     stream.unlink()
 
@@ -129,7 +129,7 @@ def test_what_it_is_too_slow_for_is_counted(name: str, running: Running) -> None
             if ring.intact(newest) and ring.last_row_time_ns(newest):
                 assert np.all(pixels == newest)
     wait_for(lambda: ring.last_row_time_ns(400))
-    wait_for(lambda: running.counters.frames + running.counters.missed == 400, str(running.counters))
+    wait_for(lambda: running.counters.taken + running.counters.missed == 400, str(running.counters))
     assert running.counters.not_ahead == 0
     stream.unlink()
 

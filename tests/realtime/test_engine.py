@@ -34,15 +34,12 @@ pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 def test_every_frame_is_published_once_and_bit_for_bit(bench: Bench) -> None:
     data = simulated(6)
     expected = make(SETTINGS)(data).vector
-    with bench.ring() as ring:
-        bench.attached()
-        for number, frame in enumerate(data):
-            bench.send(ring, number, frame)
+    bench.measure(data)
     assert all(np.array_equal(bench.slopes[number], expected[number]) for number in range(6))
     counters = bench.engine.counters
     assert (counters.processed, counters.dropped, counters.skipped) == (6, 0, 0)
     assert counters.iterations == make(SETTINGS)(data).iterations.sum()
-    assert bench.engine.latencies.count == 6
+    assert bench.engine.latencies.as_dict()["count"] == 6
 
 
 @pytest.mark.portable
@@ -51,9 +48,7 @@ def test_what_is_published(bench: Bench) -> None:
     data = simulated(1)
     expected = make(SETTINGS)(data[0])
     streams = {name: pyshmem.open(f"{bench.name}_{name}") for name in ("slopes", "details", "marks")}
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 17, data[0])
+    bench.measure(data, [17])
     found = {name: stream.read_publication() for name, stream in streams.items()}
     assert [publication.frame_id for publication in found.values()] == [17] * 3
     assert np.array_equal(found["slopes"].payload, expected.vector)
@@ -73,15 +68,9 @@ def test_telemetry_says_with_which_calibration_and_spot(bench: Bench) -> None:
 def test_arms_take_turns() -> None:
     """Two frames not denoised, two denoised, and again; every frame says which."""
     data = simulated(8)
-    bench = Bench(interleaving=Interleaving.parse("none,tv", 2))
-    try:
-        with bench.ring() as ring:
-            bench.attached()
-            for number, frame in enumerate(data):
-                bench.send(ring, number, frame)
+    with Bench(interleaving=Interleaving.parse("none,tv", 2)) as bench:
+        bench.measure(data)
         records = bench.records
-    finally:
-        bench.close()
     assert records["arm"].tolist() == [0, 0, 1, 1, 0, 0, 1, 1]
     for record, frame in zip(records, data, strict=True):
         settings = SETTINGS if record["arm"] else SETTINGS.replace(estimator="brightest")
@@ -111,10 +100,7 @@ def test_source_restarts(bench: Bench) -> None:
     data = simulated(2)
     expected = make(SETTINGS)(data).vector
     for start in (0, 100):
-        with bench.ring() as ring:
-            bench.attached()
-            bench.send(ring, start, data[0])
-            bench.send(ring, start + 1, data[1])
+        bench.measure(data, [start, start + 1])
         bench.detached()
     for start in (0, 100):
         assert np.array_equal(bench.slopes[start + 1], expected[1])
@@ -135,9 +121,7 @@ bench = Bench(control=Control(np.random.default_rng(1).standard_normal((32, 5)))
 bench.engine.loop.close()
 before = compiled()
 for dtype in (np.uint16, np.float32):
-    with bench.ring(dtype) as ring:
-        for number, frame in enumerate(simulated(3).astype(dtype)):
-            bench.send(ring, number, frame)
+    bench.measure(simulated(3).astype(dtype))
     bench.detached()
 assert bench.engine.counters.processed == 6
 bench.close()
@@ -183,8 +167,7 @@ def test_frames_of_a_stream() -> None:
     data = simulated(4)
     expected = make(SETTINGS)(data).vector
     name = f"fs_test_{uuid4().hex[:12]}"
-    bench = Bench(f"{name}_ring", source=StreamBridge(name, f"{name}_ring"))
-    try:
+    with Bench(f"{name}_ring", source=StreamBridge(name, f"{name}_ring")) as bench:
         for shape in (data.shape[1:], (64, 64), data.shape[1:]):
             stream = pyshmem.create(name, shape=shape, dtype=np.uint16)
             if shape != data.shape[1:]:
@@ -200,8 +183,6 @@ def test_frames_of_a_stream() -> None:
             pyshmem.unlink(name)
         assert bench.engine.counters.processed >= 6
         assert np.array_equal(bench.slopes[3], expected[3])
-    finally:
-        bench.close()
 
 
 @pytest.mark.portable
@@ -230,7 +211,7 @@ def test_the_terminal_shows_the_status(bench: Bench, monkeypatch: pytest.MonkeyP
     with bench.ring() as ring:
         bench.attached()
         bench.send(ring, 0, data[0])
-        monkeypatch.setattr(realtime_control, "_asked", lambda name, what: bench.engine.status())
+        monkeypatch.setattr(realtime_control, "asked", lambda name, what: bench.engine.status())
         console = Console(width=100, record=True, file=io.StringIO())
         console.print(realtime_control._table(bench.name))
     text = console.export_text()

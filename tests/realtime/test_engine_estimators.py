@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -14,7 +13,7 @@ from tests.realtime.bench import SETTINGS, Bench, make, simulated
 from tests.realtime.estimator_files import PEAK, write
 
 import faintspot as fs
-from faintspot.cli.realtime_estimators import COMMANDS
+from faintspot.cli.realtime import command
 from faintspot.estimators import estimators
 from faintspot.estimators.registry import restore
 from faintspot.realtime.commands import commands_of
@@ -64,7 +63,6 @@ def camera() -> Iterator[Camera]:
         yield camera
     finally:
         camera.close()
-        camera.camera.close()
         restore(before)
 
 
@@ -152,7 +150,7 @@ def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fa
     assert status["estimator"] == SETTINGS.estimator.name
     assert "mine" in status["estimator_fault"]
     assert camera.engine.counters.processed == camera.sent
-    taken = camera.engine.live.history()[-1][1]
+    taken = camera.engine.live.taken()[-1][2]
     assert (taken["estimator"], taken["estimator_fault"]) == ("tv", status["estimator_fault"])
 
 
@@ -194,8 +192,7 @@ def test_what_is_refused_changes_nothing(camera: Camera, tmp_path: Path) -> None
 @pytest.mark.usefixtures("tried_here")
 def test_the_commands(camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def run(*arguments: str) -> str:
-        group = click.Group(commands=list(COMMANDS))
-        result = CliRunner().invoke(group, [*arguments, "--name", camera.name], catch_exceptions=False)
+        result = CliRunner().invoke(command, [*arguments, "--name", camera.name], catch_exceptions=False)
         assert result.exit_code == 0
         return result.output
 

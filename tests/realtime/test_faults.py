@@ -51,10 +51,7 @@ def test_a_short_frame(bench: Bench) -> None:
 def test_frame_numbers(bench: Bench, numbers: list[int], skipped: int, repeated: int) -> None:
     """No frame that came is lost where numbers stay, are left out, begin anew or jump."""
     data = simulated(len(numbers))
-    with bench.ring() as ring:
-        bench.attached()
-        for number, frame in zip(numbers, data, strict=True):
-            bench.send(ring, number, frame)
+    bench.measure(data, numbers)
     counters = bench.engine.counters
     assert (counters.processed, counters.dropped, counters.torn) == (len(numbers), 0, 0)
     assert (counters.skipped, counters.repeated) == (skipped, repeated)
@@ -93,15 +90,9 @@ def test_nan_and_saturated_pixels() -> None:
     data[1] = 65535.0
     data[2, :8, :8] = np.inf
     expected = make(SETTINGS)(data)
-    bench = Bench()
-    try:
-        with bench.ring(np.float32) as ring:
-            bench.attached()
-            for number, frame in enumerate(data):
-                bench.send(ring, number, frame)
+    with Bench() as bench:
+        bench.measure(data)
         records = bench.records
-    finally:
-        bench.close()
     assert np.array_equal(records["flags"], expected.flags)
     assert np.array_equal(records["x"], expected.x)
     assert np.isfinite(records["x"]).all()
@@ -109,17 +100,13 @@ def test_nan_and_saturated_pixels() -> None:
 
 def test_frame_size_changes_and_comes_back(bench: Bench) -> None:
     data = simulated(2)
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 0, data[0])
+    bench.measure(data[:1])
     bench.detached()
     with bench.ring(shape=(64, 64)) as ring:
         bench.until(lambda: bench.engine.status()["source_refused"] is not None)
         ring.publish(np.zeros((64, 64), np.uint16))
         assert "64 x 64 pixels, uint16; expected 32 x 32" in bench.engine.status()["source_refused"]
-    with bench.ring() as ring:
-        bench.attached()
-        bench.send(ring, 1, data[1])
+    bench.measure(data[1:], [1])
     assert np.array_equal(bench.slopes[1], make(SETTINGS)(data[1]).vector)
     assert bench.engine.status()["source_refused"] is None
 
@@ -171,14 +158,13 @@ def test_the_clock_is_set_back(bench: Bench, monkeypatch: pytest.MonkeyPatch) ->
     records = bench.records
     assert (np.diff(records["last_row_time_ns"]) > 0).all()
     assert (records["published_time_ns"] > records["last_row_time_ns"]).all()
-    assert bench.engine.latencies.largest_ns < LIMIT_S * 1e9
+    assert (bench.engine.latencies.as_dict()["max_us"] or 0) < LIMIT_S * 1e6
 
 
 def test_a_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:
     """One frame is dropped and counted; the thread is replaced and the loop goes on."""
     data = simulated(4)
-    bench = Bench(threads=2)
-    try:
+    with Bench(threads=2) as bench:
         with bench.ring() as ring:
             bench.attached()
             bench.send(ring, 0, data[0])
@@ -199,8 +185,6 @@ def test_a_worker_dies(monkeypatch: pytest.MonkeyPatch) -> None:
         assert counters.worker_restarts == 1
         assert counters.dropped == 1
         assert np.array_equal(bench.slopes[3], make(SETTINGS)(data[3]).vector)
-    finally:
-        bench.close()
 
 
 def test_a_hundred_changes_a_second_under_load(bench: Bench) -> None:

@@ -314,7 +314,7 @@ def test_counters_that_are_mad(folder: Path, name: str) -> None:
         file.put(264, "Q", counter)
         file.write(np.ones((3, 5), np.uint16))
         wait_for(bridge.step)
-    assert (bridge.counters.frames, bridge.counters.not_ahead) == (2, 1)
+    assert (bridge.counters.taken, bridge.counters.not_ahead) == (2, 1)
     assert (bridge.counters.missed, bridge.counters.restarts) == (0, 1)  # the jump, not what lies between
     bridge.close()
 
@@ -330,7 +330,7 @@ def test_slopes_come_out(folder: Path, name: str) -> None:
     np.testing.assert_array_equal(values_of(reader), [np.arange(8)])
     stream.write(np.ones(8, np.float32), frame_id=6)
     wait_for(out.step)
-    assert (reader.count, out.published, out.missed) == (2, 2, 0)
+    assert (reader.count, out.counters.taken, out.counters.missed) == (2, 2, 0)
     stream.unlink()
     wait_for(lambda: out.step() or any("was removed" in line for line in lines))
     another = pyshmem.create(f"{name}_slopes", shape=(4,), dtype=np.float32)
@@ -347,7 +347,7 @@ def test_slopes_come_out(folder: Path, name: str) -> None:
 def test_command_both_ways(folder: Path, name: str) -> None:
     file = isio(folder)
     slopes = pyshmem.create(f"{name}_slopes", shape=(8,), dtype=np.float32)
-    arguments = ["--from", "isio:cam", "--to", "isio:cam_slopes", "--name", name, "--frames", "3"]
+    arguments = ["isio:cam", "--to", "isio:cam_slopes", "--name", name, "--frames", "3"]
     process = start("from faintspot.cli.realtime_sources import bridge; bridge()", *arguments)
     try:
         wait_for(lambda: (FOLDER / name).exists() or process.poll() is not None)
@@ -375,7 +375,6 @@ def test_command_both_ways(folder: Path, name: str) -> None:
     ("arguments", "naming"),
     [
         ([], "expected a stream of frames, --to or --commands"),
-        (["a", "--from", "isio:b"], "--from isio:b"),
         (["--to", "isio:b", "--frames", "3"], "--frames"),
         (["--to", "b"], "expected isio:NAME or dao:FILE"),
         (["isio:a/b"], "isio:a/b"),

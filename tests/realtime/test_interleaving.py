@@ -119,4 +119,3 @@ def test_arms_change_while_the_engine_runs(bench: Bench) -> None:
     handlers["set"]({"changes": {"noise_std": 2.0}})  # the arms stay
     bench.send(ring, 12, frames[0])
     assert bench.engine.live.running.interleaving.labels == ["none", "tv"]
-    ring.close()

@@ -83,7 +83,6 @@ class Changing:
         gc.enable()
         gc.unfreeze()
         self.bench.close()
-        self.ring.close()
 
 
 @pytest.fixture
@@ -118,7 +117,7 @@ def test_changes_of_settings(changing: Changing) -> None:
 def test_swaps_of_an_estimator(changing: Changing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every one is another version of its file, in use; the trial in another process is left out."""
     # Its frame comes after the change.
-    monkeypatch.setattr("faintspot.realtime.engine_estimators._EFFECT_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("faintspot.realtime.engine_estimators.EFFECT_TIMEOUT_S", 0.0)
     monkeypatch.setattr(Trial, "elsewhere", Trial.here)
     estimators, live = changing.bench.engine.estimators, changing.bench.engine.live
     estimators.load(str(write(tmp_path, "return sensor.zero")))

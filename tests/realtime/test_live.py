@@ -25,6 +25,11 @@ def made(settings: fs.Settings) -> fs.SlopePipeline:
     return fs.SlopePipeline(LAYOUT, settings)
 
 
+def history(live: LiveSettings[Any]) -> list[tuple[int, dict[str, Any], list[int] | None]]:
+    """Return frame, new values and sub-apertures of the changes that took effect."""
+    return [(frame, values, where) for frame, _, values, where in live.taken()]
+
+
 @pytest.fixture
 def live() -> LiveSettings[fs.SlopePipeline]:
     return LiveSettings(made, SETTINGS)
@@ -33,14 +38,14 @@ def live() -> LiveSettings[fs.SlopePipeline]:
 def test_a_change_waits_for_the_next_frame_and_is_stamped(live: LiveSettings[fs.SlopePipeline]) -> None:
     before = live.take(6)
     change = live.propose({"noise_std": 2.5})
-    assert (live.frame_of(change), live.waiting(), live.running is before) == (None, 1, True)
-    assert live.history() == []
+    assert (live.frame_of(change), live.running is before) == (None, True)
+    assert history(live) == []
     after = live.take(7)
     assert after is not before
     assert (after.settings.noise_std, live.settings.noise_std) == (2.5, 2.5)
     assert live.take(8) is after
-    assert (live.frame_of(change), live.waiting()) == (7, 0)
-    assert live.history() == [(7, {"noise_std": 2.5}, None)]
+    assert live.frame_of(change) == 7
+    assert history(live) == [(7, {"noise_std": 2.5}, None)]
 
 
 def test_changes_between_two_frames_build_on_each_other(live: LiveSettings[fs.SlopePipeline]) -> None:
@@ -52,7 +57,7 @@ def test_changes_between_two_frames_build_on_each_other(live: LiveSettings[fs.Sl
     pipeline = live.take(100)
     live.propose({"tolerance": 0.1})
     assert [live.frame_of(change) for change in changes] == [100] * 3
-    assert live.history() == [
+    assert history(live) == [
         (100, {"noise_std": 2.5}, None),
         (100, {"keep_brightest": 20}, [1, 4]),
         (100, {"noise_std": 3.0}, [0]),
@@ -91,7 +96,7 @@ def test_what_does_not_fit_is_refused_whole(live: LiveSettings, changes: Any, wh
     with refused(named):
         live.propose(changes, where)
     assert live.take(1) is before
-    assert (live.waiting(), live.history()) == (0, [])
+    assert history(live) == []
 
 
 def test_an_unforeseen_fault_while_building_leaves_the_running_one() -> None:
@@ -107,13 +112,14 @@ def test_an_unforeseen_fault_while_building_leaves_the_running_one() -> None:
     assert live.take(3).settings == SETTINGS.replace(tolerance=0.1)
 
 
-def test_history_is_bounded_and_keeps_the_latest() -> None:
-    live = LiveSettings(made, SETTINGS, history_length=3)
+def test_history_is_bounded_and_keeps_the_latest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("faintspot.realtime.live.HISTORY_LENGTH", 3)
+    live = LiveSettings(made, SETTINGS)
     changes = []
     for frame_number in range(5):
         changes.append(live.propose({"noise_std": 1.0 + frame_number}))
         live.take(frame_number)
-    assert [frame for frame, _, _ in live.history()] == [2, 3, 4]
+    assert [frame for frame, _, _ in history(live)] == [2, 3, 4]
     assert [live.frame_of(change) for change in changes] == [0, 1, 2, 3, 4]
 
 
@@ -138,8 +144,8 @@ def test_history_is_not_changed_from_outside(live: LiveSettings[fs.SlopePipeline
     live.take(5)
     values["noise_std"][0] = 9.0
     where.append(2)
-    live.history()[0][1].clear()
-    assert live.history() == [(5, {"noise_std": [1.0, 2.0]}, [0, 1])]
+    history(live)[0][1].clear()
+    assert history(live) == [(5, {"noise_std": [1.0, 2.0]}, [0, 1])]
 
 
 def test_many_threads_propose_while_frames_are_taken() -> None:
@@ -157,7 +163,7 @@ def test_many_threads_propose_while_frames_are_taken() -> None:
     def engine() -> None:
         while True:
             last = done.is_set()
-            if len(taken) == 0 or taken[-1] is not live.running or live.waiting() or last:
+            if len(taken) == 0 or taken[-1] is not live.newest or last:
                 taken.append(live.take(len(taken)))
             if last:
                 return
@@ -169,16 +175,16 @@ def test_many_threads_propose_while_frames_are_taken() -> None:
         thread.join()
     done.set()
     runner.join()
-    history = live.history()
-    assert len(history) == 4 * each
-    frames = [frame for frame, _, _ in history]
+    taken_up = history(live)
+    assert len(taken_up) == 4 * each
+    frames = [frame for frame, _, _ in taken_up]
     assert frames == sorted(frames)
     now = np.full(N, 0.5)
     for place in range(4):
-        mine = [changes["noise_std"] for _, changes, where in history if where == [place]]
+        mine = [changes["noise_std"] for _, changes, where in taken_up if where == [place]]
         assert mine == [float(value) for value in range(1, each + 1)]
     for frame_number, pipeline in enumerate(taken):
-        for _, changes, where in [entry for entry in history if entry[0] == frame_number]:
+        for _, changes, where in [entry for entry in taken_up if entry[0] == frame_number]:
             now[where] = changes["noise_std"]
         np.testing.assert_array_equal(pipeline.settings.values("noise_std", N, 64), now)
 
@@ -201,7 +207,7 @@ def test_what_is_being_prepared_is_said_and_nobody_waits_for_it() -> None:
     assert said is not None
     assert said["changes"] == {"noise_std": 2.0}
     assert said["seconds"] >= 0
-    assert (live.history(), live.take(3).settings, live.waiting()) == ([], SETTINGS, 0)
+    assert (history(live), live.take(3).settings) == ([], SETTINGS)
     go_on.set()
     proposer.join()
     assert live.preparing is None

@@ -62,7 +62,7 @@ def test_the_clock_jumps(
     monkeypatch.setattr(time, "time_ns", lambda: true_ns() + round(jump_s * 1e9))
     assert sky.frames(30)[20:].mean() > 0.4
     check_commands(sky, files[1])
-    assert sky.loop.latencies.largest_ns < PATIENCE_S * 1e9
+    assert (sky.loop.latencies.as_dict()["max_us"] or 0) < PATIENCE_S * 1e6
 
 
 def frames_until(sky: Sky, condition: Callable[[], bool], pause_s: float = 0.0) -> None:

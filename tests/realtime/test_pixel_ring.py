@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import stat
-import subprocess
-import sys
 import threading
 import time
+from collections.abc import Iterator
 from multiprocessing.queues import Queue
 from multiprocessing.synchronize import Barrier
-from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.patience import LIMIT_S
+from tests.patience import LIMIT_S, wait_for
+from tests.realtime.commands import process, start
 
-import faintspot
 from faintspot.base.errors import InputError
 from faintspot.realtime.pixel_ring import ARRIVALS, CLOSED, FRAME, ROWS, PixelRing
 from faintspot.realtime.pixel_segment import FOLDER
@@ -95,15 +92,15 @@ def test_rows_that_progress_names_are_there_for_two_readers(name: str, pause_s: 
     answers: Queue[tuple[int, int, int]] = spawn.Queue()
     meeting = spawn.Barrier(3)
     reading = (name, n_frames - 1, answers, meeting)
-    readers = [spawn.Process(target=read, args=reading, daemon=True) for _ in range(2)]
-    writer = spawn.Process(target=write, args=(name, n_frames, pause_s, 4, meeting), daemon=True)
-    for process in (*readers, writer):
-        process.start()
-    results = [answers.get(timeout=LIMIT_S) for _ in readers]
-    for process in (*readers, writer):
-        process.join(LIMIT_S)
-        assert process.exitcode == 0
-        process.close()
+    with (
+        process(read, *reading) as first,
+        process(read, *reading) as second,
+        process(write, name, n_frames, pause_s, 4, meeting) as writer,
+    ):
+        results = [answers.get(timeout=LIMIT_S) for _ in range(2)]
+        for each in (first, second, writer):
+            each.join(LIMIT_S)
+            assert each.exitcode == 0
     answers.close()
     answers.join_thread()
     for looks, _, wrong in results:
@@ -115,19 +112,16 @@ def test_rows_that_progress_names_are_there_for_two_readers(name: str, pause_s: 
 def test_every_frame_in_turn_from_another_process(name: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     meeting = spawn.Barrier(2)
-    writer = spawn.Process(target=write, args=(name, 100, 2e-3, 100, meeting), daemon=True)
-    writer.start()
-    ring = attached(name)
-    meeting.wait(LIMIT_S)
-    for frame in range(100):
-        assert ring.wait(frame, SHAPE[0], LIMIT_S)
-        np.testing.assert_array_equal(ring.slot(frame), content(frame))
-        assert ring.intact(frame)
-        assert ring.last_row_time_ns(frame) <= time.monotonic_ns()
-    meeting.wait(LIMIT_S)
-    assert not ring.wait(100, 1, LIMIT_S)  # ends with the writer, long before the time is up
-    writer.join(LIMIT_S)
-    writer.close()
+    with process(write, name, 100, 2e-3, 100, meeting) as writer:
+        ring = attached(name)
+        meeting.wait(LIMIT_S)
+        for frame in range(100):
+            wait_for(lambda frame=frame: ring.last_row_time_ns(frame) > 0)
+            np.testing.assert_array_equal(ring.slot(frame), content(frame))
+            assert ring.intact(frame)
+            assert ring.last_row_time_ns(frame) <= time.monotonic_ns()
+        meeting.wait(LIMIT_S)
+        writer.join(LIMIT_S)
     assert ring.closed
     assert is_stale(ring)
 
@@ -145,8 +139,6 @@ def test_rows_frames_and_laps(name: str) -> None:
         ring.rows_ready(5)
         assert reader.progress() == (0, 5)
         assert (int(reader.cells[FRAME, 0]), int(reader.cells[ROWS, 0])) == (0, 5)
-        assert reader.wait(0, 5, 0.0)
-        assert not reader.wait(0, 6, 0.001)
         assert reader.last_row_time_ns(0) == 0
         ring.end()
         assert reader.last_row_time_ns(0) > 0
@@ -159,7 +151,6 @@ def test_rows_frames_and_laps(name: str) -> None:
         np.testing.assert_array_equal(reader.slot(0)[:5], 7)
         ring.begin()
         assert not reader.intact(0)
-        assert not reader.wait(0, 1, LIMIT_S)
         assert reader.last_row_time_ns(0) == 0
         assert reader.arrival(0) == -1
         assert not reader.pixels.flags.writeable
@@ -178,12 +169,10 @@ def test_repeats_skips_and_short_frames_are_seen(name: str) -> None:
         ring.publish(np.full(SHAPE, 3.0), 50)
         assert reader.progress() == (50, SHAPE[0])
         assert not reader.intact(49)
-        assert not reader.wait(49, 1, LIMIT_S)
         ring.begin(51)
         ring.rows_ready(4)
         ring.begin(52)  # 51 was cut short
         assert reader.last_row_time_ns(51) == 0
-        assert not reader.wait(51, SHAPE[0], LIMIT_S)
         assert reader.progress() == (52, 0)
         ring.publish(np.zeros(SHAPE), 3)  # the camera counts anew
         assert reader.progress() == (3, SHAPE[0])
@@ -261,7 +250,8 @@ def test_a_second_writer_is_refused(name: str) -> None:
         assert not is_stale(ring)
 
 
-def killed_writer(name: str) -> subprocess.Popen[bytes]:
+@pytest.fixture
+def killed_writer(name: str) -> Iterator[None]:
     """Start a writer, wait for its first frame, kill it (-9) and leave it a zombie."""
     code = (
         "import time, numpy as np\n"
@@ -270,25 +260,24 @@ def killed_writer(name: str) -> subprocess.Popen[bytes]:
         f"ring.publish(np.full({SHAPE}, 9.0))\n"
         "time.sleep(100)\n"
     )
-    source = str(Path(faintspot.__file__).parents[1])
-    process = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": source})
-    ring = attached(name)
-    assert ring.wait(0, SHAPE[0], LIMIT_S)
-    assert not is_stale(ring)
-    with pytest.raises(InputError, match=f"process {process.pid} already writes"):
-        PixelRing.create(name, SHAPE, np.float32)
-    process.send_signal(signal.SIGKILL)
-    for _ in range(2000):
-        if is_stale(ring):
-            break
-        time.sleep(0.005)
-    assert is_stale(ring)
-    assert not ring.closed
-    return process
+    writer = start(code)
+    try:
+        ring = attached(name)
+        wait_for(lambda: ring.last_row_time_ns(0) > 0)
+        assert not is_stale(ring)
+        with pytest.raises(InputError, match=f"process {writer.pid} already writes"):
+            PixelRing.create(name, SHAPE, np.float32)
+        writer.kill()
+        wait_for(lambda: is_stale(ring))
+        assert not ring.closed
+        yield
+    finally:
+        writer.kill()
+        writer.communicate()
 
 
+@pytest.mark.usefixtures("killed_writer")
 def test_the_ring_of_a_killed_writer_is_replaced(name: str) -> None:
-    process = killed_writer(name)
     reader = PixelRing.attach(name)
     with PixelRing.create(name, (8, 8), np.uint16) as ring:
         assert is_stale(reader)
@@ -297,21 +286,19 @@ def test_the_ring_of_a_killed_writer_is_replaced(name: str) -> None:
         assert again.generation == ring.generation != reader.generation
         assert again.shape == (8, 8)
         assert not is_stale(again)
-    process.wait()
 
 
+@pytest.mark.usefixtures("killed_writer")
 def test_a_cut_ring_of_a_killed_writer_is_replaced(name: str) -> None:
-    process = killed_writer(name)
     os.truncate(FOLDER / name, 4096)
     with pytest.raises(InputError, match="cut short: 4096 of"):
         PixelRing.attach(name)
     with PixelRing.create(name, SHAPE, np.float32):
         assert not is_stale(PixelRing.attach(name))
-    process.wait()
 
 
+@pytest.mark.usefixtures("killed_writer")
 def test_of_many_that_replace_a_dead_ring_one_wins(name: str) -> None:
-    process = killed_writer(name)
     made: list[PixelRing] = []
     said: list[str] = []
 
@@ -326,7 +313,6 @@ def test_of_many_that_replace_a_dead_ring_one_wins(name: str) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    process.wait()
     assert len(made) == 1
     assert len(said) == 7
     assert PixelRing.attach(name).generation == made[0].generation

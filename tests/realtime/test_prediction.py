@@ -70,11 +70,11 @@ def test_predictions_from_a_stream(sky: Sky, files: tuple[Path, Control]) -> Non
     assert engine.status()["prediction"]["obstacle"] == "is not there"
     n = 36
     wrong = pyshmem.create(f"{sky.name}_prediction", shape=(3,), dtype=np.float64)
-    sky.until(lambda: "holds (3,) float64, expected (145,)" in prediction.obstacle)
+    sky.until(lambda: "holds (3,) float64, expected (145,)" in prediction.status()["obstacle"])
     wrong.unlink()
-    sky.until(lambda: prediction.obstacle == "is not there")
+    sky.until(lambda: prediction.status()["obstacle"] == "is not there")
     stream = pyshmem.create(f"{sky.name}_prediction", shape=(4 * n + 1,), dtype=np.float64)
-    sky.until(lambda: not prediction.obstacle)
+    sky.until(lambda: not prediction.status()["obstacle"])
     rng = np.random.default_rng(3)
     priors, widths, frames = [np.zeros(2 * n)], [np.ones(n)], [sky.pixels]
     variance = np.zeros(2 * n)

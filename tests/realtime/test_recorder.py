@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import multiprocessing
 import os
-import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -18,6 +17,8 @@ import pytest
 
 pytest.importorskip("zarr")
 
+from tests.patience import wait_for
+from tests.realtime.commands import process
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, Engine, as_written, write
 
 from faintspot.base.errors import InputError
@@ -39,10 +40,8 @@ PATIENCE_S = 60.0
 @pytest.fixture
 def engine(name: str) -> Iterator[Engine]:
     """Writes frames."""
-    running = Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS))
-    running.start()
-    yield running
-    running.stop()
+    with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS)) as running:
+        yield running
 
 
 def record_on(name: str, path: Path, started: Event) -> None:
@@ -108,10 +107,8 @@ def test_a_slow_disk_loses_only_records(name: str, tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(TelemetryStore, "append", slow)
     monkeypatch.setattr(recorder, "_FLUSH_S", 0.01)
-    engine = Engine(TelemetryRing.create(name, LAYOUT, records=16), pause_s=2e-4)
-    engine.start()
-    report = Recorder(name, tmp_path / "night.zarr").run(n_frames=100)
-    engine.stop()
+    with Engine(TelemetryRing.create(name, LAYOUT, records=16), pause_s=2e-4):
+        report = Recorder(name, tmp_path / "night.zarr").run(n_frames=100)
     assert report.dropped > 0
     assert report.longest_write_s >= 0.2
     telemetry = read_telemetry(tmp_path / "night.zarr")
@@ -150,16 +147,9 @@ def test_a_full_disk(engine: Engine, name: str, tmp_path: Path, monkeypatch: pyt
 def test_a_killed_recorder_leaves_a_whole_store(engine: Engine, name: str, tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
     started, path = spawn.Event(), tmp_path / "night.zarr"
-    process = spawn.Process(target=record_on, args=(name, path, started))
-    process.start()
-    assert started.wait(PATIENCE_S)
-    end = time.monotonic() + PATIENCE_S
-    while len(read_telemetry(path).frame) < 100:  # it can be read meanwhile
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    os.kill(process.pid or 0, signal.SIGKILL)
-    process.join()
-    process.close()
+    with process(record_on, name, path, started):
+        assert started.wait(PATIENCE_S)
+        wait_for(lambda: len(read_telemetry(path).frame) >= 100)  # it can be read meanwhile
     telemetry = read_telemetry(path)
     assert len(telemetry.frame) >= 100
     assert as_written(vars(telemetry))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
 import stat
 import time
 from multiprocessing.synchronize import Event
@@ -13,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.patience import LIMIT_S
+from tests.realtime.commands import process
 from tests.realtime.telemetry_cases import LAYOUT, SETTINGS, N, as_written, slopes_of, write, write_images
 
 from faintspot.base.errors import InputError
@@ -51,7 +50,7 @@ def test_commands_and_the_loops_state(name: str) -> None:
             ring.write(frame, 0, 0, 0, 0, slopes_of(frame), frame % 3, np.arange(3.0) + frame)
         reader = TelemetryReader.attach(name)
         assert reader.description["reference"] == [0.0, 1.0]
-        records, _, _ = reader.records_since(2)
+        records, _, _ = reader.records.since(2)
         np.testing.assert_array_equal(records["frame"], [3, 4, 5])
         np.testing.assert_array_equal(records["loop"], records["frame"] % 3)
         np.testing.assert_array_equal(records["commands"], np.arange(3.0) + records["frame"][:, None])
@@ -67,23 +66,23 @@ def test_what_is_written_is_read(name: str) -> None:
         assert reader.layout == LAYOUT
         assert reader.settings == SETTINGS
         assert reader.description["arms"] == ["none", "tv"]
-        records, cursor, dropped = reader.records_since(0)
+        records, cursor, dropped = reader.records.since(0)
         assert (len(records), cursor, dropped) == (0, 0, 0)
         for frame in range(5):
             write(ring, frame)
-        records, cursor, dropped = reader.records_since(0)
-        assert (len(records), cursor, dropped, reader.newest) == (5, 5, 0, 5)
+        records, cursor, dropped = reader.records.since(0)
+        assert (len(records), cursor, dropped, reader.records.written) == (5, 5, 0, 5)
         assert as_written(records)
         assert list(records["sequence"]) == [0, 1, 2, 3, 4]
         # The wall clock may be corrected by some milliseconds meanwhile.
         assert np.all(np.abs(records["clock_offset_ns"] - before) < 1e9)
-        assert reader.records_since(cursor)[0].shape == (0,)
-        some, cursor, _ = reader.records_since(1, most=2)
+        assert reader.records.since(cursor)[0].shape == (0,)
+        some, cursor, _ = reader.records.since(1, most=2)
         assert list(some["frame"]) == [1, 2]
         assert cursor == 3
         write_images(ring, 4)
-        images, image_cursor, dropped = reader.images_since(0)
-        assert (image_cursor, dropped, reader.newest_image) == (1, 0, 1)
+        images, image_cursor, dropped = reader.images.since(0)
+        assert (image_cursor, dropped, reader.images.written) == (1, 0, 1)
         assert images["image_frame"][0] == 4
         assert np.all(images["raw"] == 4)
         assert np.all(images["denoised"] == 4.5)
@@ -92,7 +91,7 @@ def test_what_is_written_is_read(name: str) -> None:
         assert mode == 0o600
         assert not is_stale(reader)
     assert is_stale(reader)
-    assert as_written(reader.records_since(0)[0])  # what is there can still be read
+    assert as_written(reader.records.since(0)[0])  # what is there can still be read
     reader.close()
     with pytest.raises(InputError, match="start the engine first"):
         TelemetryReader.attach(name)
@@ -103,7 +102,7 @@ def test_records_of_a_frame_are_copies(name: str) -> None:
         reader, slopes = TelemetryReader.attach(name), slopes_of(0)
         ring.write(0, 0, 0, 7, 507, slopes)
         slopes.x[:] = -1
-        kept = reader.records_since(0)[0]
+        kept = reader.records.since(0)[0]
         for frame in range(1, 9):
             write(ring, frame)
         assert as_written(kept)
@@ -115,11 +114,11 @@ def test_what_is_overwritten_is_counted(name: str) -> None:
         for frame in range(20):
             write(ring, frame)
             write_images(ring, frame)
-        records, cursor, dropped = reader.records_since(3)
+        records, cursor, dropped = reader.records.since(3)
         # Of 8 places one may be being written to.
         assert list(records["frame"]) == list(range(13, 20))
         assert (cursor, dropped) == (20, 10)
-        images, cursor, dropped = reader.images_since(0)
+        images, cursor, dropped = reader.images.since(0)
         assert list(images["image_frame"]) == [19]
         assert (cursor, dropped) == (20, 19)
 
@@ -130,7 +129,7 @@ def test_memory_is_bounded(name: str) -> None:
     with TelemetryRing.create(name, layout) as ring:
         assert (FOLDER / f"{name}_telemetry").stat().st_size < 52 << 20
         ring.write_images(0, np.zeros(layout.frame_shape), np.zeros((1600, 16, 16)))
-        assert len(TelemetryReader.attach(name).images_since(0)[0]) == 1
+        assert len(TelemetryReader.attach(name).images.since(0)[0]) == 1
 
 
 def test_changes(name: str) -> None:
@@ -158,46 +157,40 @@ def test_changes(name: str) -> None:
 def test_nothing_is_torn_between_processes(name: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, enough = spawn.Event(), spawn.Event()
-    writer = spawn.Process(target=write_on, args=(name, ready, enough), daemon=True)
-    writer.start()
-    assert ready.wait(LIMIT_S)
-    reader = TelemetryReader.attach(name)
-    cursor = image_cursor = seen = lost = 0
-    end = time.monotonic() + LIMIT_S
-    while (seen < 2000 or lost == 0 or image_cursor < 20) and time.monotonic() < end:
-        records, cursor, dropped = reader.records_since(cursor)
-        assert as_written(records)
-        assert np.array_equal(records["sequence"], np.arange(cursor - len(records), cursor))
-        images, image_cursor, _ = reader.images_since(image_cursor)
-        for image in images:
-            assert np.all(image["raw"] == image["image_frame"])
-            assert np.all(image["denoised"] == image["image_frame"] + 0.5)
-        seen, lost = seen + len(records), lost + dropped
-    assert seen + lost == cursor
-    assert seen >= 2000
-    enough.set()
-    writer.join(LIMIT_S)
-    assert writer.exitcode == 0
-    writer.close()
+    with process(write_on, name, ready, enough) as writer:
+        assert ready.wait(LIMIT_S)
+        reader = TelemetryReader.attach(name)
+        cursor = image_cursor = seen = lost = 0
+        end = time.monotonic() + LIMIT_S
+        while (seen < 2000 or lost == 0 or image_cursor < 20) and time.monotonic() < end:
+            records, cursor, dropped = reader.records.since(cursor)
+            assert as_written(records)
+            assert np.array_equal(records["sequence"], np.arange(cursor - len(records), cursor))
+            images, image_cursor, _ = reader.images.since(image_cursor)
+            for image in images:
+                assert np.all(image["raw"] == image["image_frame"])
+                assert np.all(image["denoised"] == image["image_frame"] + 0.5)
+            seen, lost = seen + len(records), lost + dropped
+        assert seen + lost == cursor
+        assert seen >= 2000
+        enough.set()
+        writer.join(LIMIT_S)
+        assert writer.exitcode == 0
     assert is_stale(reader)
 
 
 def test_the_ring_of_a_dead_engine_is_replaced(name: str) -> None:
     spawn = multiprocessing.get_context("spawn")
     ready, enough = spawn.Event(), spawn.Event()
-    writer = spawn.Process(target=write_on, args=(name, ready, enough), daemon=True)
-    writer.start()
-    assert ready.wait(LIMIT_S)
-    reader = TelemetryReader.attach(name)
-    with pytest.raises(InputError, match=f"telemetry of {name}: .*process {writer.pid} "):
-        TelemetryRing.create(name, LAYOUT)
-    os.kill(writer.pid or 0, signal.SIGKILL)
-    writer.join(LIMIT_S)
-    writer.close()
+    with process(write_on, name, ready, enough) as writer:
+        assert ready.wait(LIMIT_S)
+        reader = TelemetryReader.attach(name)
+        with pytest.raises(InputError, match=f"telemetry of {name}: .*process {writer.pid} "):
+            TelemetryRing.create(name, LAYOUT)
     assert is_stale(reader)
     with TelemetryRing.create(name, LAYOUT) as ring:
         write(ring, 3)
-        assert as_written(TelemetryReader.attach(name).records_since(0)[0])
+        assert as_written(TelemetryReader.attach(name).records.since(0)[0])
         assert is_stale(reader)
 
 

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from faintspot.ao_loop import LoopRecord, simulate_loop
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.engine_files import write_engine_files
 from faintspot.ao_loop.telescope_model import TelescopeModel
+from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.cli.realtime_telescope import telescope_set, telescope_status
 from faintspot.pipeline import configuration as configuration_file
@@ -48,7 +50,7 @@ CONFIGURATION = faint().replace("control", frame_rate_hz=1000.0)  # runs of sing
 COMMANDS, PATIENCE_S = 54, 120.0
 
 
-class Watched:
+class Watched(Closing):
     """A telescope, what it has said, and its streams as others see them."""
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -72,6 +74,18 @@ class Watched:
         publication = self._truth.read_publication()
         return dict(zip(TRUTH, publication.payload.tolist(), strict=True))
 
+    @contextmanager
+    def observing(self) -> Iterator[None]:
+        """Let frames come in another thread."""
+        stop = threading.Event()
+        runner = threading.Thread(target=self.telescope.run, args=(None, stop))
+        runner.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            runner.join()
+
     def close(self) -> None:
         self._truth.close()
         self._frames.close()
@@ -80,9 +94,8 @@ class Watched:
 
 @pytest.fixture
 def watched(name: str) -> Iterator[Watched]:
-    made = Watched(name)
-    yield made
-    made.close()
+    with Watched(name) as made:
+        yield made
 
 
 @pytest.fixture
@@ -97,9 +110,10 @@ def record() -> LoopRecord:
     return simulate_loop(CONFIGURATION.replace("run", frames=12, settle_frames=2), [plain()])
 
 
-def test_frames_and_truth_are_the_simulated_loops(record: LoopRecord, name: str, commands: Any) -> None:
+def test_frames_and_truth_are_the_simulated_loops(
+    record: LoopRecord, watched: Watched, commands: Any
+) -> None:
     """With the same commands: Strehl ratio and rms, and slopes through the same pipeline, bit for bit."""
-    watched = Watched(name)
     pipeline = make_pipeline(CONFIGURATION, watched.telescope.telescope_model.optics.sensor, plain())
     for number, (slopes, strehl, residual) in enumerate(
         zip(record.slopes_px, record.strehl, record.residual_nm, strict=True)
@@ -111,15 +125,13 @@ def test_frames_and_truth_are_the_simulated_loops(record: LoopRecord, name: str,
         assert watched.truth["time_s"] == (number + 0.5) / 1000.0
         assert watched.truth["photons"] == 200.0
     assert np.ptp(record.strehl) > 0.05  # commands do something
-    watched.close()
 
 
 def test_realisations_differ(name: str) -> None:
-    watched = Watched(name, realisation=1, seed=5)
-    telescope_model = TelescopeModel(CONFIGURATION, 5, 1)
-    seen = telescope_model.wavefronts(0.5e-3, np.zeros(COMMANDS))[1]
-    np.testing.assert_array_equal(watched.frame(), telescope_model.frame(0, seen))
-    watched.close()
+    with Watched(name, realisation=1, seed=5) as watched:
+        telescope_model = TelescopeModel(CONFIGURATION, 5, 1)
+        seen = telescope_model.wavefronts(0.5e-3, np.zeros(COMMANDS))[1]
+        np.testing.assert_array_equal(watched.frame(), telescope_model.frame(0, seen))
 
 
 def test_commands_act_on_the_next_exposure_but_one(watched: Watched, commands: Any) -> None:
@@ -131,13 +143,13 @@ def test_commands_act_on_the_next_exposure_but_one(watched: Watched, commands: A
         commands.write(np.full(COMMANDS, 10.0 * number), frame_id=number)
     assert acted[2:] == [0, 1, 2, 3, 4, 5]
     counters = watched.telescope.commands.counters
-    assert (counters.taken, counters.overtaken) == (7, 0)
+    assert (counters.taken, counters.missed) == (7, 0)
     commands.write(np.zeros(COMMANDS), frame_id=100)
     commands.write(np.ones(COMMANDS), frame_id=101)  # the newest counts
     watched.frame()
     watched.frame()
     assert watched.truth["command_frame"] == 101
-    assert counters.overtaken == 2
+    assert counters.missed == 2
 
 
 def test_a_missing_stream_leaves_the_mirror_flat_and_is_said_once(watched: Watched, name: str) -> None:
@@ -291,11 +303,8 @@ def test_a_bad_order_changes_nothing(watched: Watched) -> None:
 
 
 def test_commands_over_the_socket(watched: Watched, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    stop = threading.Event()
-    runner = threading.Thread(target=watched.telescope.run, args=(None, stop))
     path = socket_path(name, TELESCOPE)
-    with ControlServer(path, commands_of(watched.telescope)):
-        runner.start()
+    with ControlServer(path, commands_of(watched.telescope)), watched.observing():
         reply = request(path, "set", changes={"photons": 50, "r0_m": [0.1, 0.2]}, timeout_s=PATIENCE_S)
         assert reply["frame"] is None or reply["frame"] >= 0
         assert reply["conditions"] == {"photons": 50, "r0_m": [0.1, 0.2], "wind_factor": 1}
@@ -303,16 +312,12 @@ def test_commands_over_the_socket(watched: Watched, name: str, monkeypatch: pyte
             request(path, "set", changes=[])
         said = CliRunner().invoke(telescope_set, ["wind_factor=2", "--name", name])
         assert "50 photons, r0 0.1 to 0.2 m, winds x 2" in said.output
-        end = time.monotonic() + PATIENCE_S
-        while request(path, "status")["truth"] is None:
-            assert time.monotonic() < end
+        wait_for(lambda: request(path, "status")["truth"] is not None, lambda: None)
         said = CliRunner().invoke(telescope_status, ["--name", name])
         for text in ("canary", "1000 a second", "is not there", "Strehl ratio 0."):
             assert text in said.output
         status = json.loads(CliRunner().invoke(telescope_status, ["--name", name, "--json"]).output)
         assert tuple(status["truth"]) == TRUTH
-        stop.set()
-        runner.join()
     for command, options in ((telescope_set, ["photons=1"]), (telescope_status, [])):
         refused = CliRunner().invoke(command, [*options, "--name", name])
         assert isinstance(refused.exception, InputError)

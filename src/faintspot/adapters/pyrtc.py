@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import time
 from typing import Any
 
 import numpy as np
@@ -139,26 +138,11 @@ class _Frames:
         if not isinstance(name, str):
             raise InputError(f"wfs.frames: expected the name of a stream, got {name!r}")
         self._shape = int(conf["height"]), int(conf["width"])
-        self._follower = Follower(name, _logger.warning, self._incompatible, lambda: "waiting")
-        self._seen = 0
+        self._follower = Follower(name, _logger.warning, self._incompatible)
 
     def next_into(self, frame: NDArray[Any]) -> bool:
         """Wait a moment for a new frame; return whether there was one."""
-        follower = self._follower
-        if follower.source is None:
-            if follower.open() is None:
-                time.sleep(_MOMENT_S)
-                return False
-            self._seen = 0
-        source = follower.source
-        assert source is not None
-        if not source.wait(self._seen, _MOMENT_S):
-            happened = follower.lost()
-            if happened:
-                follower.say(happened)
-            return False
-        publication = source.read(None, _MOMENT_S)
-        self._seen = source.count if publication is None else publication.total
+        publication = self._follower.take(_MOMENT_S) if self._follower.wait(_MOMENT_S) else None
         if publication is not None:
             np.clip(publication.values, 0, np.iinfo(frame.dtype).max, out=frame, casting="unsafe")
         return publication is not None

@@ -212,16 +212,16 @@ def _watched(name: str, seconds: float, stop: threading.Event) -> Telemetry:
     """Return telemetry of an engine from now on, for `seconds` or until `stop` is set."""
     reader = TelemetryReader.attach(name)
     try:
-        cursors = [reader.newest, reader.newest_image]
-        records: list[NDArray[Any]] = [np.empty(0, reader.record_type)]
-        images: list[NDArray[Any]] = [np.empty(0, reader.image_type)]
+        cursors = [reader.records.written, reader.images.written]
+        records: list[NDArray[Any]] = [np.empty(0, reader.records.kind)]
+        images: list[NDArray[Any]] = [np.empty(0, reader.images.kind)]
         end, going_on = time.monotonic() + seconds, True
         while going_on:
             going_on = not stop.wait(_LOOK_S) and time.monotonic() < end
-            some, cursors[0], _ = reader.records_since(cursors[0])
+            some, cursors[0], _ = reader.records.since(cursors[0])
             records.append(some)
             if sum(map(len, images)) < _MOST_IMAGES:
-                some, cursors[1], _ = reader.images_since(cursors[1])
+                some, cursors[1], _ = reader.images.since(cursors[1])
                 images.append(some)
             if reader.stale and not stop.is_set():
                 raise InputError(f"{name}: the engine has ended")

@@ -79,7 +79,7 @@ def camera(config: str, name: str, frames: int | None, slots: int, seed: int | N
     from faintspot.simulate import Detector
 
     layout, known = Layout.load(config), Calibration.load(config)
-    values = {
+    values: dict[str, Any] = {
         "read_noise_e": 1.0 if known.read_noise_e is None else known.read_noise_e,
         "em_gain": known.em_gain,
         "gain_e_per_adu": known.gain_e_per_adu,

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from faintspot.base.errors import InputError
 from faintspot.config.written_changes import parse_changes, parse_subapertures
-from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request
+from faintspot.realtime.control import LENGTHY_TIMEOUT_S, request, since
 from faintspot.realtime.private_socket import socket_path
 from faintspot.realtime.recorder import Recorder
 
@@ -82,12 +82,12 @@ class EngineRequests:
         changes = parse_changes(texts)
         places = parse_subapertures(where) if where.strip() else None
         reply = self._ask("set", changes=changes, where=places)
-        return {"text": _since(reply["frame"])}
+        return {"text": since(reply["frame"])}
 
     def _interleave(self, asked: dict[str, Any]) -> Mapping[str, Any]:
         """Interleave configurations as `faintspot realtime interleave`."""
         reply = self._ask("interleave", arms=asked.get("arms"), every=asked.get("every"))
-        return {"text": _since(reply.get("frame"))}
+        return {"text": since(reply.get("frame"))}
 
     def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:
         """Control the loop: "action" open, close, flat or gain, with "gain"."""
@@ -163,7 +163,3 @@ class Recording:
             return
         text = f"{file}: {report.frames} frames in {report.seconds:.0f} s, {report.dropped} dropped"
         self._said = {"running": False, "text": f"{text} ({report.ended_because})"}
-
-
-def _since(frame: int | None) -> str:
-    return "taken at the next frame" if frame is None else f"in effect from frame {frame}"

@@ -22,7 +22,6 @@ from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.control.configuration import CONTROLLER, save_control
 from faintspot.control.learnt import INTEGRATOR, KALMAN
-from faintspot.live_page.streams import NewestOfStream
 from faintspot.pipeline import configuration as configuration_file
 from faintspot.pipeline.settings import Settings
 from faintspot.realtime.camera import StopEvent
@@ -30,6 +29,7 @@ from faintspot.realtime.child_processes import ChildProcesses
 from faintspot.realtime.control import request
 from faintspot.realtime.control_loop import CLOSED, STATES
 from faintspot.realtime.private_socket import socket_path
+from faintspot.realtime.stream import Follower
 from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.realtime.telescope import TRUTH
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
@@ -273,8 +273,8 @@ class _Watcher:
     def __init__(self, name: str, shown: Shown, looks_hz: float) -> None:
         self._shown, self._look_s = shown, max(1 / looks_hz, _LEAST_LOOK_S)
         self._reader = TelemetryReader.attach(name)
-        self._truth = NewestOfStream(f"{name}_truth")
-        self._cursor = self._reader.newest
+        self._truth = Follower(f"{name}_truth")
+        self._cursor = self._reader.records.written
 
     def __enter__(self) -> _Watcher:
         return self
@@ -293,10 +293,10 @@ class _Watcher:
         self._look()
 
     def _look(self) -> None:
-        taken = self._truth.take()
-        if taken is not None and len(taken[1]) == len(TRUTH):
-            self._shown.truth[taken[0]] = taken[1][_STREHL], taken[1][_COMMAND_FRAME]
-        records, self._cursor, _ = self._reader.records_since(self._cursor)
+        truth = self._truth.newest()
+        if truth is not None and len(truth.values) == len(TRUTH):
+            self._shown.truth[truth.number] = truth.values[_STREHL], truth.values[_COMMAND_FRAME]
+        records, self._cursor, _ = self._reader.records.since(self._cursor)
         latency_us = (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3
         columns = (records["frame"], records["arm"], records["loop"], latency_us)
         self._shown.rows += zip(*(each.tolist() for each in columns), strict=True)

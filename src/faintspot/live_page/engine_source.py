@@ -9,7 +9,7 @@ import numpy as np
 
 from faintspot.base.errors import InputError
 from faintspot.live_page.batch import Batch, Picture
-from faintspot.live_page.streams import NewestOfStream
+from faintspot.realtime.stream import Follower
 from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.realtime.telescope import TRUTH
 from faintspot.sensor.layout import Layout
@@ -39,7 +39,7 @@ class EngineSource:
         self.layout: Layout | None = None
         self.arms: list[str] = []
         self._reader: TelemetryReader | None = None
-        self._truth, self._commands = NewestOfStream(f"{name}_truth"), NewestOfStream(f"{name}_commands")
+        self._truth, self._commands = Follower(f"{name}_truth"), Follower(f"{name}_commands")
         self._cursors = [0, 0, 0]  # records, images, changes
         self._asked_s = 0.0
 
@@ -51,8 +51,8 @@ class EngineSource:
             return None
         truth = self._newest_truth()
         # Images first: each image's record was written before it, so it is among these records or older ones.
-        images, self._cursors[1], _ = reader.images_since(max(self._cursors[1], reader.newest_image - 1))
-        records, self._cursors[0], missed = reader.records_since(self._cursors[0])
+        images, self._cursors[1], _ = reader.images.since(max(self._cursors[1], reader.images.written - 1))
+        records, self._cursors[0], missed = reader.records.since(self._cursors[0])
         changes, self._cursors[2], _ = reader.changes_since(self._cursors[2])
         picture = None
         if len(images):
@@ -60,13 +60,13 @@ class EngineSource:
             picture = Picture(int(newest["image_frame"]), newest["raw"], newest["denoised"])
         if not len(records):
             self._let_go_if_stale(reader)
-        commands = self._commands.take()
+        commands = self._commands.newest()
         return Batch(
             records,
             missed,
             picture,
             truth=truth,
-            commands=None if commands is None else commands[1],
+            commands=None if commands is None else commands.values.astype(np.float64),
             changes=changes,
             anew=anew,
         )
@@ -95,7 +95,7 @@ class EngineSource:
             return False
         self._reader, self.layout = reader, reader.layout
         self.arms = reader.description["arms"]
-        self._cursors = [reader.newest, max(0, reader.newest_image - 1), 0]
+        self._cursors = [reader.records.written, max(0, reader.images.written - 1), 0]
         return True
 
     def _let_go_if_stale(self, reader: TelemetryReader) -> None:
@@ -108,8 +108,8 @@ class EngineSource:
             self._reader = None
 
     def _newest_truth(self) -> tuple[int, float, float] | None:
-        taken = self._truth.take()
-        if taken is None or len(taken[1]) != len(TRUTH):
+        truth = self._truth.newest()
+        if truth is None or len(truth.values) != len(TRUTH):
             return None
-        strehl, rms_nm = taken[1][list(_TRUTH_FIELDS)]
-        return (taken[0], float(strehl), float(rms_nm)) if np.isfinite([strehl, rms_nm]).all() else None
+        strehl, rms_nm = truth.values[list(_TRUTH_FIELDS)]
+        return (truth.number, float(strehl), float(rms_nm)) if np.isfinite([strehl, rms_nm]).all() else None

@@ -99,10 +99,7 @@ class LiveServer:
         _limit_logging()
         self._http = HTTPServer(
             Application(
-                [
-                    (r"/stream", Client, {"server": self}),
-                    (r"/([a-z_.]*)", Asset, {"server": self}),
-                ],
+                [(r"/stream", Client, {"server": self}), (r"/([a-z_.]*)", Asset, {"server": self})],
                 log_function=lambda handler: None,
                 websocket_max_message_size=LARGEST_REQUEST,
                 websocket_ping_interval=20,

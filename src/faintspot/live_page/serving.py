@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +16,23 @@ from faintspot.live_page.server import LiveServer
 from faintspot.live_page.status import StatusPoller
 from faintspot.realtime.camera import StopEvent
 
-PORT = 8642
 
-
-def serve_engine(
-    name: str,
+def serve(
+    shown: str | Path,
     stop: StopEvent,
     ready: Callable[[LiveServer], None],
     *,
     address: str = "127.0.0.1",
-    port: int = PORT,
+    port: int = 8642,
     private: bool = False,
     folder: str | Path = ".",
 ) -> None:
-    """Serve the page of a running engine until `stop` is set.
+    """Serve the page of a running engine, or of a recording, until `stop` is set.
 
     Parameters
     ----------
-    name : str
-        Name of the engine, which may start later and restart.
+    shown : str or Path
+        Name of the engine, which may start later and restart; or path of a recording.
     stop : event
     ready : function
         Called when the server is ready.
@@ -44,59 +43,33 @@ def serve_engine(
     private : bool
         Whether reading needs the token even on this machine.
     folder : path
-        Folder for recordings started from the page.
+        Folder for recordings started from the page of an engine.
 
     Raises
     ------
     InputError
-        When the address is not valid, or cannot be bound.
+        When the address is not valid or cannot be bound, or the path is not a recording.
     MissingExtraError
         When tornado or pyshmem is not installed.
     """
 
-    async def work() -> None:
-        source, client_requests = EngineSource(name), EngineRequests(name, folder)
-        server = LiveServer(source, client_requests, Access(address, private), address, port)
+    async def work(used: ExitStack) -> None:
+        access = Access(address, private)
+        if isinstance(shown, Path):
+            recording = RecordingSource(shown)
+            server = LiveServer(recording, recording, access, address, port)
+        else:
+            source = used.enter_context(closing(EngineSource(shown)))
+            requests = used.enter_context(closing(EngineRequests(shown, folder)))
+            server = LiveServer(source, requests, access, address, port)
 
-        def told(kind: str, values: dict[str, Any]) -> None:
-            server.tell(
-                kind,
-                {**values, "recording": client_requests.recording.status()} if kind == "status" else values,
-            )
+            def told(kind: str, values: dict[str, Any]) -> None:
+                recording = {"recording": requests.recording.status()} if kind == "status" else {}
+                server.tell(kind, values | recording)
 
-        poller = StatusPoller(name, told)
-        try:
-            ready(server)
-            await server.run(stop)
-        finally:
-            poller.close()
-            client_requests.close()
-            source.close()
-
-    asyncio.run(work())
-
-
-def serve_recording(
-    path: str | Path,
-    stop: StopEvent,
-    ready: Callable[[LiveServer], None],
-    *,
-    address: str = "127.0.0.1",
-    port: int = PORT,
-    private: bool = False,
-) -> None:
-    """Serve the page of a recording until `stop` is set; see `serve_engine`.
-
-    Raises
-    ------
-    InputError
-        When the file is not a recording, or the address as for `serve_engine`.
-    """
-
-    async def work() -> None:
-        source = RecordingSource(path)
-        server = LiveServer(source, source, Access(address, private), address, port)
+            used.enter_context(closing(StatusPoller(shown, told)))
         ready(server)
         await server.run(stop)
 
-    asyncio.run(work())
+    with ExitStack() as used:
+        asyncio.run(work(used))

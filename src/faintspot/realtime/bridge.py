@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 
 from faintspot.base.checks import number_between
-from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.replay import ring_type
-from faintspot.realtime.stream import Follower
+from faintspot.realtime.stream import Follower, Stream, StreamCounters
 
 SPIN_S = 0.02
 """Time after a frame during which the bridge polls for the next one without a pause [s]."""
@@ -35,21 +34,13 @@ _LOOK_S = 0.1  # between two attempts to open a missing stream
 
 
 @dataclass(slots=True)
-class BridgeCounters:
-    """Counters of a bridge, changed in place."""
+class BridgeCounters(StreamCounters):
+    """Counters of a bridge, changed in place; `taken` counts the frames published in the ring."""
 
-    frames: int = 0
-    """Frames published in the ring."""
-    missed: int = 0
-    """Publications that were overwritten before they were read."""
     not_ahead: int = 0
     """Frames whose number was not above that of the frame before: two writers, or a source that restarted."""
-    incomplete: int = 0
-    """Publications whose writer died or paused before they were complete."""
     stalls: int = 0
     """Number of times that no frame came for `STALL_S`."""
-    restarts: int = 0
-    """Number of times that the stream was recreated or its publication count jumped."""
 
 
 class StreamBridge:
@@ -90,12 +81,19 @@ class StreamBridge:
         spins: bool | None = None,
     ) -> None:
         self.stream, self.name, self._slots = stream, name, slots
-        self._follower = Follower(stream, say or (lambda _: None), _incompatible, lambda: "waiting")
         self.counters = BridgeCounters()
+        self._follower = Follower(
+            stream,
+            say or (lambda _: None),
+            _incompatible,
+            counters=self.counters,
+            holds="pixels",
+            prepare=self._prepare,
+        )
         enough = len(os.sched_getaffinity(0)) >= SPINNING_NEEDS
         self._spin_s = SPIN_S if (enough if spins is None else spins) else 0.0
         self._ring: PixelRing | None = None
-        self._seen, self._last_number = 0, -1
+        self._last_number = -1
         self._arrived, self._silent = -math.inf, True
 
     def run(self, n_frames: int | None = None, stop: StopEvent | None = None) -> BridgeCounters:
@@ -110,7 +108,7 @@ class StreamBridge:
         limit = None if n_frames is None else int(number_between("n_frames", n_frames, 1, integer=True))
         counters = self.counters
         try:
-            while not (stop is not None and stop.is_set()) and (limit is None or counters.frames < limit):
+            while not (stop is not None and stop.is_set()) and (limit is None or counters.taken < limit):
                 self.step()
         finally:
             self.close()
@@ -124,18 +122,14 @@ class StreamBridge:
         InputError
             As `run`.
         """
-        if self._follower.source is None:
-            if not self._open():
-                time.sleep(_LOOK_S)
-        elif self._new_one():
+        if self._follower.source is not None and self._new_one():
             return self._pass_on()
-        else:
-            self._look_after()
+        self._look_after()
         return False
 
     def close(self) -> None:
         """Close the stream and remove the ring."""
-        self._let_go()
+        self._follower.close()
         if self._ring is not None:
             self._ring.close()
             self._ring = None
@@ -144,7 +138,7 @@ class StreamBridge:
 
     def _new_one(self) -> bool:
         """Wait for a publication; return False if none comes in time."""
-        source, seen = self._follower.source, self._seen
+        source, seen = self._follower.source, self._follower.seen
         assert source is not None
         end = self._arrived + self._spin_s
         while source.count == seen:
@@ -154,75 +148,55 @@ class StreamBridge:
 
     def _pass_on(self) -> bool:
         """Copy the newest publication into the ring; return whether it was whole."""
-        source, ring, counters = self._follower.source, self._ring, self.counters
+        follower, source, ring, counters = self._follower, self._follower.source, self._ring, self.counters
         assert source is not None
         assert ring is not None
         expected = source.number
         slot = ring.begin(expected)
         with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
-            publication = source.read(slot, _PARK_S)
+            publication = follower.take(_PARK_S, slot)
         if publication is None:
-            counters.incomplete += 1
-            self._seen = source.count
+            follower.seen = source.count
             return False
         number = publication.number
         if number != expected:  # a newer frame was published meanwhile
             ring.begin(number)[...] = slot.copy()
         ring.end()
-        counters.frames += 1
-        missed = left_out(self._seen, publication.total)
-        counters.missed += max(missed, 0)
-        counters.restarts += missed < 0 and publication.total > self._seen
+        counters.taken += 1
         counters.not_ahead += number <= self._last_number
         if self._silent and self._last_number >= 0:
-            self._follower.say("resumed")
-        self._seen, self._last_number = publication.total, number
+            follower.say("resumed")
+        self._last_number = number
         self._arrived, self._silent = time.monotonic(), False
         return True
 
     # ---- the stream
 
-    def _open(self) -> bool:
-        """Open the stream and make its ring; return whether both succeeded."""
-        source = self._follower.open()
-        if source is None:
-            return False
-        # Publications before the first contact are not missed; those of a new producer are.
-        self._seen = source.count if self._ring is None else 0
-        self._last_number = -1
-        rows, columns = source.shape
-        self._make_ring((rows, columns), ring_type(source.dtype))
-        self._follower.say(f"{rows} x {columns} pixels ({source.dtype}), {source.maker}")
-        return True
-
-    def _make_ring(self, shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
-        """Make a ring of that shape and type, unless there is one."""
-        ring = self._ring
-        if ring is not None and (ring.shape, ring.dtype) == (shape, dtype):
-            return
-        if ring is not None:
-            ring.close()
-        self._ring = PixelRing.create(self.name, shape, dtype, slots=self._slots)
-
     def _look_after(self) -> None:
-        """Check whether a silent stream still exists, and report when it has stalled."""
-        follower, source = self._follower, self._follower.source
-        assert source is not None
-        happened = follower.lost()
-        if happened:
-            follower.say(happened)
-            self.counters.restarts += 1
-            self._silent = True
+        """Look whether the stream is there and the same, and report when it has stalled."""
+        follower = self._follower
+        if follower.look() is not None:
+            return
+        if follower.source is None:
+            time.sleep(_LOOK_S)
         elif not self._silent and time.monotonic() - self._arrived > STALL_S:
             lives = {True: ", which made it, is alive", False: ", which made it, has ended", None: ""}
-            follower.say(f"no frame for {STALL_S:g} s; {source.maker}{lives[source.maker_lives()]}")
+            made = f"{follower.source.maker}{lives[follower.source.maker_lives()]}"
+            follower.say(f"no frame for {STALL_S:g} s; {made}")
             self.counters.stalls += 1
             self._silent = True
 
-    def _let_go(self) -> None:
-        """Close the stream."""
-        self._follower.close()
-        self._silent = True
+    def _prepare(self, source: Stream) -> None:
+        """Make a ring of a stream's shape and type, unless there is one."""
+        self._last_number, self._silent = -1, True
+        ring, (rows, columns), dtype = self._ring, source.shape, ring_type(source.dtype)
+        if ring is None:  # publications before the first contact are not missed
+            self._follower.seen = source.count
+        elif (ring.shape, ring.dtype) == (source.shape, dtype):
+            return
+        else:
+            ring.close()
+        self._ring = PixelRing.create(self.name, (rows, columns), dtype, slots=self._slots)
 
 
 def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:

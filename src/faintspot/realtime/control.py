@@ -40,6 +40,8 @@ Result = TypeVar("Result")
 LARGEST_REQUEST = 64 * 1024
 LENGTHY_TIMEOUT_S = 180.0
 """Time that a client waits for a command that prepares something new and may compile [s]."""
+EFFECT_TIMEOUT_S = 0.5
+"""Time that a server waits for a change to take effect; then it replies that no frame came [s]."""
 _LARGEST_REPLY = 16 * 1024 * 1024
 _MOST_CONNECTIONS = 64
 _IDLE_S = 30.0  # idle time after which a connection is closed
@@ -92,6 +94,11 @@ def request(path: str | Path, command: str, /, *, timeout_s: float = 5.0, **fiel
         except OSError as error:
             raise InputError(f"the {kind} {name} cannot be reached: {error.strerror or error}") from None
     return _checked_reply(f"{kind} {name}", reply)
+
+
+def since(frame: int | None) -> str:
+    """Describe from which frame on a change is in effect; None: none has come yet."""
+    return "taken at the next frame" if frame is None else f"in effect from frame {frame}"
 
 
 class ControlServer(Closing):
@@ -305,6 +312,20 @@ def _parsed_request(line: bytes) -> dict[str, Any]:
     if not isinstance(message, dict):
         raise InputError(f"request: expected a JSON object in one line, got {line[:40]!r}")
     return message
+
+
+def changes_of(fields: dict[str, Any]) -> dict[str, Any]:
+    """Return the new values of a request, by name.
+
+    Raises
+    ------
+    InputError
+        When there are none.
+    """
+    changes = fields.get("changes")
+    if not isinstance(changes, dict) or not changes:
+        raise InputError("changes: expected values by name, got none")
+    return changes
 
 
 # The client -----------------------------------------------------------------------------------------

@@ -10,13 +10,12 @@ from typing import Any
 
 from faintspot.base.errors import InputError
 from faintspot.estimators import registry
+from faintspot.realtime.control import EFFECT_TIMEOUT_S
 from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
 from faintspot.realtime.estimator_file import EstimatorFile, load_estimators
 from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.trial import Trial
-
-_EFFECT_TIMEOUT_S = 0.5
 
 
 class EngineEstimators:
@@ -90,7 +89,7 @@ class EngineEstimators:
                 raise InputError(f"estimator {name!r}: not loaded, expected one of: {known}")
             newest, frame = self._live.newest, None
             if name in newest.estimator_names and newest.fallback is not None:
-                frame = self._live.wait(self._fallen_back(newest.fallback), _EFFECT_TIMEOUT_S)
+                frame = self._live.wait(self._fallen_back(newest.fallback), EFFECT_TIMEOUT_S)
             kind = self.loaded.pop(name).kinds[name]
             registry.restore({key: each for key, each in registry.estimators().items() if key != name})
             if all(kind.__module__ != each.__module__ for each in registry.estimators().values()):
@@ -116,4 +115,4 @@ class EngineEstimators:
         if not names & newest.estimator_names:
             return None
         change = self._live.propose({"estimator": newest.settings.estimator.name})
-        return self._live.wait(change, _EFFECT_TIMEOUT_S)
+        return self._live.wait(change, EFFECT_TIMEOUT_S)

@@ -35,12 +35,9 @@ class EnginePlan:
         Settings that the configurations' changes are added to.
     interleaving : Interleaving
         The configurations that take turns.
-    workers : Workers, optional
-    budget_s : float
-        Time limit for one frame of an estimator in NumPy.
-    prior : Prior, optional
-        Prior of all frames; see `FramePath`.
-    fallback : PreparedSettings, optional
+    new_path : function
+        Makes the frame path of a pipeline, compiled and warmed up, from the memory and progress of frames.
+    fallback : EnginePlan, optional
         Replacement when a user-defined estimator fails.
     """
 
@@ -49,14 +46,11 @@ class EnginePlan:
         pipelines: Sequence[SlopePipeline],
         settings: Settings,
         interleaving: Interleaving,
-        workers: Workers | None,
-        budget_s: float,
-        prior: Prior | None = None,
+        new_path: Callable[[SlopePipeline, NDArray[Any], Progress], FramePath],
         fallback: EnginePlan | None = None,
     ) -> None:
         self.settings, self.layout, self.interleaving = settings, pipelines[0].layout, interleaving
-        self.pipelines, self.fallback = tuple(pipelines), fallback
-        self._workers, self._budget_s, self._prior = workers, budget_s, prior
+        self.pipelines, self.fallback, self._new_path = tuple(pipelines), fallback, new_path
         self._ring: PixelRing | None = None
         self._paths: tuple[FramePath, ...] = ()
 
@@ -86,16 +80,6 @@ class EnginePlan:
         for dtype in (np.uint16, np.float32):
             for pipeline in self.pipelines:
                 self._new_path(pipeline, np.zeros((1, *self.layout.frame_shape), dtype), progress)
-
-    def _new_path(self, pipeline: SlopePipeline, pixels: NDArray[Any], progress: Progress) -> FramePath:
-        made_for = pipeline, pixels, progress
-        path = (
-            PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
-            if pipeline.plan.prepared.in_python
-            else FramePath(*made_for, workers=self._workers, prior=self._prior)
-        )
-        path.warm_up()
-        return path
 
 
 class SettingsPreparer:
@@ -142,8 +126,8 @@ class SettingsPreparer:
         for pipeline in pipelines:
             check_real_time(pipeline)
         own = all(is_built_in(each.estimator) for each in arms)
-        prepared = self._prepared(
-            pipelines, settings, self.interleaving, None if own else self._fallback(settings)
+        prepared = EnginePlan(
+            pipelines, settings, self.interleaving, self._new_path, None if own else self._fallback(settings)
         )
         if self.ring is None:
             prepared.warm_up()
@@ -162,17 +146,17 @@ class SettingsPreparer:
         """Prepare the same settings with a built-in estimator and no interleaving."""
         settings, arms = self.built_in(settings), self.interleaving
         alone = arms if len(arms.arms) == 1 else Interleaving(first=arms.first + len(arms.arms))
-        return self._prepared([self.make_pipeline(settings)], settings, alone, None)
+        return EnginePlan([self.make_pipeline(settings)], settings, alone, self._new_path)
 
-    def _prepared(
-        self,
-        pipelines: Sequence[SlopePipeline],
-        settings: Settings,
-        arms: Interleaving,
-        fallback: EnginePlan | None,
-    ) -> EnginePlan:
-        made_for = self._workers, self._budget_s, self._prior
-        return EnginePlan(pipelines, settings, arms, *made_for, fallback)
+    def _new_path(self, pipeline: SlopePipeline, pixels: NDArray[Any], progress: Progress) -> FramePath:
+        made_for = pipeline, pixels, progress
+        path = (
+            PythonPath(*made_for, workers=self._workers, prior=self._prior, budget_s=self._budget_s)
+            if pipeline.plan.prepared.in_python
+            else FramePath(*made_for, workers=self._workers, prior=self._prior)
+        )
+        path.warm_up()
+        return path
 
     def _pipeline(self, settings: Settings) -> SlopePipeline:
         if is_built_in(settings.estimator):

@@ -6,7 +6,6 @@ import contextlib
 import math
 import mmap
 import os
-import secrets
 import stat
 import time
 from pathlib import Path
@@ -36,7 +35,7 @@ from faintspot.realtime.image_layout import (
     path_of,
     places_of,
 )
-from faintspot.realtime.pixel_segment import identity_of
+from faintspot.realtime.pixel_segment import identity_of, new_memory
 from faintspot.realtime.processes import process_start
 from faintspot.realtime.publication import LARGEST_NUMBER, Publication
 from faintspot.realtime.semaphores import BYTES as SEMAPHORE_BYTES
@@ -227,15 +226,7 @@ class ImageStreamWriter:
             places = places_of(kind, np.ndarray((), METADATA[kind], memory))
             self._mapped = _Mapped(kind, memory, places, self.shape)
         else:
-            memory, hidden = _made(self.path, places.total, head)
-            self._mapped = _Mapped(kind, memory, places, self.shape)
-            if kind == ISIO:
-                for number in range(SEMAPHORES):
-                    Semaphore.made(self._mapped.semaphore(number))
-                Semaphore.made(self._mapped.address + places.log_semaphore)
-                self._mapped.pids(places.readers)[:] = -1
-                self._mapped.pids(places.writers)[:] = os.getpid()
-            os.replace(hidden, self.path)  # never visible under its name before it is complete
+            self._mapped = self._made(head, places)
         self._identity = identity_of(self.path.stat())
         self._keyword = self._keywords()
         self._semaphores = self._posted()
@@ -267,6 +258,27 @@ class ImageStreamWriter:
                 if self.kind == DAO:
                     for name in self._names():
                         Semaphore.unlink(name)
+
+    def _made(self, head: NDArray[Any], places: Places) -> _Mapped:
+        """Make the stream's file."""
+        try:
+            with new_memory(self.path, places.total, 0o666) as (memory, hidden):
+                if self.kind == ISIO:
+                    head["inode"] = hidden.stat().st_ino
+                memory[: head.nbytes] = head.tobytes()
+                mapped = _Mapped(self.kind, memory, places, self.shape)
+                if self.kind == ISIO:
+                    for number in range(SEMAPHORES):
+                        Semaphore.made(mapped.semaphore(number))
+                    Semaphore.made(mapped.address + places.log_semaphore)
+                    mapped.pids(places.readers)[:] = -1
+                    mapped.pids(places.writers)[:] = os.getpid()
+                os.replace(hidden, self.path)
+                return mapped
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: this stream cannot be made: {places.total} bytes ({error.strerror})"
+            ) from None
 
     def _head(self, dtype: np.dtype[Any]) -> NDArray[Any]:
         """Return the metadata of a new stream."""
@@ -357,27 +369,6 @@ def _there(kind: str, path: Path) -> tuple[NDArray[Any], mmap.mmap] | None:
             f"{kind}:{path}: a living process made this stream (pid {maker}); stop it or choose another name"
         )
     return np.array(head), memory
-
-
-def _made(path: Path, size: int, head: NDArray[Any]) -> tuple[mmap.mmap, Path]:
-    """Make a stream's file under a hidden name, with its metadata; return its memory and that name."""
-    hidden = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    try:
-        descriptor = os.open(hidden, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        try:
-            os.posix_fallocate(descriptor, 0, size)
-            memory = mmap.mmap(descriptor, size)
-            if "inode" in (head.dtype.names or ()):
-                head["inode"] = os.fstat(descriptor).st_ino
-            memory[: head.nbytes] = head.tobytes()
-            return memory, hidden
-        except BaseException:
-            hidden.unlink(missing_ok=True)
-            raise
-        finally:
-            os.close(descriptor)
-    except OSError as error:
-        raise InputError(f"{path}: this stream cannot be made: {size} bytes ({error.strerror})") from None
 
 
 def _clock() -> tuple[int, int]:

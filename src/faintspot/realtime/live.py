@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from faintspot.base.checks import number_between, numbers_between
+from faintspot.base.checks import numbers_between
 from faintspot.base.errors import InputError
 from faintspot.base.toml_files import check_known
 from faintspot.config.options import PerSubaperture
@@ -23,6 +23,7 @@ from faintspot.pipeline.settings import Settings, check_option, option_names
 from faintspot.sensor.layout import Layout
 
 HISTORY_LENGTH = 1000
+"""Number of changes that are remembered."""
 _POLL_S = 0.001
 
 
@@ -79,8 +80,6 @@ class LiveSettings(Generic[Prepared]):
         thread at a time.
     settings : Settings
         Initial settings.
-    history_length : int
-        Number of changes to remember.
 
     Raises
     ------
@@ -88,12 +87,7 @@ class LiveSettings(Generic[Prepared]):
         When the initial settings do not fit.
     """
 
-    def __init__(
-        self,
-        prepare: Callable[[Settings], Prepared],
-        settings: Settings,
-        history_length: int = HISTORY_LENGTH,
-    ) -> None:
+    def __init__(self, prepare: Callable[[Settings], Prepared], settings: Settings) -> None:
         self._prepare = prepare
         # `take` takes neither of them.
         self._proposing = threading.Lock()  # held while settings are prepared, which may take seconds
@@ -105,9 +99,7 @@ class LiveSettings(Generic[Prepared]):
         # Written by the engine alone.
         self._running = first
         self._replaced: deque[_Version[Prepared]] = deque()
-        self._record: deque[Change] = deque(
-            maxlen=int(number_between("history_length", history_length, 1, integer=True))
-        )
+        self._record: deque[Change] = deque(maxlen=HISTORY_LENGTH)
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -234,13 +226,6 @@ class LiveSettings(Generic[Prepared]):
             time.sleep(_POLL_S)
         return frame_number
 
-    def history(self) -> list[tuple[int, dict[str, Any], list[int] | None]]:
-        """Return the changes that took effect, oldest first: frame number, new values, sub-apertures.
-
-        Changes between the same two frames have the same frame number.
-        """
-        return [(frame_number, values, where) for frame_number, _, values, where in self.taken()]
-
     def taken(self, after: int = 0) -> list[tuple[int, int, dict[str, Any], list[int] | None]]:
         """Return the changes that took effect: frame number, number, new values, sub-apertures.
 
@@ -263,10 +248,6 @@ class LiveSettings(Generic[Prepared]):
     def change_number(self) -> int:
         """Number of the last running change; 0 before the first."""
         return self._running.change.number
-
-    def waiting(self) -> int:
-        """Return the number of changes that wait for a frame."""
-        return self._newest.change.number - self._running.change.number
 
     def get(self, names: Sequence[str] | None = None) -> dict[str, Any]:
         """Return running values by name (default: all) as plain numbers, texts and lists.

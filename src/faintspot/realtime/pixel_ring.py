@@ -24,7 +24,6 @@ import mmap
 import os
 import time
 from contextlib import suppress
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -70,7 +69,6 @@ __all__ = [
     "PixelRing",
 ]
 
-_SPIN_S, _NAP_S = 200e-6, 50e-6
 _LINE = CELL_BYTES // 8
 
 
@@ -319,24 +317,6 @@ class PixelRing:
         moment = self._look(FIRST_SLOT + frame % self.slots, SLOT_TIME)
         return moment if self._holds(frame, arrival) else 0
 
-    def wait(self, frame: int, rows: int, timeout_s: float) -> bool:
-        """Wait until the first `rows` rows of a frame have arrived; return False if they do not.
-
-        Polls for a moment, then sleeps briefly between polls. Returns False early when the ring is closed, or
-        when a later frame is arriving and this one is not held or was left incomplete.
-        """
-        start = time.perf_counter()
-        while True:
-            arriving, complete = self.progress()
-            if (arriving == frame and complete >= rows) or self.last_row_time_ns(frame):
-                return True
-            elapsed = time.perf_counter() - start
-            if elapsed >= timeout_s or arriving > frame or self.closed:
-                # Completed between the two checks above?
-                return bool(self.last_row_time_ns(frame))
-            if elapsed > _SPIN_S:
-                time.sleep(_NAP_S)
-
     def _holds(self, frame: int, arrival: int | None) -> bool:
         slot = FIRST_SLOT + frame % self.slots
         held = self._look(slot, SLOT_FRAME) == frame
@@ -367,10 +347,5 @@ class PixelRing:
     def __enter__(self) -> PixelRing:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -10,7 +10,8 @@ import secrets
 import stat
 import struct
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,28 +139,36 @@ def create_segment(path: Path, header: Header) -> tuple[mmap.mmap, tuple[int, in
         When a living process or another object has the name, or shared memory is short.
     """
     _remove_dead(path)
-    # Never visible under its name before it is complete.
-    unnamed = FOLDER / f".{path.name}.{secrets.token_hex(8)}"
     try:
-        descriptor = os.open(unnamed, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-        try:
-            os.posix_fallocate(descriptor, 0, header.total_bytes)
-            memory = mmap.mmap(descriptor, header.total_bytes)
+        with new_memory(path, header.total_bytes) as (memory, hidden):
             packed = header.pack()
             memory[: len(packed)] = packed
             cells = cells_of(memory, header)
             cells[FRAME, 0] = -1
             cells[FIRST_SLOT:, SLOT_FRAME] = -1
-            os.link(unnamed, path)
-            return memory, identity_of(os.fstat(descriptor))
-        finally:
-            os.unlink(unnamed)
-            os.close(descriptor)
+            os.link(hidden, path)
+            return memory, identity_of(hidden.stat())
     except FileExistsError:
         raise InputError(f"{path}: another process is creating this pixel ring at the same time") from None
     except OSError as error:
         size = f"{header.total_bytes / 2**20:.1f} MiB"
         raise InputError(f"{path}: cannot be created, {size} ({error.strerror or error})") from None
+
+
+@contextmanager
+def new_memory(path: Path, size: int, mode: int = 0o600) -> Iterator[tuple[mmap.mmap, Path]]:
+    """Make memory of a file under a hidden name, which is removed at the end; give both.
+
+    A file is linked or renamed to its path when it is complete, so that nobody sees it before.
+    """
+    hidden = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    descriptor = os.open(hidden, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    try:
+        os.posix_fallocate(descriptor, 0, size)
+        yield mmap.mmap(descriptor, size), hidden
+    finally:
+        hidden.unlink(missing_ok=True)
+        os.close(descriptor)
 
 
 def open_segment(path: Path, follows: bool) -> tuple[mmap.mmap, Header, tuple[int, int], NDArray[np.int64]]:

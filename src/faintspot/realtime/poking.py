@@ -63,9 +63,9 @@ class StreamedMirror(Closing):
     def close(self) -> None:
         """Flatten the mirror, and remove the stream after the mirror has had time to read it."""
         self._send(np.zeros(self.commands))
-        newest = self._reader.newest
+        newest = self._reader.records.written
         end = time.monotonic() + 1.0
-        while self._reader.newest < newest + 2 and time.monotonic() < end:
+        while self._reader.records.written < newest + 2 and time.monotonic() < end:
             time.sleep(_POLL_S)
         self._stream.unlink()
         self._reader.close()
@@ -79,12 +79,12 @@ class StreamedMirror(Closing):
             When no frames come, or the engine ends.
         """
         self._send(command)
-        cursor = self._reader.newest
+        cursor = self._reader.records.written
         after = None
         found: list[NDArray[np.void]] = []
         count, end = 0, time.monotonic() + _NO_FRAMES_S
         while count < self._frames:
-            records, cursor, _ = self._reader.records_since(cursor)
+            records, cursor, _ = self._reader.records.since(cursor)
             if not len(records):
                 self._wait(end)
                 continue
@@ -97,7 +97,7 @@ class StreamedMirror(Closing):
         return np.concatenate([seen["x"], seen["y"]], axis=1).astype(np.float64), seen["flags"]
 
     def _send(self, command: Floats) -> None:
-        self._stream.write(command.astype(np.float32), frame_id=max(self._reader.newest - 1, 0))
+        self._stream.write(command.astype(np.float32), frame_id=max(self._reader.records.written - 1, 0))
 
     def _wait(self, end: float) -> None:
         if self._reader.stale:

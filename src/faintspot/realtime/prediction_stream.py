@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from faintspot.realtime.prior import Prior
-from faintspot.realtime.shared_streams import lock_file, pyshmem_module
+from faintspot.realtime.stream import Follower
 
 _READ_S = 2e-4  # to wait for a writer in the middle of a publication
 
@@ -48,30 +48,24 @@ class PredictionStream:
     """
 
     def __init__(self, name: str, prior: Prior) -> None:
-        self._pyshmem: Any = pyshmem_module("reading predictions in shared memory")
         self.stream, self._prior = f"{name}_prediction", prior
-        self._slopes = prior.mean_px.size
-        self._length = 2 * self._slopes + 1
-        self._source: Any = None
-        self.counters, self.obstacle = PredictionCounters(), "is not there"
+        self._values = np.zeros(2 * prior.mean_px.size + 1)
+        self.counters = PredictionCounters()
+        self._follower = Follower(self.stream, incompatible=self._incompatible)
         self.look_after()
 
     def fill(self, number: int) -> None:
         """Set the prior to the prediction for a frame, or to none; for the engine's thread."""
         self._prior.forget()
-        source, counters = self._source, self.counters
-        if source is None or not source.count:
-            counters.late += 1
-            return
+        source, counters, values = self._follower.source, self.counters, self._values
         try:
-            values = source.read(timeout=_READ_S)
-        except Exception:  # the writer died, or the stream was closed meanwhile
+            whole = source is not None and source.count and source.read(values, _READ_S) is not None
+        except Exception:  # the stream was closed meanwhile
+            whole = False
+        if not whole or values[-1] != number:
             counters.late += 1
             return
-        if values[-1] != number:
-            counters.late += 1
-            return
-        mean, variance = values[:-1].astype(np.float64).reshape(2, -1)
+        mean, variance = values[:-1].reshape(2, -1)
         if not np.abs(mean).max() <= self._prior.largest_px:
             counters.refused += 1
             return
@@ -80,41 +74,18 @@ class PredictionStream:
 
     def look_after(self) -> None:
         """Check whether the stream is the same, and try to open a missing one; for any other thread."""
-        source = self._source
-        try:
-            there = self._pyshmem.stat(self.stream)["instance_id"]
-        except (OSError, ValueError):
-            there = None
-        if source is not None:
-            if there == source.instance_id:
-                return
-            self.counters.restarts += 1
-            self.close()
-        if there is None:
-            self.obstacle = "is not there"
-        else:
-            self._open()
+        self._follower.look()
+        self.counters.restarts = self._follower.counters.restarts
 
     def status(self) -> dict[str, Any]:
         """Return the stream's state as plain values."""
-        return {"stream": self.stream, "obstacle": self.obstacle, **asdict(self.counters)}
+        return {"stream": self.stream, "obstacle": self._follower.obstacle, **asdict(self.counters)}
 
     def close(self) -> None:
         """Close the stream."""
-        source, self._source = self._source, None
-        if source is not None:
-            with contextlib.suppress(Exception):
-                source.close()
+        with contextlib.suppress(Exception):
+            self._follower.close()
 
-    def _open(self) -> None:
-        lock_file(self.stream)  # refuse a folder that is not private
-        try:
-            source = self._pyshmem.open(self.stream, gpu_device=False)
-        except (OSError, ValueError) as error:
-            self.obstacle = f"cannot be opened ({' '.join(str(error).split())})"
-            return
-        if tuple(source.shape) != (self._length,) or source.dtype.kind != "f":
-            self.obstacle = f"holds {tuple(source.shape)} {source.dtype}, expected ({self._length},) floats"
-            source.close()
-            return
-        self._source, self.obstacle = source, ""
+    def _incompatible(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+        """Return what was expected, or "" if these can be predictions."""
+        return "" if shape == self._values.shape and dtype.kind == "f" else f"{self._values.shape} floats"

@@ -77,8 +77,8 @@ class _Waiting:
     def read(self, reader: TelemetryReader, limit: int) -> bool:
         """Read what is available, up to `limit` frames in total; return whether there was anything."""
         most = min(limit - self.frames_read, _MOST_RECORDS)
-        records, self.record_cursor, dropped = reader.records_since(self.record_cursor, most)
-        images, self.image_cursor, dropped_images = reader.images_since(self.image_cursor, _MOST_IMAGES)
+        records, self.record_cursor, dropped = reader.records.since(self.record_cursor, most)
+        images, self.image_cursor, dropped_images = reader.images.since(self.image_cursor, _MOST_IMAGES)
         changes, self.change_cursor, dropped_changes = reader.changes_since(self.change_cursor)
         self.dropped += dropped
         self.dropped_images += dropped_images
@@ -93,8 +93,8 @@ class _Waiting:
 
     def taken(self, reader: TelemetryReader) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the buffered records and images, and clear the buffers."""
-        records = np.concatenate([np.empty(0, reader.record_type), *self.records])
-        images = np.concatenate([np.empty(0, reader.image_type), *self.images])
+        records = np.concatenate([np.empty(0, reader.records.kind), *self.records])
+        images = np.concatenate([np.empty(0, reader.images.kind), *self.images])
         self.records, self.images, self.n_bytes = [], [], 0
         return records, images
 
@@ -127,7 +127,7 @@ class Recorder:
 
     def __init__(self, name: str, path: str | Path) -> None:
         self._reader = reader = TelemetryReader.attach(name)
-        self._waiting = _Waiting(reader.newest, reader.newest_image)
+        self._waiting = _Waiting(reader.records.written, reader.images.written)
         attributes = {
             "name": name,
             "layout": reader.description["layout"],
@@ -136,7 +136,7 @@ class Recorder:
             "parts": reader.description.get("parts"),
             **self._waiting.attributes(reader),
         }
-        self._store = TelemetryStore(path, reader.record_type, reader.image_type, attributes)
+        self._store = TelemetryStore(path, reader.records.kind, reader.images.kind, attributes)
         self._longest_write_s = self._written_at = self._asked_at = 0.0
 
     def run(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import chain
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -104,11 +104,11 @@ class Replay(Readout):
         self.n_frames = None if repeat else count
         self._waits, self.lost = waits, 0
         self._source, self._range = source, (begin, begin + count)
-        self._ahead: queue.Queue[NDArray[Any] | InputError | None] = queue.Queue(_BLOCKS_AHEAD)
         self._block: Iterator[NDArray[Any]] = iter(())
-        self._ending = threading.Event()
-        self._stop: StopEvent = self._ending
-        self._reader = threading.Thread(target=self._read, name="faintspot-reader", daemon=True)
+        self._chunks = self._converted()
+        self._reader = ThreadPoolExecutor(1, "faintspot-reader")
+        self._ahead: deque[Future[NDArray[Any] | None]] = deque()
+        self._stop: StopEvent = threading.Event()
 
     def run(
         self,
@@ -121,7 +121,7 @@ class Replay(Readout):
         With `waits` it starts no earlier than the engine. It ends when the engine, if any, has measured the
         last frame.
         """
-        self._stop, ring = self._ending if stop is None else stop, self._ring
+        self._stop, ring = threading.Event() if stop is None else stop, self._ring
         while self._waits and ring.followed is None and not self._stop.is_set():
             _nap()
         frame = self._frame()
@@ -134,33 +134,32 @@ class Replay(Readout):
         return report
 
     def __enter__(self) -> Self:
-        self._reader.start()
+        for _ in range(_BLOCKS_AHEAD):
+            self._ahead.append(self._reader.submit(self._read))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ending.set()
-        self._reader.join()
+    def __exit__(self, *_: object) -> None:
+        self._reader.shutdown(cancel_futures=True)
 
     def _frame(self) -> NDArray[Any] | None:
         """Return the next frame, or None at the end."""
         if self._waits and not self._await_engine(self._ring.arrivals + 1 - self._ring.slots):
             return None
         while (frame := next(self._block, None)) is None:
-            try:
-                block = self._ahead.get(timeout=_LOOK_S)
-            except queue.Empty:
-                if self._stop.is_set():
-                    return None
-                continue
-            if block is None or isinstance(block, InputError):
-                self._ahead.put(block)  # for a later call
-                if block is not None:
-                    raise block
+            while not self._ahead[0].done() and not self._stop.is_set():
+                wait([self._ahead[0]], _LOOK_S)
+            # The end, and the error of a damaged file, stay for later calls.
+            block = self._ahead[0].result() if self._ahead[0].done() else None
+            if block is None:
                 return None
+            self._ahead.popleft()
+            self._ahead.append(self._reader.submit(self._read))
             self._block = iter(block)
         return frame
+
+    def _read(self) -> NDArray[Any] | None:
+        """Read the next block; return None at the end."""
+        return next(self._chunks, None)
 
     def _await_engine(self, arrival: int) -> bool:
         """Wait until the engine has finished an arrival; return False if it will not."""
@@ -170,32 +169,17 @@ class Replay(Readout):
             _nap()
         return False
 
-    def _read(self) -> None:
-        """Read blocks ahead until the end or until the replay stops; runs in a separate thread."""
+    def _converted(self) -> Iterator[NDArray[Any]]:
+        """Yield blocks of the frames in the ring's type, for the reader's thread."""
         source, dtype = self._source, self._ring.dtype
         size = max(1, _BLOCK_BYTES // (source.shape[0] * source.shape[1] * source.dtype.itemsize))
-        going = True
-        try:
-            while going:
-                for _, block in source.blocks(*self._range, size):
-                    with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
-                        going = self._handed_over(block.astype(dtype, copy=False))
-                    if not going:
-                        return
-                going = self.n_frames is None
-            self._handed_over(None)
-        except InputError as error:
-            self._handed_over(error)
-
-    def _handed_over(self, block: NDArray[Any] | InputError | None) -> bool:
-        """Put a block into the queue when it is not full; return False if the replay has stopped."""
-        while not self._ending.is_set():
-            try:
-                self._ahead.put(block, timeout=_LOOK_S)
-            except queue.Full:
-                continue
-            return True
-        return False
+        while True:
+            for _, block in source.blocks(*self._range, size):
+                with np.errstate(over="ignore"):  # values beyond float32 become infinite: bad pixels
+                    converted: NDArray[Any] = block.astype(dtype, copy=False)
+                yield converted
+            if self.n_frames is not None:
+                return
 
 
 def _nap() -> None:

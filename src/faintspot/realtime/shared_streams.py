@@ -15,7 +15,6 @@ import hashlib
 import math
 import os
 import platform
-import secrets
 import stat
 import tempfile
 import time
@@ -29,7 +28,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from faintspot.base.errors import InputError, MissingExtraError
-from faintspot.realtime.pixel_segment import FOLDER
+from faintspot.realtime.pixel_segment import FOLDER, new_memory
 from faintspot.realtime.processes import process_age_s
 
 LOCK_LIMIT_S = 1.0
@@ -228,16 +227,12 @@ def _left_behind(pyshmem: Any, name: str) -> list[Path]:
 
 def _reserve(name: str, size: int) -> None:
     """Refuse a size above the free shared memory: writing to full shared memory kills the process."""
-    path = FOLDER / f".{_base(name)}.{secrets.token_hex(8)}"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
     try:
-        os.unlink(path)
-        os.posix_fallocate(descriptor, 0, size)
+        with new_memory(FOLDER / _base(name), size):
+            return
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
         raise InputError(
             f"{name}: the stream cannot be created: its {size} bytes exceed the free space in {FOLDER}"
         ) from None
-    finally:
-        os.close(descriptor)

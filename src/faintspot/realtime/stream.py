@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.image_layout import DAO, ISIO, IncompatibleStreamError, path_of
 from faintspot.realtime.image_stream import ImageStream
 from faintspot.realtime.publication import LARGEST_NUMBER, Publication
@@ -177,49 +180,133 @@ def open_stream(name: str) -> Stream:
     return PyshmemStream(name)
 
 
+@dataclass(slots=True)
+class StreamCounters:
+    """Counters of what was read of a stream, changed in place."""
+
+    taken: int = 0
+    """Publications that were used."""
+    missed: int = 0
+    """Publications that were overwritten before they were read."""
+    incomplete: int = 0
+    """Publications whose writer died or paused before they were complete."""
+    restarts: int = 0
+    """Number of times that the stream was removed or recreated, or its count jumped."""
+
+
 class Follower:
     """Connection to a stream by its name: it may be missing, unusable, removed and recreated.
 
     Parameters
     ----------
     name : str
-    say : function
+    say : function, optional
         Called with a one-line message when the stream changes.
-    incompatible : function
-        Takes shape and type; returns what was expected instead, "" if they fit.
-    meanwhile : function
+    incompatible : function, optional
+        Takes shape and type; returns what was expected instead, "" if they fit. Default: everything fits.
+    meanwhile : function, optional
         Returns what is done without a stream, for messages.
+    holds : str
+        What the stream holds, for messages.
+    prepare : function, optional
+        Called with a stream that was opened, before that is said.
+    counters : StreamCounters, optional
+        Counts what `look` and `take` find.
 
     Attributes
     ----------
     source : Stream or None
     obstacle : str
         Why there is no stream; "" if there is one.
+    seen : int
+        Number of publications of the stream up to the last one that `take` returned.
     """
 
     def __init__(
         self,
         name: str,
-        say: Callable[[str], None],
-        incompatible: Callable[[tuple[int, ...], np.dtype[Any]], str],
-        meanwhile: Callable[[], str],
+        say: Callable[[str], None] = lambda text: None,
+        incompatible: Callable[[tuple[int, ...], np.dtype[Any]], str] = lambda shape, dtype: "",
+        meanwhile: Callable[[], str] = lambda: "waiting",
+        holds: str = "values",
+        prepare: Callable[[Stream], object] = lambda source: None,
+        counters: StreamCounters | None = None,
     ) -> None:
         check_stream(name)
         self.name, self._say, self._incompatible, self._meanwhile = name, say, incompatible, meanwhile
+        self._holds, self._prepare = holds, prepare
         self.source: Stream | None = None
-        self.obstacle = ""
+        self.obstacle = "is not there"
+        self.counters = StreamCounters() if counters is None else counters
+        self.seen, self._said, self._next_look_s = 0, "", -math.inf
 
     def say(self, text: str) -> None:
         """Report a change of the stream."""
         self._say(f"stream {self.name}: {text}")
 
-    def open(self) -> Stream | None:
-        """Open the stream; return None if that fails, and report the reason once."""
-        obstacle = self._opened()
-        if obstacle and obstacle != self.obstacle:
-            self.say(f"{obstacle}; {self._meanwhile()}")
-        self.obstacle = obstacle
-        return self.source
+    def look(self, period_s: float = 0.0) -> Stream | None:
+        """Close a stream that was removed or recreated, and open a missing one, at most once in `period_s`.
+
+        Returns
+        -------
+        Stream or None
+            The stream, if it was opened now.
+        """
+        now = time.monotonic()
+        if now < self._next_look_s:
+            return None
+        self._next_look_s = now + period_s
+        if self.source is not None:
+            same = self.source.same()
+            if same:
+                return None
+            self.counters.restarts += 1
+            self.close()
+            self.say("was removed" if same is None else "was recreated")
+        self.obstacle = self._opened()
+        if self.obstacle != self._said and self.obstacle:
+            self.say(f"{self.obstacle}; {self._meanwhile()}")
+        self._said = self.obstacle
+        source = self.source
+        if source is not None:
+            self._prepare(source)
+            self.say(f"{' x '.join(map(str, source.shape))} {self._holds} ({source.dtype}), {source.maker}")
+        return source
+
+    def take(self, limit_s: float, out: NDArray[Any] | None = None) -> Publication | None:
+        """Return the newest publication if it is new, and complete within `limit_s`; see `Stream.read`."""
+        source, counters = self.source, self.counters
+        if source is None or source.count == self.seen:
+            return None
+        publication = source.read(out, limit_s)
+        if publication is None:
+            counters.incomplete += 1
+            return None
+        missed = left_out(self.seen, publication.total)
+        counters.missed += max(missed, 0)
+        counters.restarts += missed < 0 and publication.total > self.seen
+        self.seen = publication.total
+        return publication
+
+    def wait(self, limit_s: float) -> bool:
+        """Wait up to `limit_s` for a new publication, else look for the stream; return whether one came."""
+        source = self.source
+        if source is not None and source.wait(self.seen, limit_s):
+            return True
+        self.look()
+        if self.source is None:
+            time.sleep(limit_s)
+        return False
+
+    def newest(self, limit_s: float = 1e-3, period_s: float = 1.0) -> Publication | None:
+        """Return what `take` gives; without, look for the stream at most once in `period_s`.
+
+        So a stream that was removed is read as long as its writer goes on.
+        """
+        publication = self.take(limit_s)
+        if publication is None and self.look(period_s) is not None:
+            return self.take(limit_s)
+        return publication
 
     def _opened(self) -> str:
         """Open the stream; return the reason if that fails, else ""."""
@@ -233,16 +320,8 @@ class Follower:
         if obstacle:
             source.close()
             return f"holds {source.shape} {source.dtype}, expected {obstacle}"
-        self.source = source
+        self.source, self.seen = source, max(source.count - 1, 0)  # earlier ones were not missed
         return ""
-
-    def lost(self) -> str:
-        """Close a stream that was removed or recreated; return what happened in words, "" for nothing."""
-        same = self.source.same() if self.source is not None else True
-        if same:
-            return ""
-        self.close()
-        return "was removed" if same is None else "was recreated"
 
     def close(self) -> None:
         """Close the stream."""

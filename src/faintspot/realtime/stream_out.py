@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from faintspot.base.errors import InputError
-from faintspot.io.frame_numbers import left_out
 from faintspot.realtime.camera import StopEvent
 from faintspot.realtime.image_stream import ImageStreamWriter
-from faintspot.realtime.stream import Follower, split_name
+from faintspot.realtime.stream import Follower, Stream, split_name
 
-_LOOK_S = 0.1  # between two attempts to open a missing stream
 _PARK_S = 0.05
 
 
@@ -33,8 +30,7 @@ class StreamOut:
 
     Attributes
     ----------
-    published, missed : int
-        Publications that were passed on, and those overwritten before.
+    counters : StreamCounters
 
     Raises
     ------
@@ -48,9 +44,9 @@ class StreamOut:
         self._kind, self._target = split_name(target)
         if not self._kind:
             raise InputError(f"{target}: expected isio:NAME or dao:FILE (pyshmem programs can read {stream})")
-        self._follower = Follower(stream, say or (lambda _: None), _incompatible, lambda: "waiting")
+        self._follower = Follower(stream, say or (lambda _: None), _incompatible, prepare=self._prepare)
         self._writer: ImageStreamWriter | None = None
-        self._seen = self.published = self.missed = 0
+        self.counters = self._follower.counters
 
     def run(self, stop: StopEvent) -> None:
         """Pass publications on until `stop` is set.
@@ -67,29 +63,16 @@ class StreamOut:
             self.close()
 
     def step(self) -> bool:
-        """Follow the stream for at most 0.1 s; return whether something was passed on."""
-        source = self._follower.source
-        if source is None:
-            source = self._follower.open()
-            if source is None:
-                time.sleep(_LOOK_S)
-                return False
-            self._seen = 0
-            self._prepare(source.shape)
-        if not source.wait(self._seen, _PARK_S):
-            happened = self._follower.lost()
-            if happened:
-                self._follower.say(happened)
+        """Follow the stream for a moment; return whether something was passed on."""
+        follower = self._follower
+        if not follower.wait(_PARK_S):
             return False
-        publication = source.read(None, _PARK_S)
+        publication = follower.take(_PARK_S)
         if publication is None:
-            self._seen = source.count
             return False
         assert self._writer is not None
         self._writer.publish(publication.values, publication.number)
-        self.missed += max(left_out(self._seen, publication.total), 0) if self._seen else 0
-        self._seen = publication.total
-        self.published += 1
+        self.counters.taken += 1
         return True
 
     def close(self) -> None:
@@ -100,15 +83,15 @@ class StreamOut:
                 self._writer.close()
             self._writer = None
 
-    def _prepare(self, shape: tuple[int, ...]) -> None:
-        """Make the target with that size, unless it exists."""
+    def _prepare(self, source: Stream) -> None:
+        """Make the target, unless it exists with that number of values."""
         writer = self._writer
-        if writer is not None and writer.shape[-1:] == shape:
+        if writer is not None and writer.shape[-1:] == source.shape:
             return
         if writer is not None:
             writer.close()
-        self._writer = ImageStreamWriter(self._kind, self._target, shape)
-        self._follower.say(f"{shape[0]} values to {self._kind}:{self._writer.path}")
+        self._writer = ImageStreamWriter(self._kind, self._target, source.shape)
+        self._follower.say(f"passed on as {self._kind}:{self._writer.path}")
 
 
 def _incompatible(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str:

@@ -248,12 +248,12 @@ class TelemetryRing(Closing):
 class TelemetryReader:
     """Reader of an engine's telemetry, made by `attach`.
 
-    A cursor is the number of the next item to read; 0 starts with the oldest one available.
-
     Attributes
     ----------
     name : str
         Name of the engine.
+    records, images : Ring
+        Records of all frames, and images of some; see `record_type` and `image_type`.
     layout : Layout
     settings : str
         Initial settings of the engine: TOML text.
@@ -266,7 +266,8 @@ class TelemetryReader:
         self.name, self._ring, self.description = name, ring, description
         self.layout = Layout(**description["layout"])
         self.settings: str = description["settings"]
-        self._rings = Rings(ring.pixels[0, 0], begin, description)
+        rings = Rings(ring.pixels[0, 0], begin, description)
+        self.records, self.images, self._changes = rings.records, rings.images, rings.changes
 
     @classmethod
     def attach(cls, name: str) -> TelemetryReader:
@@ -289,26 +290,6 @@ class TelemetryReader:
         return cls(name, ring, up_to_pages(_START.size + length), json.loads(text))
 
     @property
-    def newest(self) -> int:
-        """Cursor after the newest record."""
-        return self._rings.records.written
-
-    @property
-    def newest_image(self) -> int:
-        """Cursor after the newest images."""
-        return self._rings.images.written
-
-    @property
-    def record_type(self) -> np.dtype[np.void]:
-        """Type of the records; see `record_type`."""
-        return self._rings.records.items.dtype
-
-    @property
-    def image_type(self) -> np.dtype[np.void]:
-        """Type of the images; see `image_type`."""
-        return self._rings.images.items.dtype
-
-    @property
     def stale(self) -> bool:
         """Whether no more data come: the engine has ended or died, or another one has taken its name.
 
@@ -316,36 +297,12 @@ class TelemetryReader:
         """
         return self._ring.closed or self._ring.stale
 
-    def records_since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
-        """Return copies of the records from a cursor on, in order.
-
-        Parameters
-        ----------
-        cursor : int
-        most : int, optional
-            Maximum number of records; the oldest are returned. Default: all available.
-
-        Returns
-        -------
-        records : structured array, (m,)
-            See `record_type`.
-        cursor : int
-            Cursor for the next call.
-        dropped : int
-            Records that were overwritten before they could be copied.
-        """
-        return self._rings.records.since(cursor, most)
-
-    def images_since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
-        """Return copies of the images from a cursor on, as `records_since` does; see `image_type`."""
-        return self._rings.images.since(cursor, most)
-
     def changes_since(self, cursor: int) -> tuple[list[dict[str, Any]], int, int]:
-        """Return the changes of settings from a cursor on, as `records_since` does.
+        """Return the changes of settings from a cursor on, as `Ring.since` does.
 
         Each has frame, number, changes (values by name) and where (sub-apertures, None for all).
         """
-        items, cursor, dropped = self._rings.changes.since(cursor, None)
+        items, cursor, dropped = self._changes.since(cursor)
         changes = [json.loads(item["text"][: item["length"]].tobytes()) for item in items]
         return changes, cursor, dropped
 

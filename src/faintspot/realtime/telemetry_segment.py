@@ -33,8 +33,7 @@ def record_type(n: int, commands: int = 0) -> np.dtype[np.void]:
     body = [(name, np.float32, (n,)) for name in floats]
     control = [("loop", np.int64), ("commands", np.float32, (commands,))] if commands else []
     return np.dtype(
-        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,)), *control],
-        align=True,
+        [*head, *body, ("iterations", np.int32, (n,)), ("flags", np.uint8, (n,)), *control], align=True
     )
 
 
@@ -52,14 +51,22 @@ def image_type(frame_shape: tuple[int, int], n: int, window: tuple[int, int]) ->
 
 
 class Ring:
-    """One of the rings: its places, and the count of items ever written."""
+    """One of the rings: its places, and the count of items ever written.
+
+    Attributes
+    ----------
+    items : structured array
+        Places in shared memory.
+    kind : dtype
+        Type of an item.
+    """
 
     def __init__(self, cells: NDArray[np.int64], row: int, items: NDArray[Any]) -> None:
-        self.items, self._cell = items, cells[row]
+        self.items, self.kind, self._cell = items, items.dtype, cells[row]
 
     @property
     def written(self) -> int:
-        """Number of items ever written."""
+        """Number of items ever written, which is the cursor after the newest."""
         count: int = load(self._cell, 0)
         return count
 
@@ -68,8 +75,24 @@ class Ring:
         store(self._cell, 0, written)
         fence()  # before the next item overwrites the oldest
 
-    def since(self, cursor: int, most: int | None) -> tuple[NDArray[Any], int, int]:
-        """Return copies of the items from number `cursor` on, the next cursor, and how many were lost."""
+    def since(self, cursor: int, most: int | None = None) -> tuple[NDArray[Any], int, int]:
+        """Return copies of the items from a cursor on, in order.
+
+        Parameters
+        ----------
+        cursor : int
+            Number of the next item to read; 0: from the oldest one available.
+        most : int, optional
+            Maximum number of items; the oldest are returned. Default: all available.
+
+        Returns
+        -------
+        items : structured array, (m,)
+        cursor : int
+            Cursor for the next call.
+        dropped : int
+            Items that were overwritten before they could be copied.
+        """
         places, written = len(self.items), self.written
         first = max(cursor, written - places + 1)  # one place may be in use by the writer
         last = max(first, written if most is None else min(written, first + most))

@@ -17,10 +17,9 @@ from faintspot.ao_loop.camera import make_detector
 from faintspot.ao_loop.configuration import LoopConfiguration
 from faintspot.ao_loop.telescope_model import TelescopeModel
 from faintspot.base.closing import Closing
-from faintspot.base.errors import InputError
 from faintspot.realtime.camera import CameraReport, Readout, StopEvent, readout_type
 from faintspot.realtime.command_stream import CommandStream
-from faintspot.realtime.control import Handler
+from faintspot.realtime.control import EFFECT_TIMEOUT_S, Handler, changes_of
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.shared_streams import create_stream, held
 from faintspot.realtime.telescope_orders import Conditions
@@ -34,7 +33,6 @@ photo-electrons per fully illuminated sub-aperture.
 """
 LENGTHY = ("set",)
 """Commands that wait for the next exposure; other commands are answered meanwhile."""
-_EFFECT_TIMEOUT_S = 0.5  # to wait for an order to take effect
 _BETWEEN_COMPLAINTS_S = 10.0
 
 
@@ -262,15 +260,9 @@ class SimulatedTelescope(Readout, Closing):
 def commands_of(telescope: SimulatedTelescope) -> dict[str, Handler]:
     """Return the commands of the control channel: status and set."""
 
-    def status(fields: dict[str, Any]) -> Mapping[str, Any]:
-        return telescope.status()
-
     def change(fields: dict[str, Any]) -> Mapping[str, Any]:
-        changes = fields.get("changes")
-        if not isinstance(changes, dict) or not changes:
-            raise InputError("changes: expected values by name, got none")
-        order = telescope.order(changes)
-        frame = order.frame if order.in_effect.wait(_EFFECT_TIMEOUT_S) else None
+        order = telescope.order(changes_of(fields))
+        frame = order.frame if order.in_effect.wait(EFFECT_TIMEOUT_S) else None
         return {"frame": frame, "conditions": asdict(order.conditions)}
 
-    return {"status": status, "set": change}
+    return {"status": lambda fields: telescope.status(), "set": change}

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintspot.base.checks import number_between
-
 _BITS = 7  # 2^7 bins in every factor of 2: each is at most 1/128 of its value wide
 _LONGEST_NS = 2**37 - 1  # 137 s; longer durations count in the last bin
 _BINS = ((_LONGEST_NS.bit_length() - _BITS - 1) << _BITS) + 2 ** (_BITS + 1)
@@ -25,21 +23,15 @@ class Latencies:
     A duration's bin is given by its leading 8 bits, so that finding it takes two shifts. Durations below 256
     ns are counted exactly, longer ones to within 0.4 %. Count, mean, smallest and largest are exact.
 
-    One thread adds and resets; others may read at the same time.
+    One thread adds; others may read at the same time.
     """
 
     __slots__ = ("_counts", "_largest", "_smallest", "_total")
 
     def __init__(self) -> None:
         self._counts = array("q", bytes(8 * _BINS))
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the distribution."""
-        self._counts[:] = array("q", bytes(8 * _BINS))
-        self._total = 0
+        self._total = self._largest = 0
         self._smallest = -1
-        self._largest = 0
 
     def add(self, duration_ns: int) -> None:
         """Count a duration [ns], a plain int; a negative one counts as 0."""
@@ -57,89 +49,31 @@ class Latencies:
             shift = 0
         self._counts[(shift << 7) + (duration_ns >> shift)] += 1
 
-    @property
-    def count(self) -> int:
-        """Number of durations."""
-        return int(np.sum(self._snapshot()))
-
-    @property
-    def mean_ns(self) -> float:
-        """Arithmetic mean [ns]; NaN without durations."""
-        count = self.count
-        return self._total / count if count else math.nan
-
-    @property
-    def smallest_ns(self) -> int:
-        """Shortest duration [ns]; 0 without durations."""
-        return max(self._smallest, 0)
-
-    @property
-    def largest_ns(self) -> int:
-        """Longest duration [ns]; 0 without durations."""
-        return self._largest
-
-    def percentile_ns(self, percent: float) -> float:
-        """Return the shortest duration that at least `percent` % of all do not exceed [ns].
-
-        Within a factor 1 +- `RESOLUTION` of the exact value; NaN without durations.
-
-        Raises
-        ------
-        InputError
-            For a percentage outside 0 to 100.
-        """
-        percent = number_between("percent", percent, 0, 100)
-        return self._percentile(self._snapshot(), percent)
-
-    def distribution(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Return the bins in use: shortest and longest duration [ns, inclusive] and count."""
-        counts = self._snapshot()
-        index = np.flatnonzero(counts)
-        shift = np.maximum((index >> _BITS) - 1, 0)
-        lowest = (index - (shift << _BITS)) << shift
-        return lowest, lowest + (1 << shift) - 1, counts[index]
-
-    def merge(self, other: Latencies) -> Latencies:
-        """Return the sum of both distributions."""
-        both = Latencies()
-        both._counts = array("q", (self._snapshot() + other._snapshot()).tobytes())
-        both._total = self._total + other._total
-        both._largest = max(self._largest, other._largest)
-        seen = [part._smallest for part in (self, other) if part._smallest >= 0]
-        both._smallest = min(seen, default=-1)
-        return both
-
     def as_dict(self) -> dict[str, int | float | None]:
-        """Return the count, and mean, percentiles, smallest and largest [us]; None without durations."""
-        counts = self._snapshot()
-        count = int(counts.sum())
-        values = {
-            "mean_us": self._total / count if count else math.nan,
-            "min_us": self.smallest_ns,
-            "p50_us": self._percentile(counts, 50.0),
-            "p99_us": self._percentile(counts, 99.0),
-            "p99_9_us": self._percentile(counts, 99.9),
-            "max_us": self.largest_ns,
-        }
-        return {"count": count, **{name: value / 1e3 if count else None for name, value in values.items()}}
+        """Return the count, and mean, percentiles, smallest and largest [us]; None without durations.
 
-    def _snapshot(self) -> NDArray[np.int64]:
-        """Return a copy of the counts, so that the figures of one reading are consistent."""
-        return np.array(self._counts, np.int64)
+        A percentile is the shortest duration that at least that part of all do not exceed, within a factor
+        1 +- `RESOLUTION` of the exact value.
+        """
+        counts = np.cumsum(np.array(self._counts, np.int64))  # a copy: all figures are of one moment
+        count = int(counts[-1])
+        names = ("mean_us", "min_us", "p50_us", "p99_us", "p99_9_us", "max_us")
+        if count == 0:
+            return {"count": 0, **dict.fromkeys(names)}
+        percentiles = (self._percentile(counts, percent) for percent in (50.0, 99.0, 99.9))
+        values = (self._total / count, self._smallest, *percentiles, self._largest)
+        return {"count": count, **{name: value / 1e3 for name, value in zip(names, values, strict=True)}}
 
     def _percentile(self, counts: NDArray[np.int64], percent: float) -> float:
-        cumulative = np.cumsum(counts)
-        count = int(cumulative[-1])
-        if count == 0:
-            return math.nan
+        """Return a percentile [ns] of cumulative counts."""
+        count = int(counts[-1])
         rank = max(math.ceil(percent / 100 * count - 1e-9 * count), 1)  # 0.999 of 1000 is the 999th
-        index = int(np.searchsorted(cumulative, rank))
-        shift = max((index >> _BITS) - 1, 0)
-        lowest = (index - (shift << _BITS)) << shift
+        index = int(np.searchsorted(counts, rank))
         if index == _BINS - 1:
             return float(self._largest)
-        middle = lowest + ((1 << shift) - 1) / 2
-        return float(min(max(middle, self.smallest_ns), self._largest))
+        shift = max((index >> _BITS) - 1, 0)
+        lowest = (index - (shift << _BITS)) << shift
+        return float(min(max(lowest + ((1 << shift) - 1) / 2, self._smallest), self._largest))
 
 
 @dataclass(slots=True)
