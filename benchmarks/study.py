@@ -22,8 +22,8 @@ from benchmarks.measuring import Row, Table, best, interleaved, pinned, ratio
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import KeepingBrightest
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.experiments.cell import Block, measure_cell, realisations
-from faintspot.experiments.cell_arms import error_sums
+from faintspot.experiments.cell import measure_cell, realisations
+from faintspot.experiments.cell_arms import Block, error_sums
 from faintspot.experiments.specification import StudySpecification
 from faintspot.experiments.sweep import Sweep
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import xarray
 
-from faintspot.experiments.arms import keeps_every_k, kind_of
+from faintspot.estimators.registry import estimator_named
+from faintspot.experiments.arms import keeps_every_k
 
-ARMS = ("brightest", "tv", "threshold", "smoothed", "median", "thresholded")
+ARMS = ("brightest", "tv", "smoothed", "thresholded")
 ESTIMATOR_ARMS = ("ml", "map", "weighted")
 MODES = ("best", "fixed20", "fixed40", "fixed60")
 DEFAULTS: dict[str, Any] = {
@@ -64,7 +65,7 @@ def dataset(
     at_k = values[:, :, :1] * rise
     beyond = np.array([cell["pixels"] ** 2 - 1 for cell in every])[:, None, None] < k
     at_k = np.where(beyond, np.nan, at_k)
-    at_k[:, [not keeps_every_k(kind_of(arm)) for arm in arms]] = np.nan
+    at_k[:, [not keeps_every_k(estimator_named(arm)) for arm in arms]] = np.nan
     done = np.ones(n, dtype=bool)
     done[list(unfinished)] = False
     choice = np.broadcast_to(0.5, values.shape).copy()

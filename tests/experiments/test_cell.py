@@ -11,7 +11,7 @@ from tests.shared_data import shared_file
 
 from faintspot.experiments import Cell, StudySpecification, Sweep, measure_cell
 from faintspot.experiments.cell import realisations
-from faintspot.experiments.cell_arms import CellArms, error_sums, error_table
+from faintspot.experiments.cell_arms import CellArms, error_sums, errors_of
 
 SMALL = StudySpecification("small", [Sweep("a", flux_e=60, pixels=8)], realisations=400, fixed_k=(10, 40))
 
@@ -53,7 +53,8 @@ def test_chosen_on_one_half_and_scored_on_the_other(measured: dict[str, Any]) ->
     arms = CellArms(cell, SMALL)
 
     def errors(strength: float, images: Any, truth: Any) -> Any:
-        return error_table(arms.estimator("tv", (("noise_std", strength),)), images, truth)[0]  # type: ignore[arg-type]
+        positions, _, _ = arms.positions("tv", (("noise_std", strength),), images)
+        return errors_of(positions, truth[:, None])
 
     tables = [errors(f, first, first_truth).mean(axis=0) for f in SMALL.strengths]
     row, column = map(int, np.unravel_index(np.argmin(tables), np.shape(tables)))

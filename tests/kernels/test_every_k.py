@@ -71,17 +71,6 @@ def test_equal_to_float32_rounding_on_spots(rule: str) -> None:
     np.testing.assert_allclose(positions, expected, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("reach", [math.inf, 0.5])
-def test_errors_are_those_of_the_positions(reach: float) -> None:
-    images, truth = fs.simulate.subapertures(50, shape=(8, 8), flux_e=50.0, rng=np.random.default_rng(6))
-    flat = images.reshape(50, -1)
-    errors, valid = np.empty((50, 63), np.float32), np.empty((50, 63), bool)
-    every_k.errors_of_every_k(flat, 8, every_k.SUBTRACT_NEXT, FLOOR, reach, truth, 0, 50, errors, valid)
-    positions, also_valid = positions_of_all(images, "subtract_next", reach)
-    np.testing.assert_array_equal(valid, also_valid)
-    np.testing.assert_allclose(errors, np.abs(positions - truth[:, None]).mean(axis=2), rtol=1e-6)
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_positions_stay_within_reach(rule: str) -> None:
     images, _ = fs.simulate.subapertures(50, shape=(8, 8), flux_e=10.0, rng=np.random.default_rng(7))

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from faintspot.algorithms.brightest import RULES
 from faintspot.ao_loop.arms import Arm
-from faintspot.base.errors import InputError
 from faintspot.camera.detector import Detector
-from faintspot.config.options import AUTO, option
+from faintspot.config.options import AUTO
 from faintspot.estimators.base import Estimator, Need, Style
 from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.gravity import KeepingBrightest
-from faintspot.estimators.registry import estimator_named, estimators
+from faintspot.estimators.registry import estimators
 from faintspot.estimators.scene import Scene
 from faintspot.estimators.smoothed import Smoothed
 from faintspot.estimators.thresholded import Thresholded
@@ -134,54 +130,6 @@ def _rounded(values: Mapping[Any, Any]) -> dict[Any, Any]:
     }
 
 
-Images = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BrightestAsTheyAre(BrightestPixels):
-    """All but the brightest pixels are zeroed; those stay as they are."""
-
-    rule: Any = option("threshold", "As of `KeepingBrightest`.", choices=RULES)
-
-    name = "threshold"
-    label = "brightest pixels, rule “threshold”"
-    style = Style("#0072B2", "--", "v")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MedianFiltered(KeepingBrightest):
-    """The median of 3 x 3 pixels, then the brightest of them."""
-
-    name = "median"
-    label = "3 × 3 median filter"
-    style = Style("#56B4E9", "-", "<")
-    automatic_method = BrightestPixels.automatic_method
-
-    def denoised(self, images: Images) -> Images:
-        """See `KeepingBrightest`."""
-        return median_of_nine(images)
-
-
-def median_of_nine(images: Images) -> Images:
-    """Return the median of each pixel and its eight neighbours; pixels at the edge continue outwards.
-
-    The median of nine numbers in three sorted columns is the median of the largest of the small ones, the
-    median of the middle ones and the smallest of the large ones.
-    """
-    padded = np.pad(images, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    low, middle, high = _sorted_three(padded[:, :-2], padded[:, 1:-1], padded[:, 2:])
-    small = np.maximum(np.maximum(low[..., :-2], low[..., 1:-1]), low[..., 2:])
-    centre = _sorted_three(middle[..., :-2], middle[..., 1:-1], middle[..., 2:])[1]
-    large = np.minimum(np.minimum(high[..., :-2], high[..., 1:-1]), high[..., 2:])
-    return _sorted_three(small, centre, large)[1]
-
-
-def _sorted_three(a: Images, b: Images, c: Images) -> tuple[Images, Images, Images]:
-    """Return the smallest, the middle and the largest of three images, pixel by pixel."""
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    return np.minimum(low, c), np.maximum(low, np.minimum(high, c)), np.maximum(high, c)
-
-
 Kind = type[Estimator]
 
 TV, NO_TV, SMOOTHING = TotalVariation.name, BrightestPixels.name, Smoothed.name
@@ -189,52 +137,25 @@ TV, NO_TV, SMOOTHING = TotalVariation.name, BrightestPixels.name, Smoothed.name
 TV_OVER_NO_TV = {"method": TV, "reference": NO_TV}
 """Curves between which gains are computed."""
 
-_ONLY_HERE: dict[str, Kind] = {kind.name: kind for kind in (BrightestAsTheyAre, MedianFiltered)}
-DEFAULT_ARMS = tuple(
-    kind.name
-    for kind in (BrightestPixels, TotalVariation, BrightestAsTheyAre, Smoothed, MedianFiltered, Thresholded)
-)
+DEFAULT_ARMS = tuple(kind.name for kind in (BrightestPixels, TotalVariation, Smoothed, Thresholded))
 """The built-in ones that know nothing of the spot."""
-
-
-def kind_of(arm: str) -> Kind:
-    """Return the estimator that an arm is.
-
-    Raises
-    ------
-    InputError
-        For an unknown name.
-    """
-    known = [*estimators(), *_ONLY_HERE]
-    if arm not in known:
-        raise InputError(f"arms = {arm!r}: expected one of {', '.join(map(repr, known))}")
-    return _ONLY_HERE.get(arm) or estimator_named(arm)
 
 
 def label_of(arm: str) -> str:
     """Return what tables and figures call an arm; its name where its estimator is not installed here."""
-    return kind_of(arm).label if _is_known(arm) else arm
+    return estimators()[arm].label if arm in estimators() else arm
 
 
 def style_of(arm: str) -> Style:
     """Return how figures draw an arm."""
-    return kind_of(arm).style if _is_known(arm) else Estimator.style
+    return estimators().get(arm, Estimator).style
 
 
 def knows_the_spot(arm: str) -> bool:
     """Return whether a method knows more than the noise."""
-    return _is_known(arm) and Knowledge.of(kind_of(arm)) > Knowledge.NOISE
-
-
-def is_estimator(arm: str) -> bool:
-    """Whether an arm is not of studies alone."""
-    return arm not in _ONLY_HERE
+    return arm in estimators() and Knowledge.of(estimators()[arm]) > Knowledge.NOISE
 
 
 def keeps_every_k(kind: Kind) -> bool:
     """Whether all numbers of kept pixels are measured at once: its denoised images are known."""
     return issubclass(kind, KeepingBrightest) and kind.denoised is not KeepingBrightest.denoised
-
-
-def _is_known(arm: str) -> bool:
-    return arm in _ONLY_HERE or arm in estimators()

@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from faintspot.experiments.arms import keeps_every_k, knows_the_spot
 from faintspot.experiments.cell_arms import (
+    Block,
     Candidate,
     CellArms,
     Floats,
-    Images,
+    Measured,
     detector_of,
-    error_sums,
     errors_of,
     moments_of,
-    position_table,
     shown,
 )
 from faintspot.experiments.specification import BEST, CORRECTED, StudySpecification
@@ -52,31 +51,16 @@ class Tuning:
         self._errors: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)  # sums over images
         self._moments: dict[str, Any] = dict.fromkeys(self._candidates, 0.0)
 
-    def add(self, blocks: list[Any]) -> None:
+    def add(self, blocks: Sequence[Block]) -> None:
         """Add images and their true positions."""
         for arm, candidates in self._candidates.items():
-            if keeps_every_k(self._arms.kinds[arm]):
-                for block in blocks:
-                    self._add_table(arm, candidates, *block)
-            elif len(candidates) > 1:  # else there is nothing to choose
-                self._add_measured(arm, candidates, blocks)
-
-    def _add_table(self, arm: str, candidates: Sequence[Candidate], images: Images, truth: Floats) -> None:
-        estimators: list[Any] = [self._arms.estimator(arm, candidate) for candidate in candidates]
-        reach = self._arms.search_range_px
-        self._errors[arm] += error_sums(estimators, images, truth, reach)
-        if CORRECTED in self._modes:
-            tables = (position_table(each, images, reach)[0] for each in estimators)
-            self._moments[arm] += np.stack([moments_of(table, truth) for table in tables], axis=1)
-
-    def _add_measured(self, arm: str, candidates: Sequence[Candidate], blocks: list[Any]) -> None:
-        images, truth = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        slopes = [self._arms.measure(arm, candidate, images) for candidate in candidates]
-        positions = [np.stack([s.x, s.y], axis=-1).astype(np.float64) for s in slopes]
-        sums = np.array([[np.abs(part - truth).mean(axis=1).sum()] for part in positions])
-        self._errors[arm] += sums
-        moments = [moments_of(part[:, None], truth) for part in positions]
-        self._moments[arm] += np.stack(moments, axis=1)
+            if len(candidates) == 1 and not keeps_every_k(self._arms.kinds[arm]):
+                continue  # there is nothing to choose
+            for images, truth in self._arms.parts(arm, blocks):
+                found = [self._arms.positions(arm, candidate, images)[0] for candidate in candidates]
+                self._errors[arm] += np.stack([errors_of(each, truth[:, None]).sum(axis=0) for each in found])
+                if CORRECTED in self._modes:
+                    self._moments[arm] += np.stack([moments_of(each, truth) for each in found], axis=1)
 
     def choices(self) -> dict[tuple[str, str], Choice]:
         """Return the choice of every arm and mode."""
@@ -117,8 +101,6 @@ _BLOCK_PIXELS = 1 << 18  # small enough for the processor's cache
 _STACK_PIXELS = 1 << 21  # that an estimator measures at once
 
 
-Block = tuple[Images, Floats]
-"""Images (n, side, side) and the true positions of their spots, (n, 2) px."""
 STATISTICS = ("gain", "rms", "corrected_rms", "outlier_fraction")
 """Variables beside R that are made with their standard errors, from `slope_statistics`."""
 
@@ -210,43 +192,30 @@ class Scores:
         """True positions (n, 2), px."""
         return np.concatenate(self._truth)
 
-    def add(self, blocks: list[Block]) -> None:
+    def add(self, blocks: Sequence[Block]) -> None:
         """Score images."""
         self._truth += [truth for _, truth in blocks]
         for arm, candidate in dict.fromkeys((arm, c.candidate) for (arm, _), c in self.choices.items()):
-            if keeps_every_k(self._arms.kinds[arm]):
-                for block in blocks:
-                    self._add_table(arm, candidate, *block)
-            else:
-                self._add_measured(arm, candidate, np.concatenate([images for images, _ in blocks]))
+            same = (arm, candidate)
+            modes = [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
+            for images, truth in self._arms.parts(arm, blocks):
+                self._add(arm, modes, truth, self._arms.positions(arm, candidate, images))
 
-    def _modes(self, arm: str, candidate: Candidate) -> list[str]:
-        """Modes in which an arm chose a candidate."""
-        same = (arm, candidate)
-        return [mode for (a, mode), choice in self.choices.items() if (a, choice.candidate) == same]
-
-    def _add_measured(self, arm: str, candidate: Candidate, images: Images) -> None:
-        slopes = self._arms.measure(arm, candidate, images)
-        modes = self._modes(arm, candidate)
-        for mode in modes:
-            self._positions[arm, mode].append(np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64))
-            self._valid[arm, mode].append(slopes.valid)
-        stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1)
-        if BEST in modes and knows_the_spot(arm):
-            self._stated.setdefault(arm, []).append(stated.astype(np.float64))
-
-    def _add_table(self, arm: str, candidate: Candidate, images: Images, truth: Floats) -> None:
-        estimator: Any = self._arms.estimator(arm, candidate)
-        positions, valid = position_table(estimator, images, self._arms.search_range_px)
-        modes = self._modes(arm, candidate)
+    def _add(self, arm: str, modes: list[str], truth: Floats, measured: Measured) -> None:
+        """Add positions that an arm measured for the modes that chose its candidate."""
+        positions, valid, stated = measured
         for mode in modes:
             column = self.choices[arm, mode].column or 0
             self._positions[arm, mode].append(positions[:, column])
             self._valid[arm, mode].append(valid[:, column])
-        if BEST in modes:
+        if BEST not in modes:
+            return
+        if stated is None:
             errors = errors_of(positions, truth[:, None])
             sums = np.stack([errors.sum(axis=0), np.square(errors).sum(axis=0)])
             self.sums[arm] = self.sums.get(arm, 0.0) + sums
+        elif knows_the_spot(arm):
+            self._stated.setdefault(arm, []).append(stated)
 
     def positions(self, arm: str, mode: str) -> Floats:
         """Return the positions of all realisations, (n, 2) px."""

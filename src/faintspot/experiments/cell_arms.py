@@ -16,8 +16,9 @@ from faintspot.ao_loop.arms import Arm
 from faintspot.camera.calibration import Calibration
 from faintspot.estimators.base import Estimator, Need
 from faintspot.estimators.gravity import KeepingBrightest
+from faintspot.estimators.registry import estimator_named
 from faintspot.estimators.scene import Scene
-from faintspot.experiments.arms import Kind, keeps_every_k, kind_of, score_for_scene
+from faintspot.experiments.arms import Kind, keeps_every_k, score_for_scene
 from faintspot.kernels import every_k
 from faintspot.pipeline.images import measure_images
 from faintspot.pipeline.settings import Settings
@@ -33,6 +34,12 @@ if TYPE_CHECKING:
 
 
 Images = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Block = tuple[Images, Floats]
+"""Images (n, side, side) and the true positions of their spots, (n, 2) px."""
+Measured = tuple[Floats, Bools, Floats | None]
+"""Positions (n, K, 2), whether they are valid (n, K), and stated standard errors (n, 2), if any, px."""
 
 _KEPT = "keep_brightest"
 _TRAINING = 1  # word that is added to a cell's seed
@@ -73,7 +80,7 @@ class CellArms:
         self.flux_e = max(cell.flux_e if flux_e is None else flux_e, _LEAST_FLUX_E)
         self.search_range_px = specification.search_range_of(cell)
         self._within_px = min(self.search_range_px, cell.pixels / 2)
-        self.kinds = {arm: kind_of(arm) for arm in specification.arms}
+        self.kinds = {arm: estimator_named(arm) for arm in specification.arms}
         self._calibration = Calibration(
             dark=0.0,
             read_noise_e=cell.read_noise_e * cell.em_gain,
@@ -95,6 +102,23 @@ class CellArms:
         output = images * np.float32(self.cell.em_gain)  # as the camera gives it
         made = self._arm(self.estimator(arm, candidate))
         return measure_images(output, made.settings, calibration=self._calibration, **made.parts)
+
+    def parts(self, arm: str, blocks: Sequence[Block]) -> Sequence[Block]:
+        """Return what an arm measures at a time: blocks, or all of them where it has no table."""
+        if keeps_every_k(self.kinds[arm]):
+            return blocks
+        images, truth = (np.concatenate(part) for part in zip(*blocks, strict=True))
+        return [(images, truth)]
+
+    def positions(self, arm: str, candidate: Candidate, images: Images) -> Measured:
+        """Return the positions in images; K is 1 where an arm has no table of all numbers of kept pixels."""
+        if keeps_every_k(self.kinds[arm]):
+            estimator: Any = self.estimator(arm, candidate)
+            return *position_table(estimator, images, self.search_range_px), None
+        slopes = self.measure(arm, candidate, images)
+        positions = np.stack([slopes.x, slopes.y], axis=-1).astype(np.float64)
+        stated = np.stack([slopes.standard_error_x, slopes.standard_error_y], axis=-1).astype(np.float64)
+        return positions[:, None], np.asarray(slopes.valid)[:, None], stated
 
     def _arm(self, estimator: Estimator) -> Arm:
         """Tell an estimator what it has to know."""
@@ -179,59 +203,38 @@ def _psf_of(profile: str, size: float, elongation: float, radius_px: float) -> P
     return PSF.analytic(profile, size=size, elongation=elongation, radius_px=radius_px)
 
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-
-RULES = {"subtract_next": every_k.SUBTRACT_NEXT, "threshold": every_k.THRESHOLD}
-
-
-def error_sums(
-    estimators: Sequence[KeepingBrightest], images: Images, truth: Floats, search_range_px: float = math.inf
-) -> Floats:
-    """Return sums of (|dx| + |dy|) / 2 over images for every estimator and k, (estimators, K)."""
-    tables = (error_table(each, images, truth, search_range_px)[0] for each in estimators)
-    return np.stack([table.sum(axis=0, dtype=np.float64) for table in tables])
-
-
-def error_table(
-    estimator: KeepingBrightest, images: Images, truth: Floats, search_range_px: float = math.inf
-) -> tuple[NDArray[np.float32], Bools]:
-    """Return (|dx| + |dy|) / 2 of every image for every number k of kept pixels.
+def position_table(
+    estimator: KeepingBrightest, images: Images, search_range_px: float = math.inf
+) -> tuple[Floats, Bools]:
+    """Return the position in every image for every number k of kept pixels.
 
     Parameters
     ----------
     estimator : KeepingBrightest
         What it says of the number of pixels does not count.
     images : (n, side, side) array, float32
-    truth : (n, 2) array, px
     search_range_px : float
         Positions beyond plus or minus this become it, on each axis.
 
     Returns
     -------
-    errors : (n, K) array, float32
+    positions : (n, K, 2) array
         For k = 1 to K = side^2 - 1, px.
     valid : (n, K) array, bool
-        Whether there was light. Where not, the position counts as (0, 0).
+        Whether there was flux. Where not, the position counts as (0, 0).
     """
-    prepared = _prepared(estimator, images)
-    errors = np.empty((len(images), prepared.shape[1] - 1), np.float32)
-    valid = np.empty(errors.shape, np.bool_)
-    how = images.shape[-1], RULES[estimator.rule], estimator.flux_floor, search_range_px
-    every_k.errors_of_every_k(prepared, *how, truth, 0, len(images), errors, valid)
-    return errors, valid
-
-
-def position_table(
-    estimator: KeepingBrightest, images: Images, search_range_px: float = math.inf
-) -> tuple[Floats, Bools]:
-    """Return the positions (n, K, 2), px, whose errors `error_table` returns, and their validity (n, K)."""
     prepared = _prepared(estimator, images)
     positions = np.empty((len(images), prepared.shape[1] - 1, 2))
     valid = np.empty(positions.shape[:2], np.bool_)
-    how = images.shape[-1], RULES[estimator.rule], estimator.flux_floor, search_range_px
+    how = images.shape[-1], every_k.SUBTRACT_NEXT, estimator.flux_floor, search_range_px
     every_k.positions_of_every_k(prepared, *how, 0, len(images), positions, valid)
     return positions, valid
+
+
+def error_sums(estimators: Sequence[KeepingBrightest], images: Images, truth: Floats) -> Floats:
+    """Return sums of (|dx| + |dy|) / 2 over images for every estimator and k, (estimators, K)."""
+    tables = (position_table(each, images)[0] for each in estimators)
+    return np.stack([errors_of(table, truth[:, None]).sum(axis=0) for table in tables])
 
 
 def _prepared(estimator: KeepingBrightest, images: Images) -> Images:
@@ -252,6 +255,6 @@ def moments_of(positions: Floats, truth: Floats) -> Floats:
 
 
 def errors_of(positions: Floats, truth: Floats) -> Floats:
-    """(|dx| + |dy|) / 2, to the precision of `error_table`."""
+    """Return (|dx| + |dy|) / 2 in single precision."""
     errors: NDArray[np.float32] = np.abs(positions - truth).mean(axis=-1).astype(np.float32)
     return errors.astype(np.float64)

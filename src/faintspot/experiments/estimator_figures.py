@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from faintspot.experiments.arms import is_estimator, knows_the_spot, label_of, style_of
+from faintspot.experiments.arms import knows_the_spot, label_of, style_of
 from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_figures import label_axes
 from faintspot.experiments.study_tables import parameter_in_words, parameters_of, table_of_cells
@@ -179,7 +179,7 @@ _SCALES = {
 
 
 def _drawn_arms(dataset: xarray.Dataset) -> list[str]:
-    return [str(arm) for arm in dataset["arm"].values if is_estimator(str(arm))]
+    return [str(arm) for arm in dataset["arm"].values]
 
 
 def _line_of(arm: str) -> dict[str, Any]:

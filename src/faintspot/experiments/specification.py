@@ -15,7 +15,8 @@ from faintspot.base.checks import number_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.base.sizes import check_size
 from faintspot.base.toml_files import check_keys, checked_table, parse_text, read_text
-from faintspot.experiments.arms import DEFAULT_ARMS, kind_of, knows_the_spot
+from faintspot.estimators.registry import estimators
+from faintspot.experiments.arms import DEFAULT_ARMS, knows_the_spot
 from faintspot.experiments.store import fingerprint_of
 from faintspot.experiments.sweep import PARAMETERS, PROFILES, RANGES, Cell, Range, Sweep, checked_numbers
 
@@ -49,7 +50,7 @@ class StudySpecification:
         Simulated images of each cell, at least 20. Settings are chosen on the first half of them and scored
         on the second.
     arms : sequence of str
-        What is compared: names of estimators (`faintspot.estimators.estimators()`), "threshold", "median".
+        What is compared: names of estimators (`faintspot.estimators.estimators()`).
         Default: the built-in ones that know nothing of the spot.
     strengths : sequence of float
         Strengths of the denoising (option `noise_std`) to choose from, as fractions of the noise of a mean
@@ -120,7 +121,8 @@ class StudySpecification:
         number = number_between("realisations", self.realisations, 20, 10_000_000, integer=True)
         self._set("realisations", int(number))
         self._set("sweeps", _checked_sweeps(self.sweeps))
-        self._set("arms", tuple(dict.fromkeys(kind_of(arm).name for arm in _checked_list("arms", self.arms))))
+        arms = [one_of("arms", arm, list(estimators())) for arm in _checked_list("arms", self.arms)]
+        self._set("arms", tuple(dict.fromkeys(arms)))
         for name, bounds in _CANDIDATE_RANGES.items():
             items = _checked_list(name, getattr(self, name))
             self._set(name, tuple(checked_numbers(name, items, bounds)))

@@ -122,26 +122,3 @@ def positions_of_every_k(
         for k in range(side * side - 1):
             found[i, k, 0] = x[k]
             found[i, k, 1] = y[k]
-
-
-@allocating
-def errors_of_every_k(
-    images: Any,
-    side: Any,
-    rule: Any,
-    floor: Any,
-    reach: Any,
-    truth: Any,
-    start: Any,
-    stop: Any,
-    errors: Any,
-    valid: Any,
-) -> None:
-    """Write (|dx| + |dy|) / 2 (n, K) and validity (n, K), as `positions_of_every_k`."""
-    scratch = _scratch(side * side)
-    x, y = scratch[3], scratch[4]
-    for i in range(start, stop):
-        _sort_and_measure(images[i], side, rule, floor, reach, scratch, valid[i])
-        true_x, true_y = truth[i, 0], truth[i, 1]
-        for k in range(side * side - 1):
-            errors[i, k] = 0.5 * (abs(x[k] - true_x) + abs(y[k] - true_y))
