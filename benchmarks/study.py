@@ -153,7 +153,7 @@ def run() -> list[Table]:
                     found.smaller >= TARGET,
                     found.spread,
                 ),
-                Row("a whole cell, six arms", {"faintspot 1/s": count / best(times, "all")}),
+                Row("a whole cell, four arms", {"faintspot 1/s": count / best(times, "all")}),
             ],
             ["simulation included; a target is met when both ratios meet it"],
         )

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from tests.experiments.planner_cases import answered
 
-from faintspot import Calibration, InputError, Layout, Settings, SlopePipeline
+from faintspot import Calibration, InputError, Layout, SlopePipeline
 from faintspot.estimators import estimators
 from faintspot.experiments import answer_text
-from faintspot.experiments.answer import Answer, settings_in_words
+from faintspot.experiments.answer import Answer
 from faintspot.experiments.answer_figures import tune_figure
-from faintspot.experiments.statistics import Estimate, slope_error
+from faintspot.experiments.statistics import slope_error
 from faintspot.simulate import Detector, sensor_frames
 
 LAYOUT = Layout.grid((4, 4), pixels=12)
@@ -92,20 +92,6 @@ def test_a_star_that_is_too_faint_is_called_so() -> None:
     assert "too faint" in " ".join(answer_text.recommendation(answer))
 
 
-def test_gains_beyond_the_range_are_said_to_be_so() -> None:
-    answer = answered()
-    beyond = Estimate(float("inf"), float("nan"))
-    assert answer_text.gain_in_words(answer, beyond) == "more than 0.8 mag"
-    assert answer_text.short_gain(answer, Estimate(-float("inf"), float("nan"))) == "<-0.8"
-    assert answer_text.short_gain(answer, Estimate(0.12345, 0.0123)) == "+0.12±0.01"
-
-
-def test_settings_in_words_name_what_is_not_the_default() -> None:
-    tv = settings_in_words(Settings("tv", noise_std=1.5, keep_brightest=12, preset="fast"))
-    assert tv == 'estimator "tv", keep_brightest 12, noise_std 1.5, preset "fast"'
-    assert settings_in_words(Settings("brightest")) == 'estimator "brightest"'
-
-
 def test_the_limit_is_sought_beyond_the_plot() -> None:
     answer = answered(budget="0.02")
     limit = answer.best.limiting_flux_e
@@ -117,11 +103,6 @@ def test_the_limit_is_sought_beyond_the_plot() -> None:
     # R of the recommended arm at its limit is the budget: straight line in log-log between the points.
     found = np.exp(np.interp(np.log(limit.value), np.log(answer.flux_e), np.log(answer.best.error_px)))
     assert found == pytest.approx(0.02, rel=0.05)
-
-
-def test_a_budget_that_no_star_is_too_faint_for() -> None:
-    answer = answered(budget="0.9")
-    assert "fainter than all that was tried" in " ".join(answer_text.recommendation(answer))
 
 
 def test_the_figure_shows_every_arm_and_the_limit() -> None:

@@ -12,7 +12,7 @@ from tests.experiments.study_cases import ARMS, Cell, cells, dataset, power_law
 
 from faintspot.experiments import built_in_studies as paper
 from faintspot.experiments.claims import fixed_mode, guidance, verdicts
-from faintspot.experiments.study_curves import Case, Finding, Outcome, against_tv, combined, judged
+from faintspot.experiments.study_curves import Outcome, against_tv, combined
 
 HOLDS, IN_PART, FAILS = Outcome.HOLDS, Outcome.IN_PART, Outcome.FAILS
 Gain = Callable[[Cell, str, str], float]
@@ -135,12 +135,6 @@ def test_outcomes_are_combined(outcomes: list[Outcome], together: Outcome) -> No
     assert combined(outcomes) is together
 
 
-def test_cases_are_counted_in_words() -> None:
-    cases = [Case("", "", judged(True, False)), Case("", "", judged(False, True)), Case("", "", FAILS)]
-    text = Finding("best", cases).in_words()
-    assert text == "3 cases: 1 holds, 1 holds in part, 1 does not hold"
-
-
 def test_guidance_follows_the_numbers() -> None:
     def with_gains(tv: float, gaussian: float) -> str:
         def gain(cell: Cell, arm: str, mode: str) -> float:
@@ -156,12 +150,6 @@ def test_guidance_follows_the_numbers() -> None:
     assert "Advice: do not use TV" in bad
     assert "a median of 0.75" in bad  # over Gaussian smoothing
     assert "Advice: tune k first" in equal
-
-
-def test_guidance_without_curves_or_arms_says_so() -> None:
-    few = study(lambda cell: 1.0, cells(fluxes=(1000.0,)))
-    assert "flux gains cannot be given" in guidance(few)[0]
-    assert "no advice on TV" in guidance(few.sel(arm=["brightest"], arm2=["brightest"]))[0]
 
 
 def test_against_tv_counts_cells() -> None:

@@ -160,19 +160,6 @@ def test_without_turbulence_above_the_ground_the_radius_must_be_given() -> None:
     assert answer.coverage("window", "galactic pole") is not None
 
 
-def test_what_is_measured_interpolated_left_out_and_at_an_end_is_said() -> None:
-    answer = made_up()
-    text = "\n".join(loop_text.foundations(answer))
-    assert "measured at magnitudes 10.60, 11.86" in text
-    assert "interpolated between these, up to 1.26 apart" in text
-    assert "map+kalman was not tried: no time" in text
-    ends = [line for line in loop_text.recommendation(answer) if "at the end of what was tried" in line]
-    assert len(ends) == 1
-    assert answer.at_end("window", answer.at_star) == ["window_fwhm_px"]
-    assert "of window" in ends[0]
-    assert loop_text.situation(answer).startswith("diffraction_limit: 4.2 m, 7 x 7 sub-apertures")
-
-
 def test_saved_settings_and_loop_can_be_loaded(tmp_path: Path) -> None:
     target = tmp_path / "mine.toml"
     answer = made_up()

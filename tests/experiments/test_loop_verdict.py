@@ -33,11 +33,6 @@ def test_a_gain_is_said() -> None:
     assert "beyond its error in" in lines[0]
 
 
-def test_one_realisation_says_nothing() -> None:
-    lines = loop_verdict(LoopResults(magnitude=made_up_magnitude(0.3, realisations=1)))
-    assert lines[0].startswith("Too few")
-
-
 def test_arms_are_found_by_their_names() -> None:
     result = dataclasses.replace(made_up_magnitude(), labels=tuple("abcd"))
     assert LABELS[reference_arms(result)[0]] == "brightest pixels"

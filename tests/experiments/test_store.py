@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintspot import InputError
-from faintspot.experiments.store import MemoryStore, ZarrStore, fingerprint_of, kind_of_store
+from faintspot.experiments.store import MemoryStore, ZarrStore, kind_of_store
 
 pytest.importorskip("zarr")
 
@@ -130,8 +130,3 @@ def test_killed_while_it_writes(tmp_path: Path) -> None:
         found = store.read(str(i))
         np.testing.assert_array_equal(found["a"], float(i))
         assert str(found["b"]) == str(i)
-
-
-def test_fingerprints_tell_experiments_apart() -> None:
-    assert fingerprint_of("a", "b") == fingerprint_of("a", "b")
-    assert fingerprint_of("a", "b") != fingerprint_of("a", "c")

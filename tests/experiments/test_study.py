@@ -61,13 +61,6 @@ def test_other_cells_do_not_matter(uninterrupted: Path) -> None:
             np.testing.assert_array_equal(part[name][cell], same[name], err_msg=name)
 
 
-def test_processes(uninterrupted: Path, tmp_path: Path) -> None:
-    lines: list[str] = []
-    experiments.run(SPECIFICATION, tmp_path / "s.zarr", workers=1, announce=lines.append)
-    assert_same(tmp_path / "s.zarr", uninterrupted)
-    assert lines == ["1 process on this machine"]
-
-
 def test_bad_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("faintspot.experiments.running._CONNECT_TIMEOUT_S", 0.3)

@@ -86,12 +86,6 @@ def test_paired_difference_uses_the_covariance() -> None:
     np.testing.assert_allclose(difference, item.of("brightest") - item.of("tv"))
 
 
-def test_configuration_in_words() -> None:
-    text = Configuration("gaussian", 4.0, 3.0, 1.5, 3.0, 12, 2.0, 500.0).in_words()
-    for word in ("gaussian", "±4 px", "3 e-", "1.5", "elongated 3", "12 × 12", "background 2", "EM gain 500"):
-        assert word in text
-
-
 def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="mode 'worst'"):
         study_curves(dataset(cells(), power_law(gain_of)), "worst")

@@ -18,7 +18,6 @@ from faintspot.experiments.study_figures import (
     triple_images,
     triple_picture,
 )
-from faintspot.experiments.study_tables import mode_in_words
 
 
 def equal(cell: Any, arm: str, mode: str) -> float:
@@ -133,7 +132,3 @@ def test_triple_picture_shows_noise_and_its_removal() -> None:
     made = triple_picture()
     assert len([axes for axes in made.figure.axes if axes.get_title()]) == 6
     assert len(made.rows) == 256
-
-
-def test_modes_in_words() -> None:
-    assert [mode_in_words(mode) for mode in MODES[:3]] == ["best k", "fixed k = 20", "fixed k = 40"]

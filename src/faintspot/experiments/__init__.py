@@ -28,28 +28,25 @@ if TYPE_CHECKING:
     from faintspot.experiments.sweep import Sweep as Sweep
     from faintspot.experiments.tuning import tune as tune
 
-_HOMES = {
-    "Answer": "faintspot.experiments.answer",
-    "Cell": "faintspot.experiments.sweep",
-    "LoopAnswer": "faintspot.experiments.loop_answer",
-    "LoopQuestion": "faintspot.experiments.loop_question",
-    "Promise": "faintspot.experiments.promise",
-    "Question": "faintspot.experiments.question",
-    "StudySpecification": "faintspot.experiments.specification",
-    "Sweep": "faintspot.experiments.sweep",
-    "loop_figure": "faintspot.experiments.answer_figures",
-    "tune_figure": "faintspot.experiments.answer_figures",
-    "check_promises": "faintspot.experiments.promise",
-    "measure_cell": "faintspot.experiments.cell",
-    "open_study": "faintspot.experiments.study",
-    "question_from_frames": "faintspot.experiments.recorded",
-    "run": "faintspot.experiments.study",
-    "run_budget": "faintspot.experiments.budget",
-    "run_interleaved": "faintspot.experiments.interleaved",
-    "run_magnitude": "faintspot.experiments.magnitude",
-    "tune": "faintspot.experiments.tuning",
-    "tune_loop": "faintspot.experiments.loop_tuning",
+_NAMES = {
+    "answer": "Answer",
+    "answer_figures": "loop_figure tune_figure",
+    "budget": "run_budget",
+    "cell": "measure_cell",
+    "interleaved": "run_interleaved",
+    "loop_answer": "LoopAnswer",
+    "loop_question": "LoopQuestion",
+    "loop_tuning": "tune_loop",
+    "magnitude": "run_magnitude",
+    "promise": "Promise check_promises",
+    "question": "Question",
+    "recorded": "question_from_frames",
+    "specification": "StudySpecification",
+    "study": "open_study run",
+    "sweep": "Cell Sweep",
+    "tuning": "tune",
 }
+_HOMES = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = sorted(_HOMES)
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from faintspot.control.learning import INTEGRATOR
 from faintspot.experiments import answer_text
-from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, SECOND
+from faintspot.experiments.loop_figures import arm_style
+from faintspot.experiments.loop_question import MODEL_ERROR, PLACES
 from faintspot.report.drawing import FLUX_GREY, GREY, axis_above, new_figure, note, plain_ticks, styled
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
     from faintspot.experiments.answer import Answer
     from faintspot.experiments.loop_answer import LoopAnswer
-    from faintspot.experiments.loop_arms import ArmKind
 
 
 _WIDTH, _HEIGHT = 10.5, 6.6
@@ -114,7 +114,6 @@ def _mark_budget(axes: Axes, answer: Any) -> None:
 
 
 _LOOP_WIDTH, _LOOP_HEIGHT = 13.0, 5.6
-_LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 
 
 @styled
@@ -145,27 +144,19 @@ def loop_figure(answer: LoopAnswer) -> Figure:
 def _draw_strehl(axes: Axes, answer: LoopAnswer) -> None:
     magnitudes = answer.magnitudes
     for name, kind in answer.kinds.items():
-        drawn = _look(kind)
-        axes.plot(magnitudes, answer.curve(name), lw=1.6, color=drawn["color"], ls=drawn["ls"])
+        drawn = arm_style(name)
+        label = f"{name} (recommended)" if kind is answer.best else name
+        axes.plot(magnitudes, answer.curve(name), **{**drawn, "marker": ""})
+        axes.plot([], [], label=label, **drawn)
         values = [answer.strehl(name, flux) for flux in range(len(magnitudes))]
-        axes.errorbar(
-            magnitudes,
-            [each.value for each in values],
-            [each.standard_error for each in values],
-            lw=0,
-            elinewidth=1.2,
-            capsize=2.5,
-            color=drawn["color"],
-            marker=drawn["marker"],
-            mfc=drawn["mfc"],
-            ms=6,
-        )
+        errors = [each.standard_error for each in values]
+        bars = {**drawn, "lw": 0, "elinewidth": 1.2, "capsize": 2.5}
+        axes.errorbar(magnitudes, [each.value for each in values], errors, **bars)
         limit = answer.limit(name)
         if limit.is_known:
             error = limit.error if np.isfinite(limit.error) else 0.0
-            axes.errorbar(limit.magnitude.value, answer.level, xerr=error, **_limit_mark(drawn), zorder=5)
-        label = f"{name} (recommended)" if kind is answer.best else name
-        axes.plot([], [], label=label, lw=1.6, ms=6, **drawn)
+            mark = {"color": drawn["color"], "marker": "|", "ms": 16, "mew": 2.2, "lw": 0, "elinewidth": 2.2}
+            axes.errorbar(limit.magnitude.value, answer.level, xerr=error, zorder=5, **mark)
     axes.axhline(answer.level, color=GREY, lw=1, zorder=0)
     words, place = f"Strehl {answer.level:.2f}: limiting magnitudes", (0.99, answer.level)
     note(axes, words, place, "axes fraction, data", xytext=(0, 3), ha="right", color="#666666")
@@ -185,21 +176,20 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
     """Draw the fraction of the sky: thick error bars are the limits', thin ones with the star counts'."""
     width = 0.8 / len(answer.kinds)
     for number, (name, kind) in enumerate(answer.kinds.items()):
-        drawn = _look(kind)
+        drawn = arm_style(name)
         for group, place in enumerate(PLACES):
             found = answer.coverage(name, place)
             assert found is not None
             where, value = group + (number + 0.5) * width - 0.4, 100 * found.fraction
             own = 100 * np.nan_to_num(found.strehl_error)
             both = float(np.hypot(own, 100 * found.model_error))
-            learns = kind.control != INTEGRATOR
             axes.bar(
                 where,
                 value,
                 width * 0.9,
                 color=drawn["color"],
                 alpha=0.75,
-                hatch="//" if learns else "",
+                hatch="//" if kind.control != INTEGRATOR else "",
                 ec="white",
             )
             axes.errorbar(where, value, min(both, 0.95 * value), color="black", lw=0, elinewidth=0.8)
@@ -224,20 +214,3 @@ def _draw_sky(axes: Axes, answer: LoopAnswer) -> None:
         loc="left",
         color="#666666",
     )
-
-
-def _look(kind: ArmKind) -> dict[str, Any]:
-    """Return colour, line and marker: the estimator's, open and dash-dotted where control learns."""
-    style = kind.estimator.style
-    colour = GREY if kind.estimator.name == SECOND else style.colour
-    learns = kind.control != INTEGRATOR
-    return {
-        "color": colour,
-        "ls": _LEARNING_LINE if learns else style.line,
-        "marker": style.marker,
-        "mfc": "white" if learns else colour,
-    }
-
-
-def _limit_mark(drawn: dict[str, Any]) -> dict[str, Any]:
-    return {"color": drawn["color"], "marker": "|", "ms": 16, "mew": 2.2, "lw": 0, "elinewidth": 2.2}

@@ -24,7 +24,7 @@ from faintspot.experiments.loop_analysis import (
     paired_differences,
     regression_lines,
 )
-from faintspot.experiments.loop_arms import CONTROL_SIGN, VARIANTS
+from faintspot.experiments.loop_arms import CONTROL_SIGN
 from faintspot.experiments.loop_results import BudgetResult, MagnitudeResult
 from faintspot.experiments.statistics import paired_mean
 from faintspot.report.drawing import (
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 _TEXT = Texts("faintspot.experiments")
 _STREHL = "H-band Strehl ratio"
 _DODGE = 0.008  # of the axis, between arms at the same magnitude
+_LEARNING_LINE = (0, (6, 1.5, 1, 1.5))
 _DECADES = 3  # of intensity in images
 
 Floats = NDArray[np.float64]
@@ -70,7 +71,7 @@ def magnitude_figure(result: MagnitudeResult, reference: int, label: str) -> Fig
         value = np.array([run.value for run in runs])
         error = np.nan_to_num([run.standard_error for run in runs])
         place = result.magnitudes + (arm - len(result.labels) / 2) * shift
-        style = _arm_style(result.names[arm])
+        style = arm_style(result.names[arm])
         left.errorbar(result.magnitudes, value, error, label=name, capsize=2, **style)
         differences = differences_by_flux(result, arm, reference)
         low, middle, high = np.array([[d.low, d.value, d.high] for d in differences]).T
@@ -98,7 +99,7 @@ def gain_figure(result: MagnitudeResult) -> FigureWithData:
     rows = []
     for arm, name in enumerate(result.labels):
         value = np.array([paired_mean(values).value for values in result.centroid_gain[arm]])
-        panel.plot(result.photons, value, label=name, **_arm_style(result.names[arm]))
+        panel.plot(result.photons, value, label=name, **arm_style(result.names[arm]))
         rows += [[name, p, v] for p, v in zip(result.photons, value, strict=True)]
     panel.axhline(1, color=GREY, lw=1)
     panel.set_xscale("log")
@@ -160,7 +161,7 @@ def budget_figure(result: BudgetResult, label: str) -> FigureWithData:
         value = np.array([run.value for run in runs])
         error = np.nan_to_num([run.standard_error for run in runs])
         place = np.arange(terms) + (arm - (arms - 1) / 2) * 0.8 / arms
-        colour = _arm_style(result.names[arm])["color"]
+        colour = arm_style(result.names[arm])["color"]
         panel.barh(place, value, 0.72 / arms, xerr=error, color=colour, label=name, capsize=2, ecolor=GREY)
         panel.plot([value[0]] * 2, [-0.5, terms - 0.5], color=colour, lw=0.8, ls=":")
         rows += [[name, t, v, e] for t, v, e in zip(result.terms, value, error, strict=True)]
@@ -175,19 +176,21 @@ def _switched(term: str) -> str:
     return "whole loop" if term == "nothing" else f"without {term}"
 
 
-def _arm_style(name: str) -> dict[str, Any]:
-    """Return the style of an arm's estimator; markers are hollow where the loop does more than the usual."""
+def arm_style(name: str) -> dict[str, Any]:
+    """Return the style of an arm's estimator; markers are hollow where the loop does more than the usual.
+
+    Lines of control that learns are dash-dotted.
+    """
     known = estimators()
     base = next((name[:end] for end in range(len(name), 0, -1) if name[:end] in known), "")
     style = known[base].style if base else Style("#666666")
-    variants = [ending for ending in (*VARIANTS, CONTROL_SIGN) if ending in name[len(base) :]]
     return {
         "color": style.colour,
         "marker": style.marker,
-        "ms": 6 + len(variants),
-        "mfc": "white" if variants else style.colour,
-        "lw": 1.3,
-        "ls": ":" if len(variants) > 1 else style.line,
+        "ms": 6,
+        "mfc": style.colour if name == base else "white",
+        "lw": 1.5,
+        "ls": _LEARNING_LINE if CONTROL_SIGN in name else style.line,
     }
 
 
