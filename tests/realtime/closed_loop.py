@@ -27,18 +27,18 @@ from faintspot.realtime.telemetry import TelemetryReader
 from faintspot.realtime.telescope import TRUTH, SimulatedTelescope
 
 CONFIGURATION = faint()
+BRIGHTEST = fs.Settings("brightest", keep_brightest=20)
 COMMANDS, PATIENCE_S = 54, 60.0
 
 
 def configured(
     folder: Path,
-    settings: fs.Settings | None = None,
+    settings: fs.Settings = BRIGHTEST,
     configuration: Any = CONFIGURATION,
     controller: str = INTEGRATOR,
 ) -> tuple[Path, Control]:
     """Write what the engine needs; return the configuration file, and its control."""
-    if settings is not None:
-        configuration_file.save(folder / "faintspot.toml", settings)
+    configuration_file.save(folder / "faintspot.toml", settings)
     path = write_engine_files(configuration, folder, controller)
     control = load_control(path)
     assert control is not None

@@ -207,7 +207,7 @@ class LoopConfiguration:
         return dataclasses.replace(self, **{section: changed})
 
     def slowed_to(self, rate_hz: float) -> LoopConfiguration:
-        """Return the same loop at another frame rate: with winds that move the air as far in a frame.
+        """Return the same loop at another frame rate, with winds that move the turbulence as far in a frame.
 
         Raises
         ------

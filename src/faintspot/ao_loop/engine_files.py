@@ -28,7 +28,9 @@ CONFIGURATION = "faintspot.toml"
 INTERACTION = "interaction_matrix.npy"
 REFERENCE = "reference_slopes.npy"
 MODEL = "control_model.npz"
-_SETTINGS = Settings("brightest", keep_brightest=20)
+# Chosen in simulated loops with other realisations of the turbulence than those shown.
+WINDOW_WIDTH = 2.8
+"""Width of the fixed window in widths of the spots."""
 
 
 def write_engine_files(
@@ -36,7 +38,7 @@ def write_engine_files(
 ) -> Path:
     """Write layout, calibration, PSF and the controller's files into a folder.
 
-    faintspot.toml (what else is in it stays; without an estimator it gets the 20 brightest pixels);
+    faintspot.toml (what else is in it stays; without an estimator it gets a fixed window);
     interaction_matrix.npy, (2 n, commands) float64, px for a command of 1 nm; reference_slopes.npy, (2 n,)
     float32, px, what that estimator measures of a flat wavefront. Slopes are all x, then all y. [control] has
     the loop's gain, leak and delay where it says nothing else, and the estimator's centroid gain.
@@ -76,7 +78,7 @@ def write_engine_files(
     configuration_file.save(path, camera_calibration(configuration))
     configuration_file.save(path, psf)
     if not configuration_file.has(path, "settings"):
-        configuration_file.save(path, _SETTINGS)
+        configuration_file.save(path, fixed_window(configuration))
     known = configuration_file.load_all(path)
     arm = _arm(known.settings, psf, known.score, control)
     reference = reference_slopes(configuration, optics.sensor, arm)
@@ -95,6 +97,12 @@ def write_engine_files(
         measured |= {"controller": control, "model": MODEL}
     control_file.save_control(path, **{**usual, **before, **measured})
     return path
+
+
+def fixed_window(configuration: LoopConfiguration, **options: Any) -> Settings:
+    """Return settings of a fixed window for the configuration's star, with other options of the estimator."""
+    width = float(f"{WINDOW_WIDTH * configuration.scene.seen_fwhm_px:.3g}")
+    return Settings("window", window_fwhm_px=width, flux_e=configuration.photons, **options)
 
 
 def _arm(settings: Settings, psf: PSF, score: Score | None, control: str) -> Arm:

@@ -25,7 +25,13 @@ def telescope() -> None:
 @telescope.command("run", short_help="Run the simulated telescope until Ctrl-C.")
 @click.argument("configuration", metavar="[CONFIG]", default="canary")
 @name_option("Name of the pixel ring and the streams.")
-@option("--frame-rate-hz", type=float, metavar="HZ", help="Frame rate.", show_default="CONFIG")
+@option(
+    "--frame-rate-hz",
+    type=float,
+    metavar="HZ",
+    help="Frame rate; winds are scaled with it, so that the turbulence moves as far in a frame.",
+    show_default="CONFIG",
+)
 @option(
     "--write-config", metavar="FOLDER", help="Write what an engine needs: faintspot.toml and two matrices."
 )
@@ -84,7 +90,7 @@ def run(
 
     observed = load_loop(configuration)
     if frame_rate_hz is not None:
-        observed = observed.replace("control", frame_rate_hz=frame_rate_hz)
+        observed = observed.slowed_to(frame_rate_hz)
     if write_config is not None:
         click.echo(f"{name}: {write_engine_files(observed, write_config, control)} written")
     say = partial(click.echo, err=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from faintspot.ao_loop.arms import Arm
 from faintspot.ao_loop.calibration import make_pipeline
 from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
-from faintspot.ao_loop.engine_files import write_engine_files
+from faintspot.ao_loop.engine_files import fixed_window, write_engine_files
 from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import prepare
 from faintspot.base.errors import InputError
@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 _CONFIGURATION = "camera_3e"
 # Chosen in the simulated loop with other realisations of the turbulence than the one shown.
-_PRIOR_PX, _GAIN, _WINDOW_WIDTH = 1.0, 0.4, 2.8  # the last one in widths of the spots
+_PRIOR_PX, _GAIN = 1.0, 0.4
 _TURN_S = 1.0
 _IMAGES_EVERY = 10
 _SETTLE_FRAMES = 20  # start of a turn, affected by the previous method
@@ -98,13 +98,13 @@ class LiveDemonstration:
         gain.
         """
         observed = self.observed
-        width = _WINDOW_WIDTH * observed.scene.seen_fwhm_px
-        window = Settings("window", window_fwhm_px=width, centroid_gain=1.0, flux_e=self.photons)
+        window = fixed_window(observed, centroid_gain=1.0)
         pipeline = make_pipeline(observed, prepare(observed).sensor, Arm("-", window))
         gain = float(measure_gains(observed, [pipeline], seed=self.seed)[0])
+        options = f"window_fwhm_px={window.window_fwhm_px:g}+centroid_gain={gain:.3g}"
         return {
             "brightest": f"brightest+{INTEGRATOR}",
-            "window": f"estimator=window+window_fwhm_px={width:.3g}+centroid_gain={gain:.3g}+{INTEGRATOR}",
+            "window": f"estimator=window+{options}+{INTEGRATOR}",
             f"map+{KALMAN}": f"map+{KALMAN}",
         }
 
