@@ -111,32 +111,42 @@ def kept_panels(dataset: xarray.Dataset, profile: str) -> list[KeptPanel]:
     16 x 16 pixels (or the study's largest), round spots, the smallest position range. Where a study does not
     have the paper's fluxes, the nearest are taken.
     """
-    by_configuration = {
+    cells_of = {
         configuration: cells
         for configuration, cells in cells_by_configuration(dataset).items()
         if configuration.profile == profile and configuration.elongation == 1
     }
-    if not by_configuration:
+    if not cells_of:
         return []
-    reach = min(configuration.position_range_px for configuration in by_configuration)
-    pixels = max(configuration.pixels for configuration in by_configuration)
-    kept = {c: i for c, i in by_configuration.items() if (c.position_range_px, c.pixels) == (reach, pixels)}
-    noise = min(c.read_noise_e for c in kept) if kept else 0.0
-    size = min(c.size for c in kept) if kept else 0.0
+    reach = min(configuration.position_range_px for configuration in cells_of)
+    pixels = max(configuration.pixels for configuration in cells_of)
+    kept = [c for c in sorted(cells_of) if (c.position_range_px, c.pixels) == (reach, pixels)]
+    noise = min((c.read_noise_e for c in kept), default=0.0)
+    size = min((c.size for c in kept), default=0.0)
+    fixed = f"{profile}, {pixels} × {pixels} px, ±{reach:g} px"
     low, high = _WANTED_SIGNALS_E
+
+    def nearest(configuration: Configuration, wanted_e: float) -> tuple[float, int]:
+        flux = dataset["flux_e"].values[cells_of[configuration]]
+        best = int(np.argmin(np.abs(np.log(flux / wanted_e))))
+        return float(flux[best]), int(cells_of[configuration][best])
+
+    def panel(what: str, named: Sequence[tuple[str, Configuration]], common: str) -> KeptPanel:
+        """Return one cell of each configuration, at the flux nearest to the lower one that is wanted."""
+        found = [(name, *nearest(configuration, low)) for name, configuration in named]
+        fluxes = {flux for _, flux, _ in found}
+        at = f"{fluxes.pop():g} e-" if len(fluxes) == 1 else ""
+        cells = [(name if at else f"{name}, {flux:g} e-", cell) for name, flux, cell in found]
+        return KeptPanel(f"{what} at {at or 'signals as named'}, {common}; {fixed}", cells)
+
     quiet = [c for c in kept if c.read_noise_e == noise]
     sharp = [c for c in kept if c.size == size and c.read_noise_e in (*_SHOWN_NOISES_E, noise)]
-    signals = [
-        (f"{flux:g} e-", cell)
-        for c in quiet
-        if c.size == size
-        for flux, cell in dict(_nearest(dataset, kept[c], wanted) for wanted in (low, high)).items()
-    ]
-    fixed = f"{profile}, {pixels} × {pixels} px, ±{reach:g} px"
+    at_signals = dict(nearest(c, wanted) for c in quiet if c.size == size for wanted in (low, high))
+    signals = [(f"{flux:g} e-", cell) for flux, cell in at_signals.items()]
     return [
         KeptPanel(f"signals, size {size:g}, {noise:g} e- read noise; {fixed}", signals),
-        _panel("spot sizes", dataset, kept, sorted(quiet), low, f"{noise:g} e- read noise; {fixed}"),
-        _panel("read noises", dataset, kept, sorted(sharp), low, f"size {size:g}; {fixed}"),
+        panel("spot sizes", [(f"size {c.size:g}", c) for c in quiet], f"{noise:g} e- read noise"),
+        panel("read noises", [(f"{c.read_noise_e:g} e-", c) for c in sharp], f"size {size:g}"),
     ]
 
 
@@ -160,36 +170,6 @@ def spread(
     low, high = int(np.argmin(values)), int(np.argmax(values))
     relative = np.hypot(errors[low] / values[low], errors[high] / values[high])
     return float(np.log(values[high] / values[low])), float(relative)
-
-
-def _panel(
-    what: str,
-    dataset: xarray.Dataset,
-    kept: dict[Configuration, np.ndarray],
-    configurations: Sequence[Configuration],
-    wanted_e: float,
-    fixed: str,
-) -> KeptPanel:
-    """Return one cell of each configuration, all of one flux: the nearest to the wanted one they share."""
-    cells = []
-    for configuration in configurations:
-        flux, cell = _nearest(dataset, kept[configuration], wanted_e)
-        value = (
-            f"size {configuration.size:g}" if what == "spot sizes" else f"{configuration.read_noise_e:g} e-"
-        )
-        cells.append((value, cell, flux))
-    fluxes = {flux for _, _, flux in cells}
-    at = f"{fluxes.pop():g} e-" if len(fluxes) == 1 else "signals as named"
-    labelled = [
-        (name if at != "signals as named" else f"{name}, {flux:g} e-", cell) for name, cell, flux in cells
-    ]
-    return KeptPanel(f"{what} at {at}, {fixed}", labelled)
-
-
-def _nearest(dataset: xarray.Dataset, cells: np.ndarray, wanted_e: float) -> tuple[float, int]:
-    flux = dataset["flux_e"].values[cells]
-    best = int(np.argmin(np.abs(np.log(flux / wanted_e))))
-    return float(flux[best]), int(cells[best])
 
 
 _FAMILY_FALSE_ALARM = 0.05
