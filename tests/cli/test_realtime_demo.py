@@ -1,4 +1,4 @@
-"""faintspot realtime demo: it shows a loop, ends what it has started, and says what the arms were worth."""
+"""faintspot realtime demo: it shows a loop, ends what it has started, and says what each method gained."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytest.importorskip("tornado")
 pytest.importorskip("zarr")
 
 from faintspot.base.errors import InputError
-from faintspot.cli.realtime_demo import arms_table, in_words
+from faintspot.cli.realtime_demo import in_words, methods_table
 from faintspot.live_page.demonstration import Shown
 from faintspot.realtime.control import ControlServer, request
 from faintspot.realtime.pixel_segment import FOLDER
@@ -58,7 +58,7 @@ def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
         with urllib.request.urlopen(lines[2], timeout=60) as page:
             assert b"<title>faintspot</title>" in page.read()
         end, begun = time.monotonic() + PATIENCE_S, frames_measured(name)
-        while frames_measured(name) < begun + 260:  # each of three arms has turns of 50
+        while frames_measured(name) < begun + 260:  # each of three methods has turns of 50
             assert time.monotonic() < end
             time.sleep(0.1)
         process.send_signal(signal.SIGINT)
@@ -77,7 +77,7 @@ def test_from_an_empty_folder_to_a_table(tmp_path: Path, name: str) -> None:
 
 
 def shown(turns: int) -> Shown:
-    """Arms of 60 frames with Strehl ratios of 0.3, 0.5 and 0.4, and 0.9 while they settle; before, 0.1."""
+    """Methods of 60 frames with Strehl ratios of 0.3, 0.5 and 0.4, and 0.9 while they settle; before, 0.1."""
     seen = Shown(["brightest", "window", "map"], delay_frames=2)
     seen.status = {
         "counters": COUNTERS,
@@ -95,17 +95,17 @@ def shown(turns: int) -> Shown:
 
 def test_table() -> None:
     seen = shown(13)
-    arms = {arm.strehl.arm: arm for arm in seen.by_arm()}
-    assert [arm.strehl.mean.value for arm in arms.values()] == pytest.approx([0.3, 0.5, 0.4])
-    assert arms["brightest"].strehl.difference is None
-    difference = arms["window"].strehl.difference
+    methods = {method.strehl.arm: method for method in seen.by_method()}
+    assert [method.strehl.mean.value for method in methods.values()] == pytest.approx([0.3, 0.5, 0.4])
+    assert methods["brightest"].strehl.difference is None
+    difference = methods["window"].strehl.difference
     assert difference is not None
     assert difference.value == pytest.approx(0.2)
-    assert arms["map"].frames == 240
-    assert (arms["map"].p50_us, seen.open_strehl) == pytest.approx((32.0, 0.1))
+    assert methods["map"].frames == 240
+    assert (methods["map"].p50_us, seen.open_strehl) == pytest.approx((32.0, 0.1))
     assert seen.on_time == pytest.approx(2 / 3)  # of every four frames, three are known, two of them odd
     console = Console(width=80, record=True)
-    console.print(arms_table(seen.by_arm()))
+    console.print(methods_table(seen.by_method()))
     assert "0.500 ± 0.000  +0.200 ± 0.000" in console.export_text()
     words = in_words(seen)
     assert words[0].startswith("600 frames measured, 3 lost; ")
@@ -115,7 +115,7 @@ def test_table() -> None:
 def test_what_was_not_seen_is_said() -> None:
     assert in_words(Shown(["a"], 2)) == ["ended before there was a loop"]
     early = shown(2)
-    assert early.by_arm() == []
+    assert early.by_method() == []
     assert in_words(early)[-1] == "ended before every method had its turn"
     nothing = Shown(["a"], 2)
     assert np.isnan([nothing.open_strehl, nothing.on_time]).all()

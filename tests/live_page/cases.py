@@ -24,11 +24,11 @@ PATIENCE_S = 20.0
 _opened: list[Client] = []
 
 
-def records(first: int, count: int, *, arm: int = 0, interval_s: float = 0.01) -> NDArray[Any]:
+def records(first: int, count: int, *, method: int = 0, interval_s: float = 0.01) -> NDArray[Any]:
     """Records of `count` frames from number `first` on, valid, 100 e-, 50 us late."""
     made = np.zeros(count, record_type(N))
     made["frame"] = np.arange(first, first + count)
-    made["arm"] = arm
+    made["arm"] = method
     made["last_row_time_ns"] = 1e9 * interval_s * made["frame"]
     made["published_time_ns"] = made["last_row_time_ns"] + 50_000
     made["flux"] = 100.0
@@ -40,7 +40,7 @@ class Played:
     """Gives a frame, with its picture, each time it is asked."""
 
     def __init__(self, layout: Layout = LAYOUT) -> None:
-        self.name, self.arms, self.frames = "played", ["set"], 0
+        self.name, self.methods, self.frames = "played", ["set"], 0
         self.layout: Layout | None = layout
 
     def read(self) -> Batch | None:

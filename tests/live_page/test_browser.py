@@ -233,18 +233,18 @@ def test_loop_is_closed_and_its_gain_set(open_page: Any, server: LiveServer, eng
     assert engine.loop == {"state": "closed", "gain": 0.3, "opened_because": None}
 
 
-def test_arms_take_turns_and_are_compared(open_page: Any, server: LiveServer, engine: Running) -> None:
+def test_methods_take_turns_and_are_compared(open_page: Any, server: LiveServer, engine: Running) -> None:
     page = open_page(server.url)
-    page.locator("#arms-text").fill("none,nothing")
-    page.locator("#arms-text").press("Enter")
+    page.locator("#methods-text").fill("none,nothing")
+    page.locator("#methods-text").press("Enter")
     page.locator("#interleave-answer[data-ok=false]").filter(has_text="'nothing': expected").wait_for()
-    page.locator("#arms-text").fill("none,tv")
+    page.locator("#methods-text").fill("none,tv")
     page.locator("#every").fill("5")
     page.locator("#every").press("Enter")
     page.locator("#interleave-answer").filter(has_text="frame").wait_for()
-    page.locator("#arms tbody tr").nth(1).wait_for()
-    assert page.locator("#arms tbody th").all_inner_texts() == ["none", "tv"]
-    assert engine.engine.status()["arms"] == ["none", "tv"]
+    page.locator("#methods tbody tr").nth(1).wait_for()
+    assert page.locator("#methods tbody th").all_inner_texts() == ["none", "tv"]
+    assert engine.engine.status()["methods"] == ["none", "tv"]
 
 
 def test_recording_from_the_page(open_page: Any, server: LiveServer, folder: Path) -> None:

@@ -53,11 +53,11 @@ def test_client_requests_reach_the_control_channel_as_the_command_line_sends_the
     client_requests = EngineRequests(NAME, tmp_path)
     answer = ask(client_requests, do="set", changes=["noise_std=2.5", "rule=threshold"], subapertures="1,3-5")
     assert answer == {"ok": True, "text": "in effect from frame 12"}
-    assert ask(client_requests, do="interleave", arms="none,tv", every=20)["ok"]
+    assert ask(client_requests, do="interleave", methods="none,tv", every=20)["ok"]
     assert ask(client_requests, do="loop", action="gain", gain=0.3)["ok"]
     assert asked == [
         ("set", {"changes": {"noise_std": 2.5, "rule": "threshold"}, "where": [1, 3, 4, 5]}),
-        ("interleave", {"arms": "none,tv", "every": 20}),
+        ("interleave", {"methods": "none,tv", "every": 20}),
         ("loop", {"action": "gain", "gain": 0.3}),
     ]
 

@@ -25,12 +25,12 @@ def test_engine_that_comes_goes_and_comes_back(name: str, monkeypatch: pytest.Mo
     source = EngineSource(name)
     assert source.read() is None
     assert not source.place()["there"]
-    for arms in ([], ["none", "tv"]):
-        with TelemetryRing.create(name, LAYOUT, arms=arms) as ring:
+    for methods in ([], ["none", "tv"]):
+        with TelemetryRing.create(name, LAYOUT, methods=methods) as ring:
             first = source.read()
             assert first is not None
             assert first.anew
-            assert source.arms == arms
+            assert source.methods == methods
             for frame in range(5):
                 write(ring, frame)
             write_images(ring, 3)

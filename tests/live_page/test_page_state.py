@@ -40,8 +40,8 @@ def test_truth_that_comes_before_its_frame_counts_for_it() -> None:
     for turn in range(40):
         first = 10 * turn
         truth = (first + 10, 0.2 + 0.4 * ((turn + 1) % 2), 100.0)  # of the next turn's first frame
-        page_state.add(Batch(records(first, 10, arm=turn % 2), truth=truth))
-    none, tv = page_state.arms_compared()
+        page_state.add(Batch(records(first, 10, method=turn % 2), truth=truth))
+    none, tv = page_state.methods_compared()
     assert none["figures"]["Strehl ratio"]["mean"] == pytest.approx(0.2)
     assert tv["figures"]["Strehl ratio"]["mean"] == pytest.approx(0.6)
 
@@ -67,18 +67,18 @@ def test_figures_are_those_of_numpy() -> None:
     assert figures["rate_hz"] == pytest.approx(100.0)
     assert figures["longest_us"] == pytest.approx(latency_us.max())
     assert figures["histogram"]["counts"].sum() == 1000
-    assert page_state.arms_compared() == []
+    assert page_state.methods_compared() == []
 
 
-def test_arms_in_turn_are_compared_with_the_first() -> None:
-    """The second arm has 10 e- more, without noise: the difference is known exactly."""
+def test_methods_in_turn_are_compared_with_the_first() -> None:
+    """The second method has 10 e- more, without noise: the difference is known exactly."""
     page_state = PageState(["none", "tv"])
     for turn in range(40):
-        made = records(50 * turn, 50, arm=turn % 2)
+        made = records(50 * turn, 50, method=turn % 2)
         made["flux"] += 10.0 * (turn % 2)
         page_state.add(Batch(made))
-    none, tv = page_state.arms_compared()
-    assert (none["arm"], tv["arm"], none["frames"]) == ("none", "tv", 1000)
+    none, tv = page_state.methods_compared()
+    assert (none["method"], tv["method"], none["frames"]) == ("none", "tv", 1000)
     flux = tv["figures"]["flux (e-)"]
     assert flux["mean"] == pytest.approx(110.0)
     assert flux["difference"] == pytest.approx(10.0)
@@ -87,15 +87,15 @@ def test_arms_in_turn_are_compared_with_the_first() -> None:
     assert "Strehl ratio" not in tv["figures"]
 
 
-def test_arms_of_an_earlier_interleaving_are_not_compared() -> None:
+def test_methods_of_an_earlier_interleaving_are_not_compared() -> None:
     page_state = PageState(["none", "tv"])
     for turn in range(6):
-        page_state.add(Batch(records(50 * turn, 50, arm=turn % 2)))
+        page_state.add(Batch(records(50 * turn, 50, method=turn % 2)))
     change = {"frame": 300, "number": 1, "changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 50}}
     for turn in range(6, 12):
-        made = records(50 * turn, 50, arm=2 + turn % 2)
+        made = records(50 * turn, 50, method=2 + turn % 2)
         page_state.add(Batch(made, changes=[change] if turn == 6 else []))
-    assert [row["arm"] for row in page_state.arms_compared()] == ["ml", "set"]
+    assert [row["method"] for row in page_state.methods_compared()] == ["ml", "set"]
 
 
 def test_only_the_last_minute_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -226,14 +226,7 @@ def test_command(config: Path, name: str) -> None:
     options = [
         "--config",
         str(config),
-        "--name",
-        name,
-        "--frame-rate-hz",
-        "400",
-        "--frames",
-        "20",
-        "--distinct",
-        "5",
+        *f"--name {name} --frame-rate-hz 400 --frames 20 --distinct 5".split(),
     ]
     result = CliRunner().invoke(camera, [*options, "--bits", "12", "--offset-adu", "50", "--seed", "1"])
     assert result.exit_code == 0, result.output

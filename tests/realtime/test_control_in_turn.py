@@ -23,7 +23,7 @@ pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 EVERY, FRAMES = 8, 40
 SETTINGS = fs.Settings("map", prior_std_px=1.0, flux_e=200.0)
-ARMS = Interleaving.parse("window+integrator,map+kalman", EVERY)
+METHODS = Interleaving.parse("window+integrator,map+kalman", EVERY)
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +34,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Control]:
 
 def test_a_controller_goes_on_from_what_the_mirror_holds(sky: Sky, files: tuple[Path, Control]) -> None:
     path, control = files
-    engine = make_engine(sky.name, path, control, interleaving=ARMS)
+    engine = make_engine(sky.name, path, control, interleaving=METHODS)
     sky.start(engine)
     sky.loop.close()
     strehl = sky.frames(FRAMES)
     records, sent = sky.records, sky.records["commands"].astype(np.float64)
     place = np.arange(FRAMES) // EVERY % 2
     assert records["arm"].tolist() == place.tolist()
-    assert engine.status()["arms"] == ["window+integrator", "map+kalman"]
+    assert engine.status()["methods"] == ["window+integrator", "map+kalman"]
     slopes, errors = (
         np.hstack([records[f"{name}{axis}"] for axis in "xy"]).astype(np.float64)
         for name in ("", "standard_error_")
@@ -101,30 +101,30 @@ def test_only_what_predicts_is_told_to_estimators(
     assert sure.max() < 0.9
 
 
-def test_arms_change_while_the_loop_is_closed(sky: Sky, files: tuple[Path, Control]) -> None:
+def test_methods_change_while_the_loop_is_closed(sky: Sky, files: tuple[Path, Control]) -> None:
     path, control = files
     engine = make_engine(sky.name, path, control)
     sky.start(engine)
     sky.loop.close()
     sky.frames(4)
     interleave = commands_of(engine)["interleave"]
-    for arms in ("map+modal", "window+integrator,map+polc"):
+    for methods in ("map+modal", "window+integrator,map+polc"):
         with refused("interleave: 'map+", "model: expected what", "got that of 'kalman'"):
-            interleave({"arms": arms, "every": 2})
-    assert engine.status()["arms"] == ["set"]
-    interleave({"arms": "window+integrator,map+kalman", "every": 2})
+            interleave({"methods": methods, "every": 2})
+    assert engine.status()["methods"] == ["set"]
+    interleave({"methods": "window+integrator,map+kalman", "every": 2})
     sky.frames(6)
     assert commands_of(engine)["loop"]({"action": "gain", "gain": 0.125})["loop"]["gain"] == 0.125
-    interleave({"arms": "set"})
+    interleave({"methods": "set"})
     sky.frames(4)
-    arms = sky.records["arm"]
-    assert set(arms[:4]) == {0}
-    assert set(arms[5:-4]) == {1, 2}
-    assert set(arms[-3:]) == {3}
+    methods = sky.records["arm"]
+    assert set(methods[:4]) == {0}
+    assert set(methods[5:-4]) == {1, 2}
+    assert set(methods[-3:]) == {3}
     assert engine.loop_status()["controller"] == "kalman"
     assert set(sky.records["loop"]) == {2}
 
 
 def test_without_commands_controllers_are_refused(sky: Sky, files: tuple[Path, Control]) -> None:
     with refused("interleave: 'window+integrator'", "makes no commands"):
-        make_engine(sky.name, files[0], None, interleaving=ARMS)
+        make_engine(sky.name, files[0], None, interleaving=METHODS)

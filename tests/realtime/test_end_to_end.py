@@ -43,19 +43,7 @@ COMMAND = [sys.executable, "-m", "faintspot", "realtime"]
 def processes(name: str, tmp_path: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Start camera and engine; end them."""
     (tmp_path / "faintspot.toml").write_text(CONFIGURATION)
-    camera = [
-        "camera",
-        "--name",
-        name,
-        "--frame-rate-hz",
-        "200",
-        "--offset-adu",
-        "100",
-        "--bits",
-        "16",
-        "--seed",
-        "3",
-    ]
+    camera = f"camera --name {name} --frame-rate-hz 200 --offset-adu 100 --bits 16 --seed 3".split()
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     started = []
     for arguments in (["run", "--name", name], camera):

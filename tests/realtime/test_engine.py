@@ -54,8 +54,8 @@ def test_what_is_published(bench: Bench) -> None:
     assert np.array_equal(found["slopes"].payload, expected.vector)
     assert np.array_equal(found["details"].payload[0], expected.flux)
     assert np.array_equal(found["details"].payload[4], expected.iterations)
-    frame, arm, change, last_row_ns, published_ns = found["marks"].payload.tolist()
-    assert (frame, arm, change) == (17, 0, 0)
+    frame, method, change, last_row_ns, published_ns = found["marks"].payload.tolist()
+    assert (frame, method, change) == (17, 0, 0)
     assert 0 < published_ns - last_row_ns < 60e9
     for stream in streams.values():
         stream.close()
@@ -65,7 +65,7 @@ def test_telemetry_says_with_which_calibration_and_spot(bench: Bench) -> None:
     assert unpacked(bench.telemetry.description["parts"]) == (CALIBRATION, None, None)
 
 
-def test_arms_take_turns() -> None:
+def test_methods_take_turns() -> None:
     """Two frames not denoised, two denoised, and again; every frame says which."""
     data = simulated(8)
     with Bench(interleaving=Interleaving.parse("none,tv", 2)) as bench:

@@ -155,14 +155,14 @@ def test_one_that_goes_on_failing_is_given_up(camera: Camera, tmp_path: Path, fa
 
 
 @pytest.mark.usefixtures("tried_here")
-def test_a_fault_in_an_arm_ends_taking_turns(camera: Camera, tmp_path: Path) -> None:
+def test_a_fault_in_an_method_ends_taking_turns(camera: Camera, tmp_path: Path) -> None:
     camera.ask["load"]({"source": str(write(tmp_path, FAILING.format("raise ValueError")))})
     camera.engine.interleave("set,mine", 1)
     camera.shoot(n=3)
     camera.shoot(camera.bright, n=8)
-    assert camera.engine.status()["arms"] == ["set"]
+    assert camera.engine.status()["methods"] == ["set"]
     camera.assert_measured_with(SETTINGS, camera.shoot())
-    # "set" has a number of its own again, after those of the arms that took turns.
+    # "set" has a number of its own again, after those of the methods that took turns.
     assert camera.records["arm"][-1] == 3
 
 

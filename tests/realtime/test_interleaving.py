@@ -1,4 +1,4 @@
-"""Arms: what their texts mean, and whose turn it is."""
+"""Methods: what their texts mean, and whose turn it is."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tests.refusals import refused
 import faintspot as fs
 from faintspot.pipeline.settings import without_denoising
 from faintspot.realtime.commands import commands_of
-from faintspot.realtime.interleaving import Interleaving, arms_after
+from faintspot.realtime.interleaving import Interleaving, methods_after
 
 pytestmark = pytest.mark.machine_time("clocks, threads and other processes")
 
 
 def test_texts() -> None:
     found = Interleaving.parse("none, tv,ml,noise_std=2+keep_brightest=20,set", 50)
-    assert [(arm.changes, arm.denoises) for arm in found.arms] == [
+    assert [(method.changes, method.denoises) for method in found.methods] == [
         ({}, False),
         ({"estimator": "tv"}, True),
         ({"estimator": "ml"}, True),
@@ -31,16 +31,16 @@ def test_texts() -> None:
 
 def test_controllers() -> None:
     found = Interleaving.parse("window+integrator,set+kalman,none,noise_std=2+keep_brightest=20+modal")
-    assert [arm.control for arm in found.arms] == ["integrator", "kalman", None, "modal"]
-    assert [arm.changes for arm in found.arms[:2]] == [{"estimator": "window"}, {}]
-    assert found.arms[3].changes == {"noise_std": 2, "keep_brightest": 20}
+    assert [method.control for method in found.methods] == ["integrator", "kalman", None, "modal"]
+    assert [method.changes for method in found.methods[:2]] == [{"estimator": "window"}, {}]
+    assert found.methods[3].changes == {"noise_std": 2, "keep_brightest": 20}
     assert found.labels[0] == "window+integrator"
 
 
-def test_what_arms_make_of_the_settings() -> None:
+def test_what_methods_make_of_the_settings() -> None:
     settings = fs.Settings("tv", noise_std=2.0, keep_brightest=9, search_range_px=3.0)
-    arms = Interleaving.parse("none,tv,ml,noise_std=3,set").arms
-    assert [arm.of(settings) for arm in arms] == [
+    methods = Interleaving.parse("none,tv,ml,noise_std=3,set").methods
+    assert [method.of(settings) for method in methods] == [
         fs.Settings("brightest", keep_brightest=9, search_range_px=3.0),
         settings,
         fs.Settings("ml", search_range_px=3.0),
@@ -50,14 +50,14 @@ def test_what_arms_make_of_the_settings() -> None:
 
 
 def test_none_needs_an_estimator_that_denoises() -> None:
-    (arm,) = Interleaving.parse("none").arms
+    (method,) = Interleaving.parse("none").methods
     with refused("interleave: 'none'", "'ml'", "does not denoise"):
-        arm.of(fs.Settings("ml"))
+        method.of(fs.Settings("ml"))
 
 
 def test_turns() -> None:
     found = Interleaving.parse("none,tv,ml", 2)
-    assert [found.arm_of(count) for count in range(8)] == [0, 0, 1, 1, 2, 2, 0, 0]
+    assert [found.method_of(count) for count in range(8)] == [0, 0, 1, 1, 2, 2, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -73,40 +73,40 @@ def test_every() -> None:
         Interleaving.parse("none,tv", 0)
 
 
-def test_arms_of_later_interleavings_have_numbers_of_their_own() -> None:
+def test_methods_of_later_interleavings_have_numbers_of_their_own() -> None:
     changes: list[dict[str, Any]] = [
         {"changes": {"noise_std": 2.0}},
         {"changes": {"arms": ["ml", "set"], "first_arm": 2, "every": 5}},
         {"changes": {"loop": "open"}},
         {"changes": {"arms": ["set"], "first_arm": 4, "every": 5}},
     ]
-    assert arms_after(["none", "tv"], changes[:1]) == (["none", "tv"], 0)
-    assert arms_after(["none", "tv"], changes) == (["none", "tv", "ml", "set", "set"], 4)
-    # Of a recording, whose arms are all of them already.
-    assert arms_after(["a", "b", "c", "d", "e"], changes[:2]) == (["a", "b", "ml", "set", "e"], 2)
+    assert methods_after(["none", "tv"], changes[:1]) == (["none", "tv"], 0)
+    assert methods_after(["none", "tv"], changes) == (["none", "tv", "ml", "set", "set"], 4)
+    # Of a recording, whose methods are all of them already.
+    assert methods_after(["a", "b", "c", "d", "e"], changes[:2]) == (["a", "b", "ml", "set", "e"], 2)
     garbage: list[dict[str, Any]] = [{}, {"changes": {"arms": "x", "first_arm": 0}}]
     garbage += [{"changes": {"arms": ["x"], "first_arm": number}} for number in (-1, 9, "0", None)]
-    assert arms_after(["none", "tv"], garbage) == (["none", "tv"], 0)
+    assert methods_after(["none", "tv"], garbage) == (["none", "tv"], 0)
 
 
-def test_arms_change_while_the_engine_runs(bench: Bench) -> None:
+def test_methods_change_while_the_engine_runs(bench: Bench) -> None:
     handlers = commands_of(bench.engine)
     frames = simulated(12)
     ring = bench.ring()
     bench.attached()
     for number in range(4):
         bench.send(ring, number, frames[number])
-    for wrong in ({"arms": "none,nothing"}, {"arms": "ml,none", "every": 0}, {"arms": ["tv"]}, {}):
+    for wrong in ({"methods": "none,nothing"}, {"methods": "ml,none", "every": 0}, {"methods": ["tv"]}, {}):
         with pytest.raises(fs.InputError):
             handlers["interleave"](wrong)
     with pytest.raises(fs.InputError, match="search_range_px = -1"):  # found only when it is prepared
-        handlers["interleave"]({"arms": "none,search_range_px=-1"})
-    assert bench.engine.status()["arms"] == ["set"]
-    handlers["interleave"]({"arms": "none,tv", "every": 2})
+        handlers["interleave"]({"methods": "none,search_range_px=-1"})
+    assert bench.engine.status()["methods"] == ["set"]
+    handlers["interleave"]({"methods": "none,tv", "every": 2})
     for number in range(4, 12):
         bench.send(ring, number, frames[number])
     status = bench.engine.status()
-    assert (status["arms"], status["every"]) == (["none", "tv"], 2)
+    assert (status["methods"], status["every"]) == (["none", "tv"], 2)
     bench.until(lambda: bench.telemetry.changes_since(0)[0])
     (change,), _, _ = bench.telemetry.changes_since(0)
     assert change["changes"] == {"arms": ["none", "tv"], "first_arm": 1, "every": 2}
@@ -116,6 +116,6 @@ def test_arms_change_while_the_engine_runs(bench: Bench) -> None:
     for record, frame in zip(bench.records[at:], frames[at:], strict=True):
         settings = without_denoising(SETTINGS, "") if record["arm"] == 1 else SETTINGS
         assert np.array_equal(np.concatenate([record["x"], record["y"]]), make(settings)(frame).vector)
-    handlers["set"]({"changes": {"noise_std": 2.0}})  # the arms stay
+    handlers["set"]({"changes": {"noise_std": 2.0}})  # the methods stay
     bench.send(ring, 12, frames[0])
     assert bench.engine.live.running.interleaving.labels == ["none", "tv"]

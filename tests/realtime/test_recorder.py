@@ -40,7 +40,7 @@ PATIENCE_S = 60.0
 @pytest.fixture
 def engine(name: str) -> Iterator[Engine]:
     """Writes frames."""
-    with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS)) as running:
+    with Engine(TelemetryRing.create(name, LAYOUT, settings=SETTINGS, image_slots=200)) as running:
         yield running
 
 
@@ -172,8 +172,8 @@ def test_what_cannot_be_recorded(name: str, tmp_path: Path) -> None:
                 Recorder(name, tmp_path / f"{next(iter(wrong))}.zarr").run(**wrong)
 
 
-def test_arms_that_came_later_are_named(name: str, tmp_path: Path) -> None:
-    with TelemetryRing.create(name, LAYOUT, arms=["none", "tv"]) as ring:
+def test_methods_that_came_later_are_named(name: str, tmp_path: Path) -> None:
+    with TelemetryRing.create(name, LAYOUT, methods=["none", "tv"]) as ring:
         recording = Recorder(name, tmp_path / "night.zarr")
         write(ring, 1)
         ring.write_change(2, 1, {"arms": ["ml", "set"], "first_arm": 2, "every": 50}, None)

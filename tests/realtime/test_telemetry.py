@@ -60,7 +60,7 @@ def test_commands_and_the_loops_state(name: str) -> None:
 def test_what_is_written_is_read(name: str) -> None:
     before = time.time_ns() - time.monotonic_ns()
     with TelemetryRing.create(
-        name, LAYOUT, settings=SETTINGS, arms=["none", "tv"], records=16, image_slots=3
+        name, LAYOUT, settings=SETTINGS, methods=["none", "tv"], records=16, image_slots=3
     ) as ring:
         reader = TelemetryReader.attach(name)
         assert reader.layout == LAYOUT

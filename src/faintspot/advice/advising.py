@@ -84,7 +84,7 @@ class Loop:
         InputError
             When there is no engine, methods are interleaved, the loop is not closed, or the engine ends.
         """
-        if len(self.ask("status")["arms"]) > 1:
+        if len(self.ask("status")["methods"]) > 1:
             raise InputError(
                 f"{self.name}: expected no interleaving; end it with faintspot realtime interleave set"
             )

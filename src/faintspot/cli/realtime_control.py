@@ -84,7 +84,7 @@ def interleave(name: str, methods: str, every: int) -> None:
     Example:
       faintspot realtime interleave none,tv --every 100
     """
-    reply = asked_at_length(name, "interleave", arms=methods, every=every)
+    reply = asked_at_length(name, "interleave", methods=methods, every=every)
     click.echo(since(reply["frame"]))
 
 
@@ -118,8 +118,8 @@ def _table(name: str) -> Any:
     grid.add_row("source", "none" if source is None else f"process {source['pid']}, frame {source['frame']}")
     for title, text in notes(reply).items():
         grid.add_row(title, text, style="bold red" if title != "preparing" else None)
-    if len(reply["arms"]) > 1:
-        grid.add_row("methods", ", ".join(reply["arms"]))
+    if len(reply["methods"]) > 1:
+        grid.add_row("methods", ", ".join(reply["methods"]))
     if reply["loop"]["state"] != "none":
         grid.add_row("loop", loop_in_words(reply["loop"]).removeprefix("loop "))
     for estimator, file in reply["loaded"].items():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from faintspot.experiments.statistics import Estimate
-    from faintspot.live_page.demonstration import ArmShown, Shown
+    from faintspot.live_page.demonstration import MethodShown, Shown
 
 _NEEDED = {"realtime": ("pyshmem",), "live": ("tornado", "zarr"), "loop": ("hcipy",)}
 
@@ -55,26 +55,26 @@ def demo(
     plan = LiveDemonstration(Path(output), flux_e, frame_rate_hz, name, port, seed)
     with stop_on_signal() as stop:
         shown = plan.run(stop, seconds, click.echo)
-    arms = shown.by_arm()
-    if arms:
-        Console().print(arms_table(arms))
+    methods = shown.by_method()
+    if methods:
+        Console().print(methods_table(methods))
     for line in in_words(shown):
         click.echo(line)
 
 
-def arms_table(arms: list[ArmShown]) -> Table:
-    """Return what every arm has done as a table."""
-    columns = ("Strehl ratio", f"over {arms[0].strehl.arm}", "p50", "p99", "frames")
+def methods_table(methods: list[MethodShown]) -> Table:
+    """Return what every method has done as a table."""
+    columns = ("Strehl ratio", f"over {methods[0].strehl.arm}", "p50", "p99", "frames")
     table = results_table("method", *columns)
-    for arm in arms:
-        difference = arm.strehl.difference
+    for method in methods:
+        difference = method.strehl.difference
         table.add_row(
-            arm.strehl.arm,
-            _plus_minus(arm.strehl.mean, ""),
+            method.strehl.arm,
+            _plus_minus(method.strehl.mean, ""),
             "" if difference is None else _plus_minus(difference, "+"),
-            f"{arm.p50_us:.0f}",
-            f"{arm.p99_us:.0f}",
-            str(arm.frames),
+            f"{method.p50_us:.0f}",
+            f"{method.p99_us:.0f}",
+            str(method.frames),
         )
     table.caption = "Standard errors from blocks of turns; p50, p99 from the last row to the slopes, us."
     return table
@@ -112,7 +112,7 @@ def in_words(shown: Shown) -> list[str]:
         lines.append(f"Strehl ratio of the open loop: {shown.open_strehl:.3f}")
     if loop["opened_because"]:
         lines.append(f"the loop was opened: {loop['opened_because']}")
-    if not shown.by_arm():
+    if not shown.by_method():
         lines.append("ended before every method had its turn")
     return lines
 

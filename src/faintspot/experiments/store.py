@@ -220,7 +220,7 @@ def _check_place(path: Path, known: Mapping[str, Any], *, overwrite: bool) -> No
         return
     found = _attributes(path)
     if found is None or found.get(_KIND, kind) != kind:
-        raise InputError(f"{path}: exists already and is not the store of a {kind}: choose another name")
+        raise InputError(f"{path}: already exists and is not the store of a {kind}; choose another name")
     if overwrite:
         return
     if found[_FINGERPRINT] != known[_FINGERPRINT]:

@@ -50,7 +50,7 @@ class Source(Protocol):
     name: str
     layout: Layout | None
     """Layout of the sensor; None until it is known."""
-    arms: list[str]
+    methods: list[str]
     """Names of the interleaved configurations."""
 
     def read(self) -> Batch | None:

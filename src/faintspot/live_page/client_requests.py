@@ -86,7 +86,7 @@ class EngineRequests:
 
     def _interleave(self, asked: dict[str, Any]) -> Mapping[str, Any]:
         """Interleave configurations as `faintspot realtime interleave`."""
-        reply = self._ask("interleave", arms=asked.get("arms"), every=asked.get("every"))
+        reply = self._ask("interleave", methods=asked.get("methods"), every=asked.get("every"))
         return {"text": since(reply.get("frame"))}
 
     def _loop(self, asked: dict[str, Any]) -> Mapping[str, Any]:

@@ -18,6 +18,7 @@ from faintspot.ao_loop.configuration import LoopConfiguration, load_loop
 from faintspot.ao_loop.engine_files import fixed_window, write_engine_files
 from faintspot.ao_loop.simulation import measure_gains
 from faintspot.ao_loop.telescope_model import prepare
+from faintspot.base.closing import Closing
 from faintspot.base.errors import InputError
 from faintspot.base.files import output_errors, write_atomically
 from faintspot.control.configuration import CONTROLLER, save_control
@@ -90,7 +91,7 @@ class LiveDemonstration:
         return max(2 * _SETTLE_FRAMES, round(_TURN_S * self.rate_hz))
 
     @cached_property
-    def arms(self) -> dict[str, str]:
+    def methods(self) -> dict[str, str]:
         """Methods that take turns, by name, in the format of `faintspot realtime interleave`.
 
         The window uses its centroid gain for speckled spots, as a system would have measured it. "map" uses
@@ -152,13 +153,13 @@ class LiveDemonstration:
         self._check_name()
         say(f"simulating a telescope and training a Kalman filter (one minute); files: {self.folder}")
         loop, engine = self.write_files()
-        shown = Shown(list(self.arms), self.observed.control.delay_frames)
+        shown = Shown(list(self.methods), self.observed.control.delay_frames)
         if stop.is_set():
             return shown
         with ChildProcesses(self.folder) as processes:
             name = ["--name", self.name]
             seed = ["--seed", str(self.seed)]
-            turns = ["--interleave", ",".join(self.arms.values()), "--every", str(self.turn_frames)]
+            turns = ["--interleave", ",".join(self.methods.values()), "--every", str(self.turn_frames)]
             images = ["--images-every", str(_IMAGES_EVERY)]
             processes.start(_TELESCOPE, ["realtime", "telescope", "run", str(loop), *name, *seed])
             processes.start(_ENGINE, ["realtime", "run", "--config", str(engine), *name, *turns, *images])
@@ -179,7 +180,7 @@ class LiveDemonstration:
             with _Watcher(self.name, shown, _LOOKS_PER_FRAME * self.rate_hz) as watcher:
                 watcher.watch(processes, stop, _OPEN_FRAMES / self.rate_hz)
                 self._asked("loop", action="close")
-                say(f"the loop is closed; methods compared for {seconds:g} s: {', '.join(self.arms)}")
+                say(f"the loop is closed; methods compared for {seconds:g} s: {', '.join(self.methods)}")
                 watcher.watch(processes, stop, seconds)
             shown.status = self._asked("status")
         return shown
@@ -207,7 +208,7 @@ class LiveDemonstration:
 class Shown:
     """Data gathered from the loop."""
 
-    arms: list[str]
+    methods: list[str]
     delay_frames: int
     rows: list[tuple[float, ...]] = field(default_factory=list)
     """Rows of all frames: number, method, state of the loop, latency [us]."""
@@ -237,7 +238,7 @@ class Shown:
         late = frames[:, 0] - frames[:, 5]
         return float(np.mean(late == self.delay_frames)) if len(late) else float("nan")
 
-    def by_arm(self) -> list[ArmShown]:
+    def by_method(self) -> list[MethodShown]:
         """Return the result of every method in the closed loop; empty before each has had a turn.
 
         The first frames of each turn, still affected by the previous method, do not count towards the Strehl
@@ -245,20 +246,22 @@ class Shown:
         """
         frames = self.table
         frames = frames[frames[:, 2] == STATES.index(CLOSED)]
-        arm = frames[:, 1].astype(np.int64)
-        if len(np.unique(arm)) < len(self.arms):
+        method = frames[:, 1].astype(np.int64)
+        if len(np.unique(method)) < len(self.methods):
             return []
-        begins = np.flatnonzero(np.concatenate([[True], np.diff(arm) != 0]))
-        since = np.arange(len(arm)) - begins[np.searchsorted(begins, np.arange(len(arm)), "right") - 1]
+        begins = np.flatnonzero(np.concatenate([[True], np.diff(method) != 0]))
+        since = np.arange(len(method)) - begins[np.searchsorted(begins, np.arange(len(method)), "right") - 1]
         strehl = np.where(since < _SETTLE_FRAMES, np.nan, frames[:, 4])
         return [
-            ArmShown(compared, int(np.sum(arm == place)), *np.percentile(frames[arm == place, 3], (50, 99)))
-            for place, compared in enumerate(compared_arms(arm, self.arms, strehl))
+            MethodShown(
+                compared, int(np.sum(method == place)), *np.percentile(frames[method == place, 3], (50, 99))
+            )
+            for place, compared in enumerate(compared_arms(method, self.methods, strehl))
         ]
 
 
 @dataclass(frozen=True)
-class ArmShown:
+class MethodShown:
     """Result of one method: Strehl ratio, frames, and latencies from the last row to the slopes."""
 
     strehl: ArmDifference
@@ -267,7 +270,7 @@ class ArmShown:
     p99_us: float
 
 
-class _Watcher:
+class _Watcher(Closing):
     """Reader of telemetry and truth as they arrive."""
 
     def __init__(self, name: str, shown: Shown, looks_hz: float) -> None:
@@ -276,10 +279,8 @@ class _Watcher:
         self._truth = Follower(f"{name}_truth")
         self._cursor = self._reader.records.written
 
-    def __enter__(self) -> _Watcher:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Close stream and telemetry."""
         self._truth.close()
         self._reader.close()
 

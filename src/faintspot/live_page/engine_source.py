@@ -37,7 +37,7 @@ class EngineSource:
     def __init__(self, name: str) -> None:
         self.name = name
         self.layout: Layout | None = None
-        self.arms: list[str] = []
+        self.methods: list[str] = []
         self._reader: TelemetryReader | None = None
         self._truth, self._commands = Follower(f"{name}_truth"), Follower(f"{name}_commands")
         self._cursors = [0, 0, 0]  # records, images, changes
@@ -94,7 +94,7 @@ class EngineSource:
             reader.close()
             return False
         self._reader, self.layout = reader, reader.layout
-        self.arms = reader.description["arms"]
+        self.methods = reader.description["arms"]
         self._cursors = [reader.records.written, max(0, reader.images.written - 1), 0]
         return True
 

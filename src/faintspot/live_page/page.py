@@ -14,7 +14,7 @@ from faintspot.live_page.pictures import FrameDrawing
 
 UPDATE_S = 0.08
 """Interval between two updates of the page [s]."""
-_FIGURES_S, _ARMS_S = 0.5, 2.0
+_FIGURES_S, _METHODS_S = 0.5, 2.0
 
 
 class Page:
@@ -31,8 +31,8 @@ class Page:
         self.source, self._tell = source, tell
         self.page_state = PageState([])
         self._drawing: FrameDrawing | None = None
-        self._figures_s = self._arms_s = 0.0
-        self._arms: list[dict[str, Any]] = []
+        self._figures_s = self._methods_s = 0.0
+        self._methods: list[dict[str, Any]] = []
         self._place: dict[str, Any] | None = None
 
     def step(self) -> None:
@@ -60,7 +60,7 @@ class Page:
         """Clear data of another engine, or of another part of the recording."""
         layout = self.source.layout
         assert layout is not None
-        self.page_state = PageState(self.source.arms)
+        self.page_state = PageState(self.source.methods)
         if self._drawing is None or self._drawing.layout is not layout:
             self._drawing = FrameDrawing(layout)
             self._tell("pictures", None)
@@ -70,7 +70,7 @@ class Page:
         moment = time.monotonic()
         if now or moment - self._figures_s >= _FIGURES_S:
             self._figures_s = moment
-            if now or moment - self._arms_s >= _ARMS_S:
-                self._arms_s, self._arms = moment, self.page_state.arms_compared()
-            values = {**self.page_state.figures(), "arms": self._arms, "flags": flag_names()}
+            if now or moment - self._methods_s >= _METHODS_S:
+                self._methods_s, self._methods = moment, self.page_state.methods_compared()
+            values = {**self.page_state.figures(), "methods": self._methods, "flags": flag_names()}
             self._tell("figures", packed("figures", values))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from faintspot.base.flags import INVALID, SubapertureFlag
 from faintspot.io.frame_numbers import all_left_out
 from faintspot.live_page.batch import Batch, Floats
-from faintspot.realtime.interleaving import arms_after
+from faintspot.realtime.interleaving import methods_after
 from faintspot.recorded.telemetry_numbers import ArmDifference, compared_arms
 
 STRIP_S = 30.0
@@ -25,7 +25,7 @@ _MEAN_FRAMES = 500  # time constant of a sub-aperture's mean slope, about which 
 _FEWEST_FRAMES = 10  # needed for a mean
 _STRIP = ("time_s", "latency_us", "longest_us", "rms_px", "flux_e", "lost", "strehl", "rms_nm")
 """Row of the strip charts: result of one read of the telemetry."""
-_FRAME = ("time_s", "arm", "latency_us", "rms_px", "flux_e", "valid", "strehl")
+_FRAME = ("time_s", "method", "latency_us", "rms_px", "flux_e", "valid", "strehl")
 """Row of the last frames."""
 _BIN_EDGES_US = 2.0 ** (np.arange(0, 20 * 4 + 1) / 4)  # 1 us to 1 s, four bins in a factor of 2
 _COMPARED = {
@@ -42,12 +42,12 @@ class PageState:
 
     Parameters
     ----------
-    arms : list of str
+    methods : list of str
         Names of the interleaved configurations; none or one without interleaving.
     """
 
-    def __init__(self, arms: list[str]) -> None:
-        self.arms = list(arms)
+    def __init__(self, methods: list[str]) -> None:
+        self.methods = list(methods)
         self.newest: NDArray[Any] | None = None
         """Record of the newest frame."""
         self.changes: list[dict[str, Any]] = []
@@ -56,7 +56,7 @@ class PageState:
         self.commands: Floats | None = None
         self._strip: deque[tuple[float, ...]] = deque()
         self._frames: deque[Floats] = deque()
-        self._first_arm = 0  # number of the first method of the present interleaving
+        self._first_method = 0  # number of the first method of the present interleaving
         self._means: dict[int, Floats] = {}  # mean slopes by method, and their numbers of frames
         self._seen_of: defaultdict[int, int] = defaultdict(int)
         # The last ones: a frame's truth may be known before its record.
@@ -66,7 +66,7 @@ class PageState:
     def add(self, batch: Batch) -> None:
         """Add the data of a batch."""
         self.changes = (self.changes + batch.changes)[-_MOST_CHANGES:]
-        self.arms, self._first_arm = arms_after(self.arms, batch.changes, self._first_arm)
+        self.methods, self._first_method = methods_after(self.methods, batch.changes, self._first_method)
         self.missed += batch.missed
         if batch.commands is not None:
             self.commands = batch.commands
@@ -109,7 +109,7 @@ class PageState:
         }
         arrays: dict[str, NDArray[Any]] = {"strip": strip.astype(np.float32)}
         if newest is not None:
-            values |= {"frame": int(newest["frame"]), "arm": self._arm_name(int(newest["arm"]))}
+            values |= {"frame": int(newest["frame"]), "method": self._method_name(int(newest["arm"]))}
             arrays |= {name: newest[name] for name in ("x", "y", "flux", "flags")}
         if self.commands is not None:
             arrays["commands"] = self.commands.astype(np.float32)
@@ -137,26 +137,26 @@ class PageState:
             "changes": self.changes,
         }
 
-    def arms_compared(self) -> list[dict[str, Any]]:
+    def methods_compared(self) -> list[dict[str, Any]]:
         """Return the figures of the present methods, with errors; empty if there is only one.
 
         Takes some 50 ms, most of it for the bootstrap of the errors.
         """
         frames = self._all_frames()
-        frames = frames[frames[:, _FRAME.index("arm")] >= self._first_arm]
-        arm = frames[:, _FRAME.index("arm")].astype(np.int64)
-        present = np.unique(arm)
+        frames = frames[frames[:, _FRAME.index("method")] >= self._first_method]
+        method = frames[:, _FRAME.index("method")].astype(np.int64)
+        present = np.unique(method)
         if len(present) < 2:
             return []
-        names = [self._arm_name(place) for place in present]
+        names = [self._method_name(place) for place in present]
         rows: list[dict[str, Any]] = [
-            {"arm": name, "frames": int(np.sum(arm == place)), "figures": {}}
+            {"method": name, "frames": int(np.sum(method == place)), "figures": {}}
             for name, place in zip(names, present, strict=True)
         ]
         for title, (column, factor) in _COMPARED.items():
             values = factor * frames[:, _FRAME.index(column)]
             if np.isfinite(values).any():
-                for row, compared in zip(rows, compared_arms(arm, names, values), strict=True):
+                for row, compared in zip(rows, compared_arms(method, names, values), strict=True):
                     row["figures"][title] = _in_plain(compared)
         return rows
 
@@ -170,7 +170,7 @@ class PageState:
         rows = np.full((len(records), len(_FRAME)), np.nan)
         columns: Mapping[str, Any] = {
             "time_s": records["last_row_time_ns"] / 1e9,
-            "arm": records["arm"],
+            "method": records["arm"],
             "latency_us": (records["published_time_ns"] - records["last_row_time_ns"]) / 1e3,
             "rms_px": self._rms(records, valid, some),
             "flux_e": np.where(valid, records["flux"], 0.0).sum(axis=1) / some,
@@ -183,18 +183,18 @@ class PageState:
     def _rms(self, records: NDArray[Any], valid: NDArray[np.bool_], some: Floats) -> Floats:
         """Return the rms of each frame's slopes about the sub-apertures' running means for its method."""
         squares = np.full(len(records), np.nan)
-        for arm in np.unique(records["arm"]):
-            own = records["arm"] == arm
-            self._seen_of[int(arm)] += own.sum()
+        for method in np.unique(records["arm"]):
+            own = records["arm"] == method
+            self._seen_of[int(method)] += own.sum()
             used = valid[own]
             slopes = np.stack([records["x"][own], records["y"][own]]).astype(np.float64)
             mean = np.where(used, slopes, 0.0).sum(axis=1) / np.maximum(used.sum(axis=0), 1)
-            before = self._means.get(int(arm), mean)
+            before = self._means.get(int(method), mean)
             weight = min(1.0, own.sum() / _MEAN_FRAMES)
-            self._means[int(arm)] = before + weight * (mean - before)
-            if self._seen_of[int(arm)] < _FEWEST_FRAMES:
+            self._means[int(method)] = before + weight * (mean - before)
+            if self._seen_of[int(method)] < _FEWEST_FRAMES:
                 continue
-            deviation = np.where(used, slopes - self._means[int(arm)][:, None], 0.0)
+            deviation = np.where(used, slopes - self._means[int(method)][:, None], 0.0)
             squares[own] = np.sum(deviation**2, axis=(0, 2))
         return np.asarray(np.sqrt(squares / (2 * some)))
 
@@ -228,8 +228,8 @@ class PageState:
     def _all_frames(self) -> Floats:
         return np.concatenate([np.empty((0, len(_FRAME))), *self._frames])
 
-    def _arm_name(self, arm: int) -> str:
-        return self.arms[arm] if arm < len(self.arms) else f"arm {arm}"
+    def _method_name(self, method: int) -> str:
+        return self.methods[method] if method < len(self.methods) else f"method {method}"
 
 
 def flag_names() -> list[dict[str, Any]]:

@@ -46,7 +46,7 @@ def _set(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
 
 def _interleave(engine: Engine, fields: dict[str, Any]) -> Mapping[str, Any]:
     every = int(number_between("every", fields.get("every", _USUAL_TURN), 1, integer=True))
-    change = engine.interleave(_text(fields, "arms"), every)
+    change = engine.interleave(_text(fields, "methods"), every)
     return {"frame": engine.live.wait(change, EFFECT_TIMEOUT_S)}
 
 

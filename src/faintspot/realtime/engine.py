@@ -20,7 +20,7 @@ from faintspot.realtime.engine_estimators import EngineEstimators
 from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
 from faintspot.realtime.flux_following import FluxFollower
 from faintspot.realtime.frame_path import FramePath
-from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM, Interleaving
+from faintspot.realtime.interleaving import EVERY, FIRST_METHOD, METHODS, Interleaving
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.pixel_ring import PixelRing
 from faintspot.realtime.prediction_stream import PredictionStream
@@ -145,7 +145,7 @@ class Engine:
                 name,
                 layout,
                 settings=to_text(settings),
-                arms=interleaving.labels,
+                methods=interleaving.labels,
                 commands=commands,
                 reference=None if control is None else control.reference,
                 parts=packed(first.calibration, *first.spot),
@@ -172,7 +172,7 @@ class Engine:
             "latency": self.latencies.as_dict(),
             "estimator": self.live.settings.estimator.name,
             "subapertures": len(self.live.running.layout),
-            "arms": interleaving.labels,
+            "methods": interleaving.labels,
             "every": interleaving.every,
             "loaded": {name: str(file.path) for name, file in self.estimators.loaded.items()},
             "estimator_fault": self.estimators.fault,
@@ -197,27 +197,27 @@ class Engine:
             When the text is refused; nothing changes then.
         """
         before = self.preparer.interleaving
-        new = Interleaving.parse(text, every, before.first + len(before.arms))
+        new = Interleaving.parse(text, every, before.first + len(before.methods))
         self._make_ready(new)
         self.preparer.interleaving = new
         try:
-            return self.live.renew({ARMS: new.labels, FIRST_ARM: new.first, EVERY: new.every})
+            return self.live.renew({METHODS: new.labels, FIRST_METHOD: new.first, EVERY: new.every})
         except BaseException:
             self.preparer.interleaving = before
             raise
 
     def _make_ready(self, interleaving: Interleaving) -> None:
         """Prepare the controllers of all configurations, or refuse them."""
-        for arm in interleaving.arms:
-            if arm.control is None:
+        for method in interleaving.methods:
+            if method.control is None:
                 continue
             try:
                 if self.loop is None:
                     raise InputError("this engine makes no commands; add [control] to its configuration")
-                self.loop.control.check_errors(self.live.running.pipelines[0].calibration, arm.control)
-                self.loop.make_ready(arm.control)
+                self.loop.control.check_errors(self.live.running.pipelines[0].calibration, method.control)
+                self.loop.make_ready(method.control)
             except InputError as error:
-                raise InputError(f"interleave: {arm.label!r}: {error}") from None
+                raise InputError(f"interleave: {method.label!r}: {error}") from None
 
     # The engine's thread ----------------------------------------------------------------------------
 
@@ -315,10 +315,10 @@ class Engine:
 
     def _measure_next(self, ring: PixelRing) -> bool:
         """Measure and publish the next frame; return False when the wait for it was ended."""
-        path, arm = self._take(ring)
+        path, method = self._take(ring)
         self._path, self._waiting = path, True
         arrival = self._arrival + 1
-        explain = self._images_every > 0 and self._measured.get(arm, 0) % self._images_every == 0
+        explain = self._images_every > 0 and self._measured.get(method, 0) % self._images_every == 0
         if self._prediction is not None:
             path.await_start(arrival)
             self._prediction.fill(self._number + 1)
@@ -329,23 +329,23 @@ class Engine:
         self._waiting = False
         if not whole and path.stopped:
             return False
-        self._end_frame(ring, path, arm, arrival, number if whole else -1, explain)
+        self._end_frame(ring, path, method, arrival, number if whole else -1, explain)
         return True
 
     def _take(self, ring: PixelRing) -> tuple[FramePath, int]:
         """Return the next frame's path and configuration; changes of settings take effect here."""
         prepared = self.live.take(self._number + 1)
-        place = prepared.interleaving.arm_of(self.counters.processed)
+        place = prepared.interleaving.method_of(self.counters.processed)
         path = prepared.paths(ring)[place]
         if path.fault is not None and prepared.fallback is not None:
             self.estimators.fall_back(prepared.fallback, path.fault)
             return self._take(ring)
         if self.loop is not None:
-            self.loop.take_turn(prepared.interleaving.arms[place].control)
+            self.loop.take_turn(prepared.interleaving.methods[place].control)
         return path, prepared.interleaving.first + place
 
     def _end_frame(
-        self, ring: PixelRing, path: FramePath, arm: int, arrival: int, number: int, explained: bool
+        self, ring: PixelRing, path: FramePath, method: int, arrival: int, number: int, explained: bool
     ) -> None:
         """Publish the slopes first, then the details, unless the frame was overwritten meanwhile."""
         counters, slopes = self.counters, path.slopes
@@ -367,9 +367,9 @@ class Engine:
         self.latencies.add(latency)
         path.flag_doubtful()
         change = self.live.change_number
-        self._streams.publish_marks((number, arm, change, moment, published))
+        self._streams.publish_marks((number, method, change, moment, published))
         invalid, limited, iterations = self._streams.publish_details(slopes, number)
-        self._telemetry.write(number, arm, change, moment, published, slopes, state, commands)
+        self._telemetry.write(number, method, change, moment, published, slopes, state, commands)
         if self._flux is not None:
             self._flux.take(slopes.flux)
         if self._streams.commands_lost:
@@ -390,7 +390,7 @@ class Engine:
             counters.skipped += max(skipped, 0)
             counters.repeated += number <= self._number
             counters.source_restarts += skipped < 0 and number > self._number
-        self._measured[arm] = self._measured.get(arm, 0) + 1
+        self._measured[method] = self._measured.get(method, 0) + 1
         self._arrival, self._number = arrival, number
 
     def _lose(self, ring: PixelRing, arrival: int, number: int) -> None:

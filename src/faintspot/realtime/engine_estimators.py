@@ -13,7 +13,7 @@ from faintspot.estimators import registry
 from faintspot.realtime.control import EFFECT_TIMEOUT_S
 from faintspot.realtime.engine_plan import EnginePlan, SettingsPreparer
 from faintspot.realtime.estimator_file import EstimatorFile, load_estimators
-from faintspot.realtime.interleaving import ARMS, EVERY, FIRST_ARM
+from faintspot.realtime.interleaving import EVERY, FIRST_METHOD, METHODS
 from faintspot.realtime.live import Change, LiveSettings
 from faintspot.realtime.trial import Trial
 
@@ -103,10 +103,10 @@ class EngineEstimators:
         self._fallen_back(fallback, estimator_fault=fault)
 
     def _fallen_back(self, fallback: EnginePlan, **more: str) -> Change:
-        self._preparer.interleaving = arms = fallback.interleaving
+        self._preparer.interleaving = turns = fallback.interleaving
         changes = {"estimator": fallback.settings.estimator.name, **more}
         return self._live.offer(
-            fallback, {**changes, ARMS: arms.labels, FIRST_ARM: arms.first, EVERY: arms.every}
+            fallback, {**changes, METHODS: turns.labels, FIRST_METHOD: turns.first, EVERY: turns.every}
         )
 
     def _renewed(self, names: set[str]) -> int | None:

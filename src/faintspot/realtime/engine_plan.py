@@ -121,11 +121,11 @@ class SettingsPreparer:
         InputError
             When the settings or those of a configuration do not fit, or an estimator fails its trial.
         """
-        arms = [arm.of(settings) for arm in self.interleaving.arms]
-        pipelines = [self._pipeline(each) for each in arms]
+        each_settings = [method.of(settings) for method in self.interleaving.methods]
+        pipelines = [self._pipeline(each) for each in each_settings]
         for pipeline in pipelines:
             check_real_time(pipeline)
-        own = all(is_built_in(each.estimator) for each in arms)
+        own = all(is_built_in(each.estimator) for each in each_settings)
         prepared = EnginePlan(
             pipelines, settings, self.interleaving, self._new_path, None if own else self._fallback(settings)
         )
@@ -144,8 +144,8 @@ class SettingsPreparer:
 
     def _fallback(self, settings: Settings) -> EnginePlan:
         """Prepare the same settings with a built-in estimator and no interleaving."""
-        settings, arms = self.built_in(settings), self.interleaving
-        alone = arms if len(arms.arms) == 1 else Interleaving(first=arms.first + len(arms.arms))
+        settings, turns = self.built_in(settings), self.interleaving
+        alone = turns if len(turns.methods) == 1 else Interleaving(first=turns.first + len(turns.methods))
         return EnginePlan([self.make_pipeline(settings)], settings, alone, self._new_path)
 
     def _new_path(self, pipeline: SlopePipeline, pixels: NDArray[Any], progress: Progress) -> FramePath:

@@ -15,12 +15,12 @@ from faintspot.pipeline.settings import Settings, without_denoising
 from faintspot.realtime.live import check_names
 
 _SET, _NONE = "set", "none"
-ARMS, FIRST_ARM, EVERY = "arms", "first_arm", "every"
+METHODS, FIRST_METHOD, EVERY = "arms", "first_arm", "every"
 """Keys of a change of the interleaving in telemetry: names, number of the first, frames per turn."""
 
 
 @dataclass(frozen=True)
-class Arm:
+class Method:
     """A configuration that takes turns: its changes of the settings, and its name."""
 
     label: str
@@ -49,30 +49,30 @@ class Interleaving:
 
     Parameters
     ----------
-    arms : tuple of Arm
+    methods : tuple of Method
     every : int
         Number of frames per turn.
     first : int
         Number of the first configuration in telemetry; those of earlier interleavings keep theirs.
     """
 
-    arms: tuple[Arm, ...] = (Arm("set", {}),)
+    methods: tuple[Method, ...] = (Method("set", {}),)
     every: int = 1
     first: int = 0
 
     def __post_init__(self) -> None:
         number_between("every", self.every, 1, integer=True)
-        if not self.arms:
+        if not self.methods:
             raise InputError("interleave: expected at least one method, got none")
 
-    def arm_of(self, count: int) -> int:
+    def method_of(self, count: int) -> int:
         """Return the index of the configuration whose turn it is after `count` frames."""
-        return count // self.every % len(self.arms)
+        return count // self.every % len(self.methods)
 
     @property
     def labels(self) -> list[str]:
         """Names of the configurations."""
-        return [arm.label for arm in self.arms]
+        return [method.label for method in self.methods]
 
     @classmethod
     def parse(cls, text: str, every: int = 1, first: int = 0) -> Interleaving:
@@ -87,49 +87,49 @@ class Interleaving:
         InputError
             When the text is anything else.
         """
-        return cls(tuple(_parsed_arm(part.strip()) for part in text.split(",")), every, first)
+        return cls(tuple(_parsed_method(part.strip()) for part in text.split(",")), every, first)
 
 
-def arms_after(
-    arms: Sequence[str], changes: Iterable[Mapping[str, Any]], first: int = 0
+def methods_after(
+    methods: Sequence[str], changes: Iterable[Mapping[str, Any]], first: int = 0
 ) -> tuple[list[str], int]:
     """Return the names of all configurations by number in telemetry, and the first active number.
 
     Parameters
     ----------
-    arms : sequence of str
+    methods : sequence of str
         Names at the start.
     changes : iterable of mapping
         Changes from telemetry; those of other settings are ignored.
     first : int
         Number of the first active configuration before the changes.
     """
-    names = list(arms)
+    names = list(methods)
     for change in changes:
         values = change.get("changes", {})
-        number, new = values.get(FIRST_ARM), values.get(ARMS)
+        number, new = values.get(FIRST_METHOD), values.get(METHODS)
         if isinstance(number, int) and 0 <= number <= len(names) and isinstance(new, list):
             names[number : number + len(new)] = map(str, new)
             first = number
     return names, first
 
 
-def _parsed_arm(text: str) -> Arm:
+def _parsed_method(text: str) -> Method:
     measured, _, control = text.rpartition("+")
     if measured and control in CONTROLS:
         return replace(_parsed_settings(measured), label=text, control=control)
     return _parsed_settings(text)
 
 
-def _parsed_settings(text: str) -> Arm:
+def _parsed_settings(text: str) -> Method:
     if text in (_SET, _NONE):
-        return Arm(text, {}, denoises=text == _SET)
+        return Method(text, {}, denoises=text == _SET)
     if text in estimators():
-        return Arm(text, {"estimator": text})
+        return Method(text, {"estimator": text})
     if "=" in text:
         changes = parse_changes(text.split("+"))
         check_names(list(changes))
-        return Arm(text, changes)
+        return Method(text, changes)
     known = ", ".join([_SET, _NONE, *estimators()])
     raise InputError(
         f"interleave: {text!r}: expected {known}, or NAME=VALUE with + between several, perhaps "

@@ -20,7 +20,7 @@ from faintspot.base.checks import number_between
 from faintspot.base.errors import InputError
 from faintspot.io.telemetry import TelemetryStore
 from faintspot.realtime.camera import StopEvent
-from faintspot.realtime.interleaving import arms_after
+from faintspot.realtime.interleaving import methods_after
 from faintspot.realtime.telemetry import TelemetryReader
 
 _POLL_S = 0.01
@@ -101,7 +101,7 @@ class _Waiting:
     def attributes(self, reader: TelemetryReader) -> dict[str, Any]:
         """Return the store's attributes."""
         return {
-            "arms": arms_after(reader.description["arms"], self.changes)[0],
+            "arms": methods_after(reader.description["arms"], self.changes)[0],
             "changes": self.changes,
             "dropped_records": self.dropped,
             "dropped_images": self.dropped_images,

@@ -93,7 +93,7 @@ class TelemetryRing(Closing):
         layout: Layout,
         *,
         settings: str = "",
-        arms: Sequence[str] = (),
+        methods: Sequence[str] = (),
         commands: int = 0,
         reference: ArrayLike | None = None,
         parts: Mapping[str, str] | None = None,
@@ -109,7 +109,7 @@ class TelemetryRing(Closing):
         layout : Layout
         settings : str
             The initial settings, for readers: TOML text (`faintspot.pipeline.configuration.to_text`).
-        arms : sequence of str, optional
+        methods : sequence of str, optional
             Names of the interleaved configurations, for readers.
         commands : int
             Number of the mirror's commands; 0: none.
@@ -138,7 +138,7 @@ class TelemetryRing(Closing):
         description = {
             "layout": layout_values(layout),
             "settings": settings,
-            "arms": list(arms),
+            "arms": list(methods),
             "commands": commands,
             "reference": None if reference is None else np.asarray(reference).tolist(),
             "parts": parts,
@@ -152,7 +152,7 @@ class TelemetryRing(Closing):
     def write(
         self,
         frame: int,
-        arm: int,
+        method: int,
         change: int,
         last_row_ns: int,
         published_ns: int,
@@ -166,7 +166,7 @@ class TelemetryRing(Closing):
         ----------
         frame : int
             Frame number of the camera.
-        arm, change : int
+        method, change : int
             Numbers of the interleaved configuration and of the last change of settings that applies.
         last_row_ns, published_ns : int
             Times of CLOCK_MONOTONIC, ns.
@@ -184,7 +184,7 @@ class TelemetryRing(Closing):
             self._begin + place * self._itemsize,
             written,
             frame,
-            arm,
+            method,
             change,
             last_row_ns,
             published_ns,

@@ -25,10 +25,10 @@ export class Controls {
     byId("explain").addEventListener("change", (event) =>
       byId("settings").classList.toggle("explained", event.currentTarget.checked));
     this.onSubmit("interleave-form", "interleave-answer", "interleave", () => ({
-      arms: byId("arms-text").value.trim(), every: Number(byId("every").value) }));
+      methods: byId("methods-text").value.trim(), every: Number(byId("every").value) }));
     this.onSubmit("record-form", "record-answer", "record", () => ({ file: byId("file").value.trim() }));
     this.onSubmit("loop-form", "loop-answer", "loop", () => ({ action: "gain", gain: Number(byId("gain").value) }));
-    byId("interleave-form").addEventListener("input", () => { this.armsEdited = true; });
+    byId("interleave-form").addEventListener("input", () => { this.methodsEdited = true; });
     byId("loop-form").addEventListener("input", () => { this.gainEdited = true; });
     this.onClick("stop-recording", "record-answer", "stop_recording", {});
     this.onClick("loop-open", "loop-answer", "loop", { action: "open" });
@@ -42,7 +42,7 @@ export class Controls {
       answer(place, { ok: true, text: "…" });
       const reply = await this.connection.ask(what, fields());
       answer(place, reply);
-      if (reply.ok) this.armsEdited = this.gainEdited = false;
+      if (reply.ok) this.methodsEdited = this.gainEdited = false;
     });
   }
 
@@ -157,7 +157,7 @@ export class Controls {
   // State of the engine ---------------------------------------------------------------------------------
 
   status(status) {
-    const { loop, recording, arms } = status;
+    const { loop, recording, methods } = status;
     const there = Boolean(loop) && loop.state !== "none";
     byId("loop-form").hidden = !there;
     if (there) {
@@ -165,9 +165,9 @@ export class Controls {
       const gain = byId("gain");
       if (document.activeElement !== gain && !this.gainEdited) gain.value = loop.gain ?? "";
     }
-    if (arms && !this.armsEdited) {
-      byId("arms-text").value = arms.join();
-      if (arms.length > 1) byId("every").value = status.every;
+    if (methods && !this.methodsEdited) {
+      byId("methods-text").value = methods.join();
+      if (methods.length > 1) byId("every").value = status.every;
     }
     if (recording) {
       byId("stop-recording").disabled = !recording.running;

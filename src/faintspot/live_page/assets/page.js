@@ -255,7 +255,7 @@ function showFigures() {
     say("histogram-caption", `p50 ${inWords(half)} µs, p99 ${inWords(most)}, p99.9 ${inWords(nearly)}, longest `
       + `${inWords(values.longest_us)}; ${inWords(values.frames)} frames in ${inWords(values.seconds, 2)} s`);
   }
-  showArms(values.arms || []);
+  showMethods(values.methods || []);
   const changes = values.changes || [];
   byId("changes-section").hidden = changes.length === 0;
   byId("changes").replaceChildren(...changes.slice(-8).reverse().map(({ frame, changes: what, where }) => {
@@ -264,10 +264,10 @@ function showFigures() {
   }));
 }
 
-function showArms(arms) {
-  byId("arms-section").hidden = arms.length === 0;
-  if (arms.length === 0) return;
-  const titles = Object.keys(arms[0].figures);
+function showMethods(methods) {
+  byId("methods-section").hidden = methods.length === 0;
+  if (methods.length === 0) return;
+  const titles = Object.keys(methods[0].figures);
   const withError = (value, half) => `${inWords(value)}${half === null ? "" : ` ± ${inWords(half, 2)}`}`;
   const cell = ({ mean, half, difference, difference_half: spread, decided }) => {
     const made = element("td", { textContent: withError(mean, half) });
@@ -277,11 +277,11 @@ function showArms(arms) {
     }
     return made;
   };
-  byId("arms").replaceChildren(
+  byId("methods").replaceChildren(
     element("thead", {}, [element("tr", {}, [element("th", { textContent: "method" }), element("th", { textContent: "frames" }),
       ...titles.map((title) => element("th", { textContent: title }))])]),
-    element("tbody", {}, arms.map((arm) => element("tr", {}, [element("th", { textContent: arm.arm, scope: "row" }),
-      element("td", { textContent: inWords(arm.frames) }), ...titles.map((title) => cell(arm.figures[title]))]))),
+    element("tbody", {}, methods.map((method) => element("tr", {}, [element("th", { textContent: method.method, scope: "row" }),
+      element("td", { textContent: inWords(method.frames) }), ...titles.map((title) => cell(method.figures[title]))]))),
   );
 }
 
@@ -310,7 +310,7 @@ function showTiles() {
     ["latency p50", `${inWords(percentiles[50])} µs`],
     ["p99", `${inWords(percentiles[99])} µs`],
     ["lost frames", inWords(now.lost)],
-    ...(now.arm && figures.arms?.length ? [["method", now.arm]] : []),
+    ...(now.method && figures.methods?.length ? [["method", now.method]] : []),
     ...(loop && loop.state !== "none" ? [["loop", loop.state], ...(loop.gain == null ? [] : [["gain", inWords(loop.gain)]])] : []),
   ]);
 }
