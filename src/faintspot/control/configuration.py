@@ -1,4 +1,4 @@
-"""From slopes to commands, as [control] of faintspot.toml says."""
+"""Table [control] of faintspot.toml: controller, matrices and limits that turn slopes into commands."""
 
 from __future__ import annotations
 
@@ -42,66 +42,67 @@ _setting = partial(option, per_subaperture=False)
 
 @dataclass(frozen=True, eq=False)
 class ControlOptions(Options):
-    """Numbers of [control]."""
+    """Options of the table [control]."""
 
     controller: str = _setting(
         INTEGRATOR,
-        "What makes commands of slopes; all but the integrator need a `model`.",
+        "Controller that turns slopes into commands; all but the integrator need a `model`.",
         choices=tuple(CONTROLS),
     )
     gain: float = _setting(0.4, "Loop gain of the integrator.", low=0, high=2)
-    leak: float = _setting(0.01, "Part of the command that is forgotten in every frame.", low=0, high=1)
+    leak: float = _setting(0.01, "Fraction by which commands decay in each frame.", low=0, high=1)
     delay_frames: int = _setting(
         2,
-        "The command computed from frame k acts first during the exposure of frame k + `delay_frames`.",
+        "Delay: the command computed from frame k first acts during the exposure of frame k + delay_frames.",
         low=1,
         high=100,
         whole=True,
     )
     largest_command: float | None = _setting(
         None,
-        "Stroke, in the interaction matrix's unit: no command is larger, and what is cut off is forgotten. "
-        "Default: no limit.",
+        "Stroke limit, in the unit of the interaction matrix; clipped commands do not accumulate "
+        "(anti-windup). Default: no limit.",
         low=0,
         high=_BEYOND_ALL,
         low_open=True,
     )
     largest_condition: float = _setting(
         30.0,
-        "Combinations of actuators that move the slopes so many times less than the best one are not driven.",
+        "Largest condition number of the reconstructor: modes of the mirror with smaller singular values are "
+        "not controlled.",
         low=1,
         high=1e6,
     )
     centroid_gain: float = _setting(
         1.0,
-        "What the estimator shows of a slope of 1 px of the interaction matrix; slopes are divided by it. 1 "
-        "for a matrix that was measured with the same estimator at the same flux.",
+        "Centroid gain relative to the interaction matrix; slopes are divided by it. 1 for a matrix measured "
+        "with the same estimator at the same flux.",
         low=0.01,
         high=100,
     )
     prediction: str | None = _setting(
         None,
-        'Where the slopes come from that estimators with a prior expect: "controller", this one; "stream", '
-        "another program, by NAME_prediction. Default: the controller if it is a Kalman filter, else none.",
+        'Source of the predicted slopes for estimators with a prior: "controller"; "stream", another program '
+        'by the stream NAME_prediction; or "none". Default: "controller" for a Kalman filter, else "none".',
         choices=(NONE, CONTROLLER, STREAM),
     )
     guard_frames: int = _setting(
         50,
-        "The guard looks at means over so many frames.",
+        "Number of frames over which the guard averages.",
         low=1,
         high=1_000_000,
         whole=True,
     )
     most_invalid: float = _setting(
         0.5,
-        "It opens the loop when a larger part of the slopes is not valid; 1: never.",
+        "Fraction of invalid slopes above which the guard opens the loop; 1: never.",
         low=0,
         high=1,
     )
     largest_residual_px: float | None = _setting(
         None,
-        "It opens the loop when the rms of the slopes is larger. Default: 1.25 times what it was in the open "
-        "loop, which must have been open for `guard_frames` before; else a quarter of a window's side.",
+        "Rms of the slopes above which the guard opens the loop. Default: 1.25 times the rms in open loop, if "
+        "the loop was open for `guard_frames` before; else a quarter of a window's side.",
         unit="px",
         low=0,
         high=_BEYOND_ALL,
@@ -109,7 +110,7 @@ class ControlOptions(Options):
     )
     most_at_limit: float = _setting(
         0.5,
-        "It opens the loop when a larger part of the commands is at `largest_command`; 1: never.",
+        "Fraction of commands at `largest_command` above which the guard opens the loop; 1: never.",
         low=0,
         high=1,
     )
@@ -122,18 +123,18 @@ class Control:
     Parameters
     ----------
     interaction : (2 n, commands) array
-        Slopes, px, all x, then all y, that a unit of each command adds.
+        Slopes [px] (all x, then all y) that one unit of each command adds.
     reference : (2 n,) or (n, 2) array, optional
-        Reference slopes, px from each sub-aperture's centre. Default: 0.
+        Reference slopes [px] from each sub-aperture's centre. Default: 0.
     options : ControlOptions
     model : path, optional
-        What the controller has learnt, a file of `Model.save`; the plain integrator has no use for it.
+        Learnt model of the controller, a file written by `Model.save`. The integrator ignores it.
 
     Raises
     ------
     InputError
-        For a model that does not fit, numbers that are not finite, shapes that do not fit, and a mirror that
-        slopes cannot control.
+        If the model or the shapes do not fit, numbers are not finite, or the slopes cannot control the
+        mirror.
     """
 
     interaction: Any
@@ -160,7 +161,7 @@ class Control:
                 raise InputError(f"{REFERENCE}: expected positions up to {_LARGEST_SLOPE_PX:g} px")
         object.__setattr__(self, "interaction", matrix)
         object.__setattr__(self, "reference", reference)
-        assert self.reconstructor  # which refuses what is no interaction matrix
+        assert self.reconstructor  # refuses a matrix that cannot be inverted
         object.__setattr__(self, "model", self._checked_model())
 
     def _checked_model(self) -> Any:
@@ -170,18 +171,18 @@ class Control:
                 'prediction = "stream": expected "controller", as a Kalman filter predicts itself'
             )
         if kind == INTEGRATOR:
-            return self.model  # of no use to it: for `with_controller`
+            return self.model  # kept for `with_controller`
         if self.model is None:
-            raise InputError(f"{MODEL}: expected a file with what {CONTROLS[kind]} has learnt, got none")
+            raise InputError(f"{MODEL}: expected a file with the learnt model of {CONTROLS[kind]}, got none")
         model = self.model if isinstance(self.model, Model) else Model.load(self.model, self.plant)
         if model.kind != kind:
-            raise InputError(f"{MODEL}: expected what {kind!r} has learnt, got that of {model.kind!r}")
+            raise InputError(f"{MODEL}: expected a model of controller {kind!r}, got one of {model.kind!r}")
         model.check(self.plant)
         return model
 
     @cached_property
     def reconstructor(self) -> Reconstructor:
-        """From slopes to the commands that cause them."""
+        """Reconstructor from slopes to the commands that cause them."""
         return make_reconstructor(self.interaction, self.options.largest_condition)
 
     @property
@@ -197,12 +198,12 @@ class Control:
         return self.options.prediction or usual
 
     def with_controller(self, kind: str) -> Control:
-        """Return the same with another controller.
+        """Return the same configuration with another controller.
 
         Raises
         ------
         InputError
-            When the model is not what that one has learnt.
+            If the model belongs to another controller.
         """
         if kind == self.options.controller:
             return self
@@ -214,12 +215,12 @@ class Control:
         return int(self.interaction.shape[1])
 
     def check_fits(self, n: int) -> None:
-        """Refuse another number of sub-apertures than the matrix has.
+        """Check the number of sub-apertures against the interaction matrix.
 
         Raises
         ------
         InputError
-            Where it differs.
+            If it differs.
         """
         slopes = len(self.interaction)
         if slopes != 2 * n:
