@@ -15,7 +15,7 @@ from faintspot.spots.psf import PSF
 from faintspot.spots.score import Score
 
 PRIOR = "prior_std_px"
-"""Option of the estimators whose prior a loop sets: how far spots are from where they are expected."""
+"""Option of estimators whose prior the loop sets: standard deviation from the predicted position."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The air: frozen screens of von Karman turbulence, moved by the wind over the pupil."""
+"""Atmosphere: frozen screens of von Karman turbulence, moved over the pupil by the wind."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class MovingLayers:
     screens: tuple[Floats, ...]
     """Periodic screens of r0 = 1 m over all layers together, nm, (n, n) each."""
     velocity: NDArray[np.float64]
-    """Points per second that each layer moves, (layers, 2): along rows, along columns."""
+    """Velocity of each layer [points/s], (layers, 2): along rows, along columns."""
     start: NDArray[np.float64]
     """Position of the pupil's first point in each screen at time 0."""
     points: int
@@ -60,7 +60,7 @@ class MovingLayers:
         return total
 
     def blown(self, velocity: NDArray[np.float64], time_s: float) -> MovingLayers:
-        """Return the same turbulence with another wind (as `velocity`) and the same wavefront at one time."""
+        """Return the same turbulence with another wind and the same wavefront at one time."""
         start = self.start + (velocity - self.velocity) * time_s
         return replace(self, velocity=velocity, start=start % len(self.screens[0]))
 
@@ -160,7 +160,7 @@ def _draw_screen(amplitude: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _keys(fraction: float) -> NDArray[np.float32]:
-    """Return the weights of four neighbours for a place `fraction` after the second of them."""
+    """Return the weights of four neighbours for a position `fraction` after the second of them."""
     t = np.float64(fraction)
     weights = (
         t * (t * (2 - t) - 1),

@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 def arm_layout(layout: Layout, arm: Arm) -> Layout:
-    """Return the windows that an arm uses: the middle of the sensor's.
+    """Return the windows of a method: the middle of the sensor's windows.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def arm_layout(layout: Layout, arm: Arm) -> Layout:
 
 
 def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm) -> SlopePipeline:
-    """Return the pipeline of an arm, with the reference slopes of a flat wavefront."""
+    """Return the pipeline of a method, with the reference slopes of a flat wavefront."""
     return SlopePipeline(
         arm_layout(sensor.layout, arm),
         arm.settings,
@@ -65,7 +65,7 @@ def make_pipeline(configuration: LoopConfiguration, sensor: ShackHartmann, arm: 
 def reference_slopes(
     configuration: LoopConfiguration, sensor: ShackHartmann, arm: Arm
 ) -> NDArray[np.float32]:
-    """Return what an arm's estimator measures of a flat wavefront, all x, then all y, (2 n,) px.
+    """Return the slopes that a method measures for a flat wavefront, all x, then all y, (2 n,) px.
 
     References are measured with bright frames without noise, and without what is for faint flux:
     at its strength of denoising they would be denoised to nothing.
@@ -132,8 +132,8 @@ def typical_spots(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return spots as in the loop, all displaced by +0.25 px in x and y, and by -0.25 px.
 
-    Wavefronts are those of the air some time before the run; in closed loop the mirror takes off what it can
-    of the wavefront of as many frames earlier as the loop is late.
+    Wavefronts are those of the turbulence before the run. In closed loop the mirror corrects the wavefront of
+    `delay_frames` earlier.
 
     Returns
     -------

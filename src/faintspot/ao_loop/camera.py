@@ -1,4 +1,4 @@
-"""The sensor's camera: what it makes of the flux, with its noise or without, and how that is undone."""
+"""Camera of the wavefront sensor, with or without noise, and its calibration."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def make_detector(configuration: LoopConfiguration) -> Detector:
 
 
 def camera_calibration(configuration: LoopConfiguration) -> Calibration:
-    """Return what turns the camera's frames into electrons of the star."""
+    """Return the calibration from the camera's frames to electrons of the star."""
     camera = configuration.camera
     background = camera.background_e + camera.dark_e
     return Calibration(

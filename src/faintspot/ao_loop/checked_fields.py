@@ -1,4 +1,4 @@
-"""Fields of a dataclass that say which numbers they may hold."""
+"""Dataclass fields with an allowed range of numbers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def number(
     whole: bool = False,
     several: str = "",
 ) -> Any:
-    """Declare a field that holds a number from `low` to `high`, or None where that is its default.
+    """Declare a field that holds a number from `low` to `high`, or None if that is its default.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ _POSITION_RANGE_PX = {CLOSED: 2.0, OPEN: 5.0}
 
 @dataclass(frozen=True)
 class Telescope:
-    """The telescope's pupil."""
+    """Pupil of the telescope."""
 
     diameter_m: float = number(4.2, 0.05, 100.0)
     obstruction: float = number(0.29, 0.0, 0.9)
@@ -42,7 +42,7 @@ class Telescope:
 
 @dataclass(frozen=True)
 class SensorParameters:
-    """The Shack-Hartmann sensor."""
+    """Shack-Hartmann sensor."""
 
     subapertures: int = number(7, 1, 200, whole=True)
     """Sub-apertures across the pupil."""
@@ -54,37 +54,37 @@ class SensorParameters:
     pixel_scale_arcsec: float | None = number(None, 0.0, 100.0, low_open=True)
     """Default: two pixels for lambda / d."""
     least_illumination: float = number(0.5, 0.0, 1.0, low_open=True)
-    """Part of its area in the pupil from which a sub-aperture is used."""
+    """Smallest illuminated fraction of a sub-aperture that is used."""
     samples: int = number(12, 4, 128, whole=True)
-    """Points of the phase across a sub-aperture."""
+    """Number of phase points across a sub-aperture."""
     spot_elongation: float = number(1.0, 1.0, 30.0)
     """Full width at half maximum of a spot along x as a multiple of that along y, before the pixels."""
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """The deformable mirror."""
+    """Deformable mirror."""
 
     actuators: int | None = number(None, 2, 201, whole=True)
     """Actuators across the pupil, its edges included. Default: one at each corner of the sub-apertures."""
     crosstalk: float = number(0.15, 0.0, 0.9, low_open=True)
-    """Height of an actuator's Gaussian influence function at its neighbour."""
+    """Value of an actuator's Gaussian influence function at its neighbour."""
     tip_tilt: bool = True
-    """Whether a tip-tilt mirror helps."""
+    """Whether there is a separate tip-tilt mirror."""
 
 
 @dataclass(frozen=True)
 class Atmosphere:
-    """Layers of frozen turbulence that the wind moves; the star is on axis and altitudes do not matter."""
+    """Layers of frozen turbulence moved by the wind; the star is on axis, so altitudes do not matter."""
 
     r0_m: float | tuple[float, float] = number(0.15, 0.01, 1e3, several=NUMBER_OR_LIST)
-    """Fried parameter at 500 nm; or the two ends between which it drifts."""
+    """Fried parameter at 500 nm, or the two values between which it drifts."""
     drift_time_s: float = number(60.0, 0.0, 1e6, low_open=True)
     """Period of the drift."""
     outer_scale_m: float = number(25.0, 0.5, 200.0)
     altitude_m: tuple[float, ...] = number((0.0, 2500.0, 4000.0, 13500.0), 0.0, 1e5, several=LIST)
     fraction: tuple[float, ...] = number((0.45, 0.25, 0.15, 0.15), 0.0, 1e6, several=LIST)
-    """Strength of each layer; their ratios matter."""
+    """Relative strength of each layer."""
     wind_speed_m_per_s: tuple[float, ...] = number((6.0, 9.0, 14.0, 22.0), 0.0, 200.0, several=LIST)
     wind_direction_deg: tuple[float, ...] = number((20.0, 80.0, 150.0, 250.0), -360.0, 360.0, several=LIST)
 
@@ -94,7 +94,7 @@ class Camera:
     """The sensor's camera and the star's flux on it; as `faintspot.simulate.Detector`."""
 
     photons_per_subaperture: float | None = number(None, 0.0, 1e9, low_open=True)
-    """Photo-electrons of a fully lit sub-aperture in a frame; or give the magnitude."""
+    """Photo-electrons of a fully illuminated sub-aperture in a frame; or give the magnitude."""
     magnitude: float | None = number(None, -30.0, 60.0)
     band: str = DEFAULT_BAND
     zero_point: float | None = number(None, 0.0, 1e20, low_open=True)
@@ -113,20 +113,20 @@ class Camera:
 
 @dataclass(frozen=True)
 class ControlParameters:
-    """The loop."""
+    """Control loop."""
 
     frame_rate_hz: float = number(250.0, 0.0, 1e5, low_open=True)
     delay_frames: int = number(2, 1, 100, whole=True)
     """The command computed from frame k acts first during the exposure of frame k + delay_frames."""
     gain: float = number(0.5, 0.0, 2.0)
     leak: float = number(0.01, 0.0, 1.0)
-    """Part of the command that is forgotten in every frame, so that a loop that has lost the star returns."""
+    """Fraction by which commands decay in each frame, so that a loop recovers after it lost the star."""
     mode: str = CLOSED
     """"closed", or "open": the sensor does not see the mirror."""
     largest_condition: float = number(30.0, 1.0, 1e6)
-    """Combinations of actuators that move the slopes so many times less than the best one are not driven."""
+    """Largest condition number of the reconstructor; weaker modes are not controlled."""
     telemetry_frames: int = number(2000, 200, 1_000_000, whole=True)
-    """Closed loop with an integrator, in turbulence that is not scored, from which other control learns."""
+    """Length of the closed loop with an integrator from which other controllers learn; never scored."""
     winds: str = LEARNT
     """Winds of a predictive model: "learnt" from telemetry, "assumed" (those of the atmosphere) or "none"."""
     assumed_wind_factor: float = number(1.0, 0.0, 100.0)
@@ -148,7 +148,7 @@ class RunLength:
 
     frames: int = number(1500, 1, 10_000_000, whole=True)
     settle_frames: int = number(100, 0, 10_000_000, whole=True)
-    """Frames at the beginning that are not scored."""
+    """Number of frames at the beginning that are not scored."""
     seed: int = number(1, 0, 2**63 - 1, whole=True)
     realisations: int = number(5, 1, 100_000, whole=True)
     photons_per_subaperture: tuple[float, ...] = number((), 0.0, 1e9, low_open=True, several=LIST)
@@ -157,7 +157,7 @@ class RunLength:
 
 @dataclass(frozen=True)
 class LoopConfiguration:
-    """Everything that a closed-loop experiment is made of.
+    """Configuration of a closed-loop experiment.
 
     Raises
     ------
@@ -249,7 +249,7 @@ class LoopConfiguration:
         return self.subaperture_m / float(r0_sensing)
 
     def position_range_px(self, *, predicted: bool = False) -> float:
-        """Return how far spots may be from the reference, or from where the loop predicts them."""
+        """Return the largest distance of spots from the reference, or from the predicted position."""
         return _POSITION_RANGE_PX[CLOSED if predicted else self.control.mode]
 
     @property
@@ -271,7 +271,7 @@ class LoopConfiguration:
 
     @property
     def photons(self) -> float:
-        """Photo-electrons of a fully lit sub-aperture in a frame."""
+        """Photo-electrons of a fully illuminated sub-aperture in a frame."""
         camera = self.camera
         if camera.photons_per_subaperture is not None:
             return camera.photons_per_subaperture
@@ -279,7 +279,7 @@ class LoopConfiguration:
 
     @property
     def photometry(self) -> Photometry:
-        """From magnitudes to photo-electrons and back."""
+        """Conversion between magnitudes and photo-electrons."""
         return Photometry(
             self.subaperture_m**2,
             1 / self.control.frame_rate_hz,
@@ -422,7 +422,7 @@ def _check_flux(camera: Camera) -> None:
 
 
 def _check_sampling(whole: LoopConfiguration) -> None:
-    """Refuse what the sensor's phase cannot hold and control that cannot be."""
+    """Refuse a sensor that is sampled too coarsely, and inconsistent control."""
     one_of("control.mode", whole.control.mode, (CLOSED, OPEN))
     one_of("control.winds", whole.control.winds, WINDS)
     if not isinstance(whole.mirror.tip_tilt, bool):
@@ -461,7 +461,7 @@ def _check_sampling(whole: LoopConfiguration) -> None:
 
 
 def field_of_view(whole: LoopConfiguration) -> float:
-    """Return the width of the images behind the lenslets that must not repeat itself, px."""
+    """Return the width of the lenslet images that must not alias [px]."""
     return whole.sensor.pixels * 1.125 + 2 * 3 * blur_px(whole)
 
 

@@ -1,4 +1,4 @@
-"""The controller of an arm: the integrator, or one that has learnt from telemetry of the loop."""
+"""Controller of a method: the integrator, or one learnt from telemetry of the loop."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Simulate = Callable[..., LoopRecord]
 
 FIRST_TELEMETRY_REALISATION = 2000
-"""Realisation of the turbulence that control learns from; never scored, nor tuned on."""
+"""Realisation of the turbulence from which controllers learn; never scored or tuned on."""
 
 _TELEMETRY_PRIOR_PX = 0.6  # while telemetry is taken, as nothing is known yet
 _SETTLE_FRAMES = 50
@@ -41,7 +41,7 @@ def make_controller(
     learnt: Learnt | None,
     line: CommandDelayLine,
 ) -> Controller:
-    """Return the controller of an arm, which sends its commands along `line`."""
+    """Return the controller of a method, which sends its commands to `line`."""
     if learnt is not None:
         return learnt.controller(line, prior_std_px(arm, len(optics.interaction)))
     control = configuration.control
@@ -63,7 +63,7 @@ def learnt_control(
     simulate: Simulate,
     learns_on: LoopConfiguration | None = None,
 ) -> tuple[Arm, Learnt | None]:
-    """Return what the control of an arm has learnt, None: it need not; and the arm with what follows.
+    """Return the learnt controller of a method (None for the integrator), and the adapted method.
 
     The prior of an estimator that has one becomes as wide as the control is sure.
 
@@ -97,7 +97,7 @@ def learnt_control(
 
 
 def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
-    """Return the prior of the arm's estimator around what control predicts, (2 n,), or None."""
+    """Return the standard deviations of the estimator's prior around the prediction, (2 n,), or None."""
     if not _has_prior(arm):
         return None
     each = np.broadcast_to(getattr(arm.settings, PRIOR), (slopes // 2,))
@@ -105,7 +105,7 @@ def prior_std_px(arm: Arm, slopes: int) -> Floats | None:
 
 
 def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64]) -> SlopeTurbulence:
-    """Return what theory knows of the slopes of sub-apertures, with the winds that control assumes."""
+    """Return the theory of slopes in turbulence with the assumed winds."""
     atmosphere, control = configuration.atmosphere, configuration.control
     angle = np.deg2rad(atmosphere.wind_direction_deg)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -122,7 +122,7 @@ def slope_turbulence(configuration: LoopConfiguration, cells: NDArray[np.int64])
 
 @dataclass(frozen=True)
 class _Known:
-    """An arm, equal to others that would leave the same telemetry."""
+    """Method, equal to others that would leave the same telemetry."""
 
     arm: Arm = field(compare=False)
     same: tuple[Any, ...]
@@ -176,7 +176,7 @@ def _telemetry(
 
 
 def telemetry_of(record: LoopRecord, arm: Arm) -> OpenLoopTelemetry:
-    """Return what control learns from a run of one arm with the integrator."""
+    """Return the telemetry of a run of one method with the integrator."""
     divisor = float(record.centroid_gain[0]) if record.corrected[0] else 1.0
     held = record.commands.astype(np.float64) @ record.interaction_matrix.T
     expected = np.zeros_like(held)
@@ -194,7 +194,7 @@ def telemetry_of(record: LoopRecord, arm: Arm) -> OpenLoopTelemetry:
 
 
 def _has_prior(arm: Arm) -> bool:
-    """Whether the slopes are drawn towards what the control predicts."""
+    """Whether the estimator uses the controller's prediction as its prior."""
     has = arm.predict_prior and PRIOR in arm.settings.declared() and not arm.true_slopes
     return has and getattr(arm.settings, PRIOR) is not None
 
@@ -205,7 +205,7 @@ def _with_prior(arm: Arm, std_px: float | Floats) -> Arm:
 
 
 def _without_assumed(configuration: LoopConfiguration) -> LoopConfiguration:
-    """Return the configuration as far as its telemetry depends on it."""
+    """Return the configuration without values that do not affect the telemetry."""
     usual = ControlParameters()
     names = ("winds", "assumed_wind_factor", "assumed_wind_turn_deg")
     return configuration.replace("control", **{name: getattr(usual, name) for name in names})

@@ -106,7 +106,7 @@ def fixed_window(configuration: LoopConfiguration, **options: Any) -> Settings:
 
 
 def _arm(settings: Settings, psf: PSF, score: Score | None, control: str) -> Arm:
-    """The arm of the simulated loop that does what the engine will do."""
+    """Return the method of the simulated loop that equals the engine's."""
     predicts = control == KALMAN and settings.estimator.takes_prior
     if predicts and PRIOR in settings.declared() and getattr(settings, PRIOR) is None:
         anything: dict[str, Any] = {PRIOR: 1.0}  # it becomes what the filter is sure of

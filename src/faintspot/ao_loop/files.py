@@ -20,7 +20,7 @@ BUDGET_FILE = "budget.npz"
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A dataclass of arrays, texts, plain numbers and tuples of texts, that can be kept in a file.
+    """Dataclass of arrays, texts, numbers and tuples of texts that can be saved to a file.
 
     A subclass that changes its fields changes its `FORMAT`: files of another one are refused.
     """
@@ -40,7 +40,7 @@ class Stored:
         save_arrays(path, self.arrays())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what is in the file."""
+        """Return the fields as arrays for the file."""
         values = {item.name: np.asarray(getattr(self, item.name)) for item in fields(self)}
         return {"format": np.asarray(self.FORMAT), **values}
 
@@ -66,7 +66,7 @@ def holds_loop_results(path: Path) -> bool:
 
 
 def make_folder(folder: str | Path) -> Path:
-    """Make a folder where it is not there, and return its path.
+    """Make a folder if it does not exist, and return its path.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The deformable mirror and the tip-tilt mirror: from commands to the wavefront they add."""
+"""Deformable mirror and tip-tilt mirror: wavefront from commands."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class DeformableMirror:
 
 @dataclass(frozen=True, eq=False)
 class BestFit:
-    """The best that a mirror can do to a wavefront that is known: the fitting error is what it leaves."""
+    """Best fit of a mirror to a known wavefront; its residual is the fitting error."""
 
     basis: NDArray[np.float32]
     """Orthonormal wavefronts of the mirror (and piston), weighted by the pupil, (points^2, n)."""
@@ -68,7 +68,7 @@ class BestFit:
         return cls(left[:, : np.count_nonzero(size > 1e-6 * size[0])], weight)
 
     def fitted(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return what the mirror can make of a wavefront (points, points); 0 outside the pupil."""
+        """Return the mirror's best fit to a wavefront (points, points); 0 outside the pupil."""
         inside = self.weight > 0
         inverse = np.where(inside, 1 / np.where(inside, self.weight, 1), 0)
         seen = self.basis.T @ (self.weight * wavefront.ravel())
@@ -76,7 +76,7 @@ class BestFit:
         return fitted.astype(np.float32)
 
     def residual(self, wavefront: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return a wavefront (points, points) without what the mirror can take off; 0 outside the pupil."""
+        """Return a wavefront (points, points) minus the mirror's best fit; 0 outside the pupil."""
         left: NDArray[np.float32] = np.where(
             self.weight.reshape(wavefront.shape) > 0, wavefront - self.fitted(wavefront), 0
         )

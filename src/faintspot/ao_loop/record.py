@@ -1,4 +1,4 @@
-"""Record of a closed-loop run: telemetry, and the truth that a simulation knows."""
+"""Record of a closed-loop run: telemetry and true values."""
 
 from __future__ import annotations
 
@@ -29,37 +29,37 @@ class LoopRecord(Stored):
     WHAT: ClassVar[str] = "a record of a loop"
 
     slopes_px: NDArray[np.float32]
-    """(frames, 2 n): all x, then all y, from the reference; not divided by the centroid gain."""
+    """(frames, 2 n): all x, then all y, from the reference, before division by the centroid gain."""
     valid: NDArray[np.bool_]
     """(frames, n)"""
     standard_error_px: NDArray[np.float32]
     """(frames, 2 n); infinite where invalid or unknown."""
     commands: NDArray[np.float32]
-    """(frames, m): what the mirror held during each frame, nm."""
+    """(frames, m): commands that acted during each frame [nm]."""
     strehl: NDArray[np.float64]
-    """(frames,): of each frame at the science wavelength, on axis."""
+    """(frames,): Strehl ratio of each frame at the science wavelength, on axis."""
     residual_nm: NDArray[np.float64]
-    """(frames,): rms of the wavefront after the mirror."""
+    """(frames,): rms of the residual wavefront."""
     r0_m: NDArray[np.float64]
     """(frames,): true Fried parameter at 500 nm."""
     arm: NDArray[np.int8]
-    """(frames,): number of the arm that measured the frame."""
+    """(frames,): number of the method that measured the frame."""
     interaction_matrix: NDArray[np.float64]
     """(2 n, m): displacements of the spots, true px, for a command of 1 nm."""
     centroid_gain: NDArray[np.float64]
-    """(arms,): slope measured for a displacement of 1 px, at the run's flux."""
+    """(arms,): centroid gain of each method at the run's flux."""
     corrected: NDArray[np.bool_]
-    """(arms,): whether the loop divided the slopes by that gain."""
+    """(arms,): whether slopes were divided by the centroid gain."""
     psf: NDArray[np.float32]
     """(arms, pixels, pixels): mean image of the frames after settling; a flat wavefront's peak is 1."""
     labels: tuple[str, ...]
-    """Of the arms."""
+    """Labels of the methods."""
     arm_settings: tuple[str, ...]
-    """TOML text of each arm's settings."""
+    """Settings of each method as TOML."""
     cells: NDArray[np.int64]
     """(n, 2): row and column of each sub-aperture in the lenslet array."""
     illumination: NDArray[np.float64]
-    """(n,): part of each sub-aperture that is in the pupil."""
+    """(n,): illuminated fraction of each sub-aperture."""
     frame_rate_hz: float
     delay_frames: int
     """The command computed from frame k acted first during frame k + delay_frames."""
@@ -72,7 +72,7 @@ class LoopRecord(Stored):
     science_wavelength_m: float
     psf_pixel_rad: float
     configuration: str
-    """TOML text."""
+    """Configuration as TOML."""
     seed: int
     realisation: int
 
@@ -87,7 +87,7 @@ class LoopRecord(Stored):
         return np.arange(self.frames) >= self.settle_frames
 
     def mean_strehl(self, arm: int = 0) -> float:
-        """Return the long-exposure Strehl ratio of an arm: the mean of its frames after settling.
+        """Return the long-exposure Strehl ratio of a method: the mean of its frames after settling.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The closed loop, frame by frame."""
+"""Simulation of the closed loop, frame by frame."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class DisabledErrors:
     stretch_settle_frames: ClassVar[int] = 40
 
     def configuration(self, configuration: LoopConfiguration) -> LoopConfiguration:
-        """Return the configuration with its frame rate, and the flux in a frame as it was."""
+        """Return the configuration with a changed frame rate and the same flux per frame."""
         if self.faster == 1.0:
             return configuration
         rate = configuration.control.frame_rate_hz * self.faster
@@ -72,7 +72,7 @@ class DisabledErrors:
         return first * self.faster / frame_rate_hz + (frame - first + 0.5) / frame_rate_hz
 
     def settled(self, frames: int) -> NDArray[np.bool_]:
-        """Return which frames do not come right after a gap, (frames,)."""
+        """Return which frames directly follow the frame before, (frames,)."""
         place = np.arange(frames) % self.stretch_frames
         return (place >= self.stretch_settle_frames) | (self.faster == 1.0)
 
@@ -166,7 +166,7 @@ def measure_gains(
 
 
 class _Loop:
-    """One run: its parts, its state and what it has written down."""
+    """State and recorded values of one run."""
 
     def __init__(
         self,
@@ -216,7 +216,7 @@ class _Loop:
         return mean_flux(pipeline, sensor, self.telescope_model.detector, photons, spots, self.seed)
 
     def _follow_flux(self, number: int) -> None:
-        """Tell an arm's pipeline the mean flux."""
+        """Set the mean flux in a method's pipeline."""
         flux = self.fluxes[number]
         if flux is not None:
             self.pipelines[number] = self.pipelines[number].with_flux(flux)
@@ -224,7 +224,7 @@ class _Loop:
     def _gains_and_divisors(
         self, known: NDArray[np.float64] | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return every arm's centroid gain, and what its slopes are divided by."""
+        """Return each method's centroid gain and the divisor of its slopes."""
         if known is not None:
             return known, known
         gains = measure_gains(
@@ -260,14 +260,14 @@ class _Loop:
         self.valid[frame], self.commands[frame] = slopes.valid, commands
 
     def _observe(self, frame: int, time: float, wavefront: NDArray[np.float32]) -> None:
-        """Take the science image and write down the truth."""
+        """Add the science image and record the true values."""
         truth = self.telescope_model.truth(time, wavefront)
         self.truth[:, frame] = truth.strehl, truth.rms_nm, truth.r0_m
         if frame >= self.configuration.run.settle_frames:
             self.images[self.which[frame]] += self.optics.science.image(truth.field)
 
     def _measure(self, frame: int, wavefront: NDArray[np.float32]) -> Slopes:
-        """Measure the slopes of the frame that the sensor's camera takes."""
+        """Measure the slopes of the camera's frame."""
         number, sensor = int(self.which[frame]), self.optics.sensor
         if self.arms[number].true_slopes:
             return _true_slopes(sensor.mean_slopes_px(wavefront))
@@ -285,11 +285,11 @@ class _Loop:
         return slopes
 
     def gains_in_run(self) -> NDArray[np.float64]:
-        """Return the regression of each arm's measured slopes on the true ones."""
+        """Return the regression of each method's measured slopes on the true ones."""
         return np.asarray(self.regression[0] / self.regression[1])
 
     def record(self) -> LoopRecord:
-        """Return what was written down."""
+        """Return the record of the run."""
         configuration, sensor = self.configuration, self.optics.sensor
         scored = self.which[configuration.run.settle_frames :]
         exposures = np.maximum(1, np.bincount(scored, minlength=len(self.arms)))
@@ -327,7 +327,7 @@ class _Loop:
 
 
 def _true_slopes(vector: NDArray[np.float64]) -> Slopes:
-    """Return slopes that are known without an error."""
+    """Return slopes without an error."""
     x, y = vector.astype(np.float32).reshape(2, -1)
     zeros, counts = np.zeros(len(x), np.float32), np.zeros(len(x), np.int32)
     return Slopes(x, y, zeros, np.zeros(len(x), np.uint8), counts, counts, zeros, zeros)

@@ -21,13 +21,13 @@ class TelemetryAnalysis:
     """Turbulence estimated from recorded telemetry of a loop."""
 
     slopes_px: Floats
-    """(frames, 2 n): slopes of the turbulence alone."""
+    """(frames, 2 n): open-loop slopes."""
     seeing: Seeing
-    """From all frames."""
+    """Turbulence estimated from all frames."""
     segments: tuple[Seeing, ...]
-    """From stretches one after the other."""
+    """Turbulence of consecutive segments."""
     time_s: Floats
-    """Middle of each stretch, from the first frame recorded."""
+    """Time of the middle of each segment since the first frame."""
 
 
 def analyse_telemetry(
@@ -44,7 +44,7 @@ def analyse_telemetry(
     centroid_gain: ArrayLike = 1.0,
     segment_s: float = 10.0,
 ) -> TelemetryAnalysis:
-    """Return the slopes of the air and r0, whole and in stretches, from a loop's recorded telemetry.
+    """Return open-loop slopes and r0, overall and in segments, from a loop's telemetry.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def analyse_telemetry(
         As `estimate_r0`.
     frame_rate_hz : float
     segment_s : float
-        Length of a stretch; a rest shorter than half of it joins none.
+        Length of a segment; a remainder shorter than half of it is left out.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The telescope: its pupil on a square grid of points, and the Strehl ratio of a wavefront in it."""
+"""Telescope pupil on a square grid of points, and the Strehl ratio of a wavefront."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ class PupilAmplitude:
     """Amplitude on (n, n) points that tile the square around the pupil."""
 
     amplitude: NDArray[np.float32]
-    """Part of each point's area that is in the pupil."""
+    """Fraction of each point's area in the pupil."""
     width_m: float
     """Side of the square that the points tile."""
 
     @property
     def points(self) -> int:
-        """Points across the pupil."""
+        """Number of points across the pupil."""
         return len(self.amplitude)
 
     @property
     def spacing_m(self) -> float:
-        """Distance between points."""
+        """Distance between points [m]."""
         return self.width_m / self.points
 
     def rms(self, wavefront: NDArray[np.floating]) -> float:
-        """Return the rms of a wavefront (n, n) over the pupil without its mean, in the wavefront's unit."""
+        """Return the rms of a wavefront (n, n) over the pupil, without piston, in the wavefront's unit."""
         weights = self.amplitude / self.amplitude.sum()
         mean = float(np.vdot(weights, wavefront))
         return float(np.sqrt(max(0.0, float(np.vdot(weights, wavefront * wavefront)) - mean**2)))
@@ -51,7 +51,7 @@ class PupilAmplitude:
         return field
 
     def strehl(self, field: NDArray[np.complex64]) -> float:
-        """Return the intensity on axis, of a flat wavefront's: |sum A exp(i phi)|^2 / (sum A)^2."""
+        """Return the Strehl ratio on axis: |sum A exp(i phi)|^2 / (sum A)^2."""
         return float(abs(field.sum(dtype=np.complex128)) ** 2 / self.amplitude.sum(dtype=np.float64) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""Telescope, one frame at a time: from time and commands to wavefront, truth and pixels."""
+"""Telescope model: wavefront, true values and pixels of one frame at a time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _OF_AIR = (
 
 @dataclass(frozen=True, eq=False)
 class LoopOptics:
-    """Everything that is the same in all runs of a configuration."""
+    """Parts that are the same in all runs of a configuration."""
 
     pupil: PupilAmplitude
     sensor: ShackHartmann
@@ -58,7 +58,7 @@ class Truth:
 
 
 class TelescopeModel:
-    """A star seen through atmosphere, telescope, mirror and sensor by the sensor's camera.
+    """Model of star, atmosphere, telescope, mirror, sensor and camera.
 
     Air and noise depend on seed, realisation and frame alone.
 
@@ -111,13 +111,13 @@ class TelescopeModel:
         return after, after if self._sees_mirror else atmosphere
 
     def truth(self, time_s: float, wavefront_nm: NDArray[np.float32]) -> Truth:
-        """Return what a wavefront after the mirror does to the science image."""
+        """Return the true values of a residual wavefront."""
         pupil = self.optics.pupil
         field = pupil.field(wavefront_nm, self._science_wavelength_m)
         return Truth(field, pupil.strehl(field), pupil.rms(wavefront_nm), self.atmosphere.r0_m(time_s))
 
     def frame(self, number: int, wavefront_nm: NDArray[np.float32]) -> NDArray[np.generic]:
-        """Return the camera's frame of that number (its noise's) of a wavefront that the sensor sees, ADU."""
+        """Return the camera frame [ADU] of a wavefront; the number seeds its noise."""
         sensor = self.optics.sensor
         flux = sensor.frame(sensor.spots(wavefront_nm)) * self.photons
         rng = np.random.default_rng([self._seed, self._realisation, number, 2])
@@ -125,7 +125,7 @@ class TelescopeModel:
 
 
 def prepare(configuration: LoopConfiguration) -> LoopOptics:
-    """Return telescope, sensor, mirror and their calibration; the last ones made are kept.
+    """Return telescope, sensor, mirror and their calibration (cached).
 
     Raises
     ------
@@ -152,7 +152,7 @@ def without_flux(configuration: LoopConfiguration) -> LoopConfiguration:
 
 @lru_cache(maxsize=2)
 def atmosphere_of(configuration: LoopConfiguration, seed: int, realisation: int) -> MovingLayers:
-    """Return the atmosphere of a configuration `without_flux`; the last ones made are kept."""
+    """Return the atmosphere of a configuration `without_flux` (cached)."""
     return make_atmosphere(configuration, seed, realisation)
 
 

@@ -1,4 +1,4 @@
-"""The Shack-Hartmann sensor: from the wavefront in the pupil to the flux on the camera."""
+"""Shack-Hartmann sensor: flux on the camera from the wavefront in the pupil."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class ShackHartmann:
 
     layout: Layout
     illumination: NDArray[np.float64]
-    """Part of each sub-aperture that is in the pupil, (n,)."""
+    """Illuminated fraction of each sub-aperture, (n,)."""
     amplitude: Floats
     """(n, samples, samples)"""
     wavelength_m: float
     px_per_nm: float
-    """Displacement of a spot for a wavefront that rises by 1 nm across the sub-aperture."""
+    """Displacement of a spot [px] for a tilt of 1 nm across the sub-aperture."""
     rows: NDArray[np.complex64]
     columns: NDArray[np.complex64]
     """Fourier transforms along y and x, (image samples, samples)."""
@@ -42,10 +42,10 @@ class ShackHartmann:
     """From image samples to pixels, (pixels, image samples)."""
 
     points: int
-    """Points across the pupil."""
+    """Number of points across the pupil."""
 
     def lenslets(self, wavefront: NDArray[np.floating]) -> Floats:
-        """Return the parts of a wavefront (n, n) that lit sub-apertures see, (n, samples, samples)."""
+        """Return the parts of a wavefront (n, n) in illuminated sub-apertures, (n, samples, samples)."""
         samples = self.amplitude.shape[-1]
         across = len(wavefront) // samples
         squares = wavefront.reshape(across, samples, across, samples).swapaxes(1, 2)
@@ -54,7 +54,7 @@ class ShackHartmann:
         return part
 
     def spots(self, wavefront_nm: NDArray[np.floating], displacement_px: float = 0.0) -> Floats:
-        """Return the flux of every spot, (n, pixels, pixels); a fully lit lenslet's whole spot holds 1.
+        """Return the flux of every spot, (n, pixels, pixels); 1 for a fully illuminated lenslet.
 
         Parameters
         ----------
@@ -83,7 +83,7 @@ class ShackHartmann:
         return frame
 
     def mean_slopes_px(self, wavefront_nm: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return all x, then all y of the displacements by the wavefront's mean gradient, (2 n,) px.
+        """Return the spot displacements by the mean gradient, all x, then all y, (2 n,) px.
 
         The mean over the lit part of each sub-aperture, of differences between neighbouring points.
         """

@@ -1,1 +1,1 @@
-"""Control: from slopes to commands. Plain objects that know nothing of a simulation."""
+"""Controllers that turn slopes into mirror commands, independent of any simulation."""

@@ -15,16 +15,16 @@ WINDS = LEARNT, ASSUMED, NONE
 
 
 class Expected(NamedTuple):
-    """The slopes of the next frame before it is measured: an estimator's prior."""
+    """Predicted slopes of the next frame, the prior of an estimator."""
 
     mean_px: Floats
-    """(2 n,): residual slopes, after what the mirror will hold."""
+    """(2 n,): residual slopes, with the commands that the mirror will hold."""
     std_px: Floats | None
-    """(2 n,): how sure that is; None where the controller does not know."""
+    """(2 n,): standard deviations; None if the controller does not know them."""
 
 
 class Controller(Protocol):
-    """Takes the slopes of every frame and sends commands to the mirror.
+    """Controller that turns the slopes of every frame into commands.
 
     In every frame first `expected`, for those who want to know, then `update`. Slopes are residual ones, in
     true pixels from the reference, all x, then all y; a standard error that is infinite means that a slope
@@ -33,13 +33,13 @@ class Controller(Protocol):
 
     @property
     def undoes_prior(self) -> bool:
-        """Whether slopes are what the frame alone says; else as estimators give them, with their prior."""
+        """Whether the controller needs slopes without the estimator's prior."""
 
     def expected(self) -> Expected:
-        """Return what this frame's slopes are expected to be."""
+        """Return the predicted slopes of this frame."""
 
     def begin(self) -> None:
-        """Go on from what the mirror holds, of which the line tells; frames before are forgotten."""
+        """Restart from the commands on the delay line, without the memory of earlier frames."""
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
-        """Take this frame's slopes and send the command that follows from them."""
+        """Compute a command from this frame's slopes and send it."""

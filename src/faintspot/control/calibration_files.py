@@ -1,4 +1,4 @@
-"""A mirror's calibration as files: what [control] reads, and a picture."""
+"""Files of a mirror calibration: matrices for [control], and a picture."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def save_calibration(path: str | Path, found: MirrorCalibration, reference: Floa
 
 
 def save_picture(path: str | Path, found: MirrorCalibration, reference: Floats, layout: Layout) -> None:
-    """Draw a calibration as a PNG picture: the matrix, how well each actuator answers, reference slopes.
+    """Draw a calibration as a PNG picture: matrix, response of each actuator, reference slopes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Commands that the mirror holds, and those that are delayed."""
+"""Delay line of mirror commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 class CommandDelayLine:
-    """Commands that act some frames after they were computed; all controllers of a mirror share it.
+    """Delay line between controllers and mirror; all controllers of a mirror share it.
 
     Its memory is made once: what `acting` and `latest` return is good until the next command is sent.
 
@@ -28,9 +28,9 @@ class CommandDelayLine:
     def __init__(self, commands: int, delay_frames: int, largest: float = math.inf) -> None:
         self.delay_frames, self.largest = delay_frames, largest
         self.rows = np.zeros((delay_frames + 1, commands))
-        """All of them."""
+        """Number of commands."""
         self.place = 0
-        """Row for the next command; the oldest of the others acts."""
+        """Row for the next command; the oldest other row acts."""
         self._rows = list(self.rows)
 
     @property
@@ -40,16 +40,16 @@ class CommandDelayLine:
 
     @property
     def latest(self) -> Floats:
-        """The last command computed, which still may be on its way."""
+        """Last computed command, which may not act yet."""
         return self._rows[self.place - 1]
 
     @property
     def spare(self) -> Floats:
-        """Row in which the next command may be written, for `sent`."""
+        """Row into which the next command may be written before `sent`."""
         return self._rows[self.place]
 
     def put(self, command: Floats) -> None:
-        """Send a command, clipped to the stroke, and go on to the next frame.
+        """Send a command, clipped to the stroke, and advance by one frame.
 
         Raises
         ------
@@ -61,7 +61,7 @@ class CommandDelayLine:
         self.sent(total)
 
     def sent(self, total: float) -> None:
-        """Send the command in `spare`, which is within the stroke, and go on to the next frame.
+        """Send the command in `spare`, which is within the stroke, and advance by one frame.
 
         Parameters
         ----------
@@ -78,6 +78,6 @@ class CommandDelayLine:
         self.place = (self.place + 1) % len(self._rows)
 
     def hold(self, command: Floats) -> None:
-        """Begin anew, with a mirror that holds a command and with no other on its way."""
+        """Restart with a mirror that holds a command, and no delayed commands."""
         for row in self._rows:
             np.clip(command, -self.largest, self.largest, out=row)

@@ -1,4 +1,4 @@
-"""Compiled control: from a frame's slopes to a command, in memory that was made beforehand."""
+"""Compiled integrator: from a frame's slopes to a command, in preallocated memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ square of a slope along one axis, px^2."""
 def true_slopes(
     x: Any, y: Any, flags: Any, error_x: Any, error_y: Any, gain: Any, slopes: Any, errors: Any, said: Any
 ) -> None:
-    """Write slopes in true pixels, all x, then all y, and their errors; what is not valid is 0, infinite.
+    """Write slopes [true px], all x, then all y, and their errors; invalid: 0 and infinite.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def add_products(columns: Any, vectors: Any, out: Any) -> None:
 
 @_compiled
 def integrate(slopes: Any, columns: Any, gain: Any, keep: Any, largest: Any, rows: Any, place: Any) -> float:
-    """Write the next command: `keep` of the latest, less `gain` times the wavefront, within the stroke.
+    """Write the next command: `keep` times the latest minus `gain` times the wavefront, clipped.
 
     Return the command's sum before it was clipped.
 
@@ -115,7 +115,7 @@ _INTEGRATE = Direct(integrate)
 
 
 class CompiledIntegrator:
-    """`control.integrator.Integrator` in compiled code, for all slopes counting alike.
+    """Compiled `control.integrator.Integrator` with equal weights of all slopes.
 
     Parameters
     ----------
@@ -144,10 +144,10 @@ class CompiledIntegrator:
         return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
 
     def begin(self) -> None:
-        """See `Controller`: all that it knows is on the line."""
+        """See `Controller`; the delay line is the only state."""
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
-        """See `Controller`; slopes that were not measured are 0."""
+        """See `Controller`; invalid slopes are 0."""
         line = self._line
         numbers = self.gain, self._keep, line.largest
         line.sent(_INTEGRATE(slopes_px, self._columns, *numbers, line.rows, line.place))

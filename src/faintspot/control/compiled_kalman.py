@@ -1,4 +1,4 @@
-"""The guarded Kalman filter in compiled code, as a controller."""
+"""Controller with the compiled Kalman filter and its fallback."""
 
 from __future__ import annotations
 
@@ -114,11 +114,11 @@ class CompiledKalman:
         self._std_px, self._shares = predictor.std_px, shares(predictor.model)
         self._is_behind = False
         self._held_at = -1
-        """Position of the delay line when the acting command was turned into slopes."""
+        """Position of the delay line at which the acting command was turned into slopes."""
 
     @property
     def chosen(self) -> int:
-        """0: the filter's commands go out; 1: the integrator's."""
+        """0: the filter's commands are sent; 1: the integrator's."""
         self._catch_up()
         return int(self._memory.guard[CHOSEN])
 
@@ -131,7 +131,7 @@ class CompiledKalman:
         return Expected(rows[HELD] + rows[PREDICTED], self._std_px)
 
     def begin(self) -> None:
-        """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
+        """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
         latest = self._line.latest
         for own in (self._learnt, self._plain):
             own.hold(latest)
@@ -166,7 +166,7 @@ class CompiledKalman:
         self._is_behind = True
 
     def _catch_up(self) -> None:
-        """Do what is left of the frame before."""
+        """Complete the previous frame."""
         if self._is_behind:
             self._is_behind, self._held_at = False, -1
             total = GO_ON(self._numbers, self._matrices, self._lines, self._places(), self._memory)

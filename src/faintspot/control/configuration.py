@@ -101,7 +101,7 @@ class ControlOptions(Options):
     )
     largest_residual_px: float | None = _setting(
         None,
-        "Rms of the slopes above which the guard opens the loop. Default: 1.25 times the rms in open loop, if "
+        "Rms of the slopes above which the guard opens the loop. Default: 1.25 times the open-loop rms, if "
         "the loop was open for `guard_frames` before; else a quarter of a window's side.",
         unit="px",
         low=0,
@@ -230,7 +230,7 @@ class Control:
             )
 
     def check_errors(self, calibration: Calibration, kind: str | None = None) -> None:
-        """Refuse a camera whose read noise is not known, where slopes are weighed by their standard errors.
+        """Refuse a camera without read noise if the controller needs standard errors of the slopes.
 
         Parameters
         ----------
@@ -251,7 +251,7 @@ class Control:
             )
 
     def line(self) -> CommandDelayLine:
-        """Return the way of commands to a mirror that is flat."""
+        """Return the delay line of commands to a flat mirror."""
         options = self.options
         return CommandDelayLine(self.commands, options.delay_frames, options.largest_command or _BEYOND_ALL)
 
@@ -267,7 +267,7 @@ class Control:
         return Learnt(self.plant, self.model).controller(line)
 
     def rehearse(self) -> None:
-        """Compile the controller and run it on made-up frames, the last without a valid slope.
+        """Compile the controller and run it on test frames, the last without a valid slope.
 
         Raises
         ------
@@ -294,7 +294,7 @@ class Control:
 
 
 def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
-    """Return how wide the prior of an estimator is, (2 n,); None where it has none."""
+    """Return the standard deviations of an estimator's prior, (2 n,); None without a prior."""
     if not settings.estimator.takes_prior or PRIOR not in settings.declared():
         return None
     each = settings.values(PRIOR, len(layout), layout.pixels).astype(np.float64)
@@ -302,7 +302,7 @@ def prior_std_px(settings: Settings, layout: Layout) -> Floats | None:
 
 
 def load_control(path: str | Path) -> Control | None:
-    """Read [control] of a configuration file, and the files that it names; None where there is none.
+    """Read [control] of a configuration file and the files that it names; None without such a table.
 
     Raises
     ------
@@ -341,7 +341,7 @@ def _read(path: Path, name: str, location: Any) -> NDArray[Any]:
 
 
 def save_control(path: str | Path, **values: Any) -> None:
-    """Write values into [control] of a configuration file; its others, other tables and comments stay.
+    """Write values into [control] of a configuration file; the rest of the file stays.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Two controllers on the same slopes: the mirror gets the commands of the one that leaves less."""
+"""Two controllers on the same slopes, of which the one with the smaller residual drives the mirror."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STANDARD_ERRORS = 2.5  # by which one must leave less than the other
 
 
 class Guarded:
-    """A controller that has learnt, and the plain one that takes its place while it does worse.
+    """Learnt controller, replaced by a plain one while its residual is larger.
 
     Both send commands in every frame, each to a mirror of its own that exists only in numbers; the slopes
     that each would have had follow from the open-loop slopes. So what they leave can be compared in the same
@@ -65,7 +65,7 @@ class Guarded:
         self.controllers = [make(own) for make, own in zip(makers, self._lines, strict=True)]
         self.prior_std_px, self._noise_factor = prior_std_px, noise_factor
         self.chosen = int(prefers_plain)
-        """0: the one that has learnt; 1: the plain one."""
+        """0: the learnt controller; 1: the plain one."""
         self._difference = np.zeros(2)
         self._frames = 0
 
@@ -76,7 +76,7 @@ class Guarded:
         return Expected(mean + self._interaction @ other, std)
 
     def begin(self) -> None:
-        """See `Controller`: both go on from there."""
+        """See `Controller`; both restart from there."""
         for controller, line in zip(self.controllers, self._lines, strict=True):
             line.hold(self._line.latest)
             controller.begin()
@@ -97,7 +97,7 @@ class Guarded:
         self._choose((left[0] - left[1]) / max(left[0] + left[1], 1e-30))
 
     def _choose(self, difference: float) -> None:
-        """Change places, from the next frame on, where the mean difference of late is beyond its error."""
+        """Switch from the next frame on if the recent mean difference exceeds its error."""
         self._frames += 1
         share = 1 / min(self._frames, MEMORY_FRAMES)
         self._difference += share * (np.array([difference, difference**2]) - self._difference)

@@ -22,21 +22,21 @@ _SPEEDS_M_PER_S = (5.0, 10.0, 20.0)  # of winds from anywhere
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Turbulence, noise and vibrations of a piece of telemetry."""
+    """Turbulence, noise and vibrations estimated from telemetry."""
 
     turbulence: SlopeTurbulence
     noise_factor: float
-    """Actual variance of the noise as a multiple of what the standard errors say."""
+    """Variance of the noise relative to the squared standard errors."""
     vibrations: tuple[Vibration, ...]
     rate_hz: float
     is_layered: bool
-    """Whether each layer goes on by itself; else winds only stand for turbulence that changes as fast."""
+    """Whether each layer has its own state; else winds only describe how fast turbulence changes."""
     wind_error_m_per_s: Floats
-    """(layers, 2): standard errors; nan of winds that were not fitted."""
+    """(layers, 2): standard errors; NaN for winds that were not fitted."""
     fraction_error: Floats
-    """(layers,): standard errors, likewise."""
+    """(layers,): standard errors; NaN if not fitted."""
     criterion: float
-    """Half the Bayesian information criterion: differences count."""
+    """Half the Bayesian information criterion, up to a constant."""
 
     def covariances_px2(self) -> Floats:
         """Return (layers, 3, m, m): covariances of each layer's slopes for lags of 0, 1 and 2 frames."""
@@ -46,12 +46,12 @@ class Identified:
         return np.array([layer.lagged_px2(frame_s) for layer in self.turbulence.layers()])
 
     def slope_model(self) -> SlopeModel:
-        """Return how the slopes go on from frame to frame, vibrations included."""
+        """Return the temporal model of the slopes, vibrations included."""
         model = SlopeModel.of_covariances(self.covariances_px2())
         return with_vibrations(model, self.vibrations, self.turbulence.positions_m, self.rate_hz)
 
     def summary(self) -> str:
-        """Return one line."""
+        """Return a summary of one line."""
         winds, shares = self.turbulence.wind_m_per_s, self.turbulence.fraction
         layers = [
             f"{math.hypot(x, y):.1f} m/s to {math.degrees(math.atan2(y, x)) % 360:.0f} degrees ({part:.0%})"
@@ -86,16 +86,16 @@ class Identification:
         self._likelihood = LayerLikelihood(records, rate_hz, self._vibrations)
 
     def layers(self) -> Identified:
-        """Return layers with the winds that the telemetry shows."""
+        """Return layers with winds fitted to the telemetry."""
         layers = self._likelihood.selected(self._likelihood.peaks())
         return self._identified(layers, self._likelihood.errors(layers))
 
     def of_winds(self, winds_m_per_s: Floats) -> Identified:
-        """Return layers with given winds, (layers, 2), and the strengths that the telemetry shows."""
+        """Return layers with given winds, (layers, 2), and fitted strengths."""
         return self._identified(self._likelihood.of_winds(np.asarray(winds_m_per_s, np.float64)[:, None]))
 
     def anywhere(self) -> Identified:
-        """Return turbulence that winds of some speeds carry from all directions alike."""
+        """Return isotropic turbulence: winds of several speeds, equally from all directions."""
         speeds = np.array(_SPEEDS_M_PER_S)
         still = replace(self._site, fraction=np.ones(len(speeds)), wind_m_per_s=np.outer(speeds, [1.0, 0.0]))
         winds = still.from_anywhere().wind_m_per_s

@@ -1,4 +1,4 @@
-"""The integrator: one gain for all, or one for each mode."""
+"""Integrator with one gain, or one gain per mode."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 
 class Integrator:
-    """Adds a part of each frame's wavefront to the command, and forgets a little of it.
+    """Integrator with leak: subtracts a fraction of each frame's wavefront from the command.
 
     Parameters
     ----------
@@ -50,13 +50,13 @@ class Integrator:
         self._weighted, self._sees_mirror = weighted, sees_mirror
 
     def expected(self) -> Expected:
-        """See `Controller`: what is not yet taken off, if the latest command is right for this frame."""
+        """See `Controller`; assumes that the latest command is right for this frame."""
         line = self._line
         commands = line.acting - line.latest if self._sees_mirror else -line.latest
         return Expected(self._interaction @ commands, None)
 
     def begin(self) -> None:
-        """See `Controller`: all that it knows is on the line."""
+        """See `Controller`; the delay line is the only state."""
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""
@@ -67,7 +67,7 @@ class Integrator:
         self.follow(wavefront)
 
     def follow(self, wavefront: Floats) -> None:
-        """Take this frame's wavefront, as commands that cause it."""
+        """Update with this frame's wavefront, given as the commands that cause it."""
         if np.ndim(self._gain):
             modes = self._reconstructor.modes
             step = modes @ (self._gain * (modes.T @ wavefront))

@@ -1,4 +1,4 @@
-"""A Kalman filter of open-loop slopes, which predicts the next frame's."""
+"""Kalman filter that predicts open-loop slopes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Floats = NDArray[np.float64]
 _MOST_DOUBLINGS = 40
 _CONVERGED = 1e-9
 LARGEST_VARIANCE_PX2 = 1e6
-"""Variance of a slope that was not measured."""
+"""Variance of an invalid slope."""
 
 
 class SlopePredictor:
-    """The Kalman filter of a `SlopeModel`, of whose state noisy z[k] is measured.
+    """Kalman filter of a `SlopeModel` for noisy measurements of z[k].
 
     The error of its predictions is the steady one, for slopes with their usual noise; how much each slope
     corrects follows the noise of each frame.
@@ -42,11 +42,11 @@ class SlopePredictor:
     ) -> None:
         self.model, self._steady = model, steady
         self.covariance = steady_covariance(model, variance_px2) if covariance is None else covariance
-        """(states, states): of the state's error before a frame is measured."""
+        """(states, states): covariance of the state's error before a measurement."""
         self.with_slopes = self.covariance @ model.seen.T
-        """(states, m): of the state's error with that of the slopes."""
+        """(states, m): covariance of the errors of state and slopes."""
         self.predicted_px2 = model.seen @ self.with_slopes
-        """(m, m): of the predicted slopes' error."""
+        """(m, m): covariance of the predicted slopes' error."""
         self.usual_px2 = self.predicted_px2 + np.diag(np.minimum(variance_px2, LARGEST_VARIANCE_PX2))
         """(m, m): covariance of measured slopes about the prediction, with their usual noise."""
         self._gain = np.linalg.solve(self.usual_px2, self.with_slopes.T).T
@@ -55,12 +55,12 @@ class SlopePredictor:
 
     @property
     def mean_px(self) -> Floats:
-        """(m,): what the coming frame's open-loop slopes are expected to be."""
+        """(m,): predicted open-loop slopes of the next frame."""
         return np.asarray(self._of_layers[:, 0].sum(axis=0))
 
     @property
     def std_px(self) -> Floats:
-        """(m,): how far they will be from that."""
+        """(m,): standard deviations of the prediction."""
         return np.asarray(np.sqrt(np.diag(self.predicted_px2)))
 
     @property
@@ -69,11 +69,11 @@ class SlopePredictor:
         return self.state.reshape(self.model.layers, 2, self.model.slopes)
 
     def begin(self, slopes_px: Floats) -> None:
-        """Start from open-loop slopes that have not changed of late."""
+        """Restart from constant open-loop slopes."""
         self._of_layers[:] = shares(self.model)[:, None, None] * slopes_px
 
     def correct(self, slopes_px: Floats, variance_px2: Floats) -> None:
-        """Take the measured open-loop slopes of this frame; infinite variance: not measured."""
+        """Update with the measured open-loop slopes of this frame; infinite variance: invalid."""
         surprise = slopes_px - self.mean_px
         if self._steady:
             surprise[~np.isfinite(variance_px2)] = 0.0
@@ -87,7 +87,7 @@ class SlopePredictor:
         self.state += self._correction
 
     def advance(self) -> None:
-        """Go on to the next frame."""
+        """Predict the next frame."""
         layers = self._of_layers
         now = np.matmul(self.model.both, self.state.reshape(len(layers), -1, 1))[:, :, 0]
         layers[:, 1] = layers[:, 0]
@@ -95,13 +95,13 @@ class SlopePredictor:
 
 
 def shares(model: SlopeModel) -> Floats:
-    """Return how slopes of which nothing else is known are shared between the layers, (layers,)."""
+    """Return the a priori share of each layer in the slopes, (layers,)."""
     driving = np.trace(model.driving, axis1=1, axis2=2)
     return np.asarray(driving / driving.sum())
 
 
 def steady_covariance(model: SlopeModel, variance_px2: Floats) -> Floats:
-    """Return the covariance (states, states) of the predicted state's error that a Kalman filter comes to.
+    """Return the steady-state covariance (states, states) of the predicted state's error.
 
     The discrete algebraic Riccati equation by doubling (Chu, Fan & Lin 2005, Linear Algebra Appl. 396, 55):
     twice as many frames with each step.

@@ -1,4 +1,4 @@
-"""Kernels of the guarded Kalman filter: from a frame's slopes to a command, and what is left of the frame.
+"""Kernels of the guarded Kalman filter: command from a frame's slopes, then the rest of the update.
 
 What they do is written in NumPy in `guarded`, `predictive`, `kalman` and `telemetry`; `compiled_kalman` calls
 them in their order.
@@ -38,21 +38,21 @@ class Matrices(NamedTuple):
     phase: Any
     """(m, commands)"""
     covariance: Any
-    """(m, states): of the state's error with the slopes' before a frame is measured."""
+    """(m, states): covariance of the errors of slopes and state before a measurement."""
     uncertainty: Any
-    """(m, m): of the slopes' error."""
+    """(m, m): covariance of the slopes' error."""
     usual_inverse: Any
-    """(m, m): of the slopes' covariance with their usual noise."""
+    """(m, m): factor of the slopes' covariance with their usual noise."""
     usual_variance: Any
-    """(m,): its diagonal, before it was inverted."""
+    """(m,): its diagonal before inversion."""
     onward: Any
     """(layers, 2 m, m)"""
     command: Any
-    """(states, commands): from the state."""
+    """(states, commands): matrix from the state to commands."""
 
 
 class Lines(NamedTuple):
-    """Commands on their way: to the mirror, and those of the two controllers."""
+    """Delayed commands: of the mirror, and of both controllers."""
 
     true: Any
     """(delay + 1, commands)"""
@@ -64,7 +64,7 @@ class Memory(NamedTuple):
     """State that persists between frames, and work arrays."""
 
     state: Any
-    """(layers, 2, m): as predicted for the coming frame."""
+    """(layers, 2, m): predicted state of the next frame."""
     guard: Any
     """(4,)"""
     slopes: Any
@@ -75,7 +75,7 @@ class Memory(NamedTuple):
 
 @_compiled
 def _take(slopes: Any, errors: Any, prior_std: Any, noise_factor: Any, rows: Any, chosen: Any) -> None:
-    """Write what both controllers make of slopes; see `Guarded.update` and `telemetry.without_prior`."""
+    """Write the inputs of both controllers; see `Guarded.update` and `telemetry.without_prior`."""
     for s in range(slopes.shape[0]):
         held, of_learnt, of_plain = rows[HELD, s], rows[HELD_LEARNT, s], rows[HELD_PLAIN, s]
         latest = rows[LATEST_PLAIN, s]
@@ -147,7 +147,7 @@ def _solve(matrices: Any, rows: Any, steps: Any) -> None:
 
 @_compiled
 def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) -> float:
-    """Correct the state, and write the command that follows; return its sum before it is cut."""
+    """Correct the state and write the filter's command; return its sum before clipping."""
     rows = memory.slopes
     whole = memory.state.reshape(1, memory.state.size)
     _solve(matrices, rows, steps)
@@ -163,7 +163,7 @@ def _filter(matrices: Any, memory: Any, steps: Any, largest: Any, command: Any) 
 
 @_compiled
 def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, command: Any) -> float:
-    """Write the integrator's command; return its sum before it is cut."""
+    """Write the integrator's command; return its sum before clipping."""
     made = memory.commands[_MADE : _MADE + 1]
     made[:] = 0.0
     add_products(matrices.reconstruct, memory.slopes[_FOR_PLAIN : _FOR_PLAIN + 1], made)
@@ -177,7 +177,7 @@ def _integrate(matrices: Any, memory: Any, gain: Any, keep: Any, largest: Any, c
 
 @_compiled
 def _advance(matrices: Any, memory: Any) -> None:
-    """Take the filter's state on to the next frame."""
+    """Predict the filter's state of the next frame."""
     state, rows = memory.state, memory.slopes
     now, m = rows[_SPARE : _SPARE + 1], rows.shape[1]
     rows[PREDICTED] = 0.0
@@ -192,7 +192,7 @@ def _advance(matrices: Any, memory: Any) -> None:
 
 @_compiled
 def _choose(guard: Any, learnt: Any, plain: Any) -> None:
-    """Let the one that leaves less have the mirror; see `Guarded`."""
+    """Select the controller with the smaller residual; see `Guarded`."""
     difference = (learnt - plain) / max(learnt + plain, 1e-30)
     guard[FRAMES] += 1.0
     share = 1.0 / min(guard[FRAMES], MEMORY_FRAMES)
@@ -208,7 +208,7 @@ def _choose(guard: Any, learnt: Any, plain: Any) -> None:
 
 @_compiled
 def hold(matrices: Any, lines: Any, places: Any, memory: Any) -> None:
-    """Write what the commands that act in the coming frame add to slopes.
+    """Write the slopes caused by the commands that act in the next frame.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def follow(
     places: Any,
     memory: Any,
 ) -> float:
-    """Write the mirror's next command, that of one of the controllers; return its sum before it is cut.
+    """Write the selected controller's command for the mirror; return its sum before clipping.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def follow(
 
 @_compiled
 def go_on(numbers: Any, matrices: Any, lines: Any, places: Any, memory: Any) -> float:
-    """Do what is left of a frame when the mirror's command is out: the other one's, the guard, the state.
+    """Complete a frame after its command was sent: the other controller, the guard, the state.
 
     Return the sum of the other controller's command before it is cut.
     """

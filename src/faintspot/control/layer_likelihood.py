@@ -1,4 +1,4 @@
-"""The likelihood of frozen layers of turbulence, given the cross-spectra of slopes, and its maximum.
+"""Likelihood of frozen-flow layers given the cross-spectra of slopes, and its maximum.
 
 Cross-spectra of all slopes in overlapping windows are compared with those of frozen layers of von Karman
 turbulence (Whittle's likelihood of complex Wishart matrices). Strengths of all winds of a grid come first, by
@@ -38,7 +38,7 @@ _NOISE = 1e-3, 1e3
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """A point in the space of models."""
+    """Parameters of a model of the turbulence."""
 
     wind_m_per_s: Floats
     """(layers, 2)"""
@@ -75,7 +75,7 @@ class LayerLikelihood:
     def _of_vibrations(
         self, vibrations: Sequence[Vibration], rate_hz: float, every: int, length: int
     ) -> Complex:
-        """Return what vibrations add to the cross-spectra."""
+        """Return the cross-spectra of vibrations."""
         m = len(self._noise_px2)
         shapes, total = mode_shapes(self._site.positions_m), np.zeros((len(self._bins), m, m), np.complex128)
         for each in vibrations:
@@ -147,7 +147,7 @@ class LayerLikelihood:
         )
 
     def peaks(self) -> Layers:
-        """Return the winds of a grid that stand out, with the strength around them."""
+        """Return the winds of a grid with a significant strength, and the strength around them."""
         winds = _grid()
         spectra = np.array([self._spectra.of_wind(wind, self._tables) for wind in winds])
         strength, noise = self.strengths(spectra, self._start())
@@ -165,7 +165,7 @@ class LayerLikelihood:
         return Layers(np.column_stack([x, y]), peak, noise, self._site.outer_scale_m)
 
     def selected(self, start: Layers) -> Layers:
-        """Return the layers that the information criterion chooses, from those of `start`."""
+        """Return the layers selected by the information criterion, starting from `start`."""
         best = self.refined(start)
         while len(best.strength) > 1:
             fewer = min(
@@ -178,7 +178,7 @@ class LayerLikelihood:
         return best
 
     def refined(self, start: Layers) -> Layers:
-        """Return the most likely layers near others."""
+        """Return the maximum-likelihood layers near a starting point."""
         count = len(start.strength)
         scale = self._weight * len(self._bins)
 
@@ -201,7 +201,7 @@ class LayerLikelihood:
         )
 
     def _of_layers(self, layers: Layers) -> tuple[float, Floats]:
-        """Return the misfit of layers, and its derivatives with what `_packed` has."""
+        """Return the misfit of layers, and its derivatives with respect to the packed parameters."""
         derivatives, total = self._derivatives(layers)
         value, gradient, of_noise = self._value(total, layers.noise)
         of_spectra = [float((gradient * each).sum().real) for each in derivatives]
@@ -250,7 +250,7 @@ class LayerLikelihood:
 
 
 def _grid() -> Floats:
-    """Return the winds of a grid, (winds, 2) m/s: as dense as windows of half a second can tell apart."""
+    """Return the winds of a grid, (winds, 2) m/s, at the resolution of half-second windows."""
     winds = [np.zeros((1, 2))]
     for ring, speed in enumerate(_RINGS_M_PER_S[1:]):
         count = math.ceil(2 * math.pi * speed / max(1.5, 0.22 * speed))
@@ -260,7 +260,7 @@ def _grid() -> Floats:
 
 
 def _near(winds_m_per_s: Floats) -> Floats:
-    """Return how close other winds are to be taken for the same peak, m/s."""
+    """Return the distance within which winds count as the same peak [m/s]."""
     return np.asarray(np.maximum(2.5, 0.3 * np.hypot(*winds_m_per_s.T)))
 
 
@@ -284,7 +284,7 @@ def _with_one_less(layers: Layers) -> list[Layers]:
 
 
 def _packed(layers: Layers) -> Floats:
-    """Return numbers of about the same size: winds, logarithms of strengths, noise and outer scale."""
+    """Return the parameters scaled to similar size: winds, logarithms of strengths, noise, outer scale."""
     ends = [math.log(layers.noise), math.log(layers.outer_scale_m)]
     return np.concatenate([layers.wind_m_per_s.ravel() / _SPEED_UNIT, np.log(layers.strength), ends])
 

@@ -48,7 +48,7 @@ def learn(
     winds: str = LEARNT,
     noise_scale: float = 1.0,
 ) -> Learnt:
-    """Return a controller of a kind that has learnt from telemetry.
+    """Return a controller of the given kind, learnt from telemetry.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def learn(
 def _kalman(
     plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
 ) -> tuple[float, dict[str, Floats]]:
-    """Return what the Kalman filter needs, and how much it leaves."""
+    """Return the Kalman filter's model and its residual."""
     model, variance, clean = found.slope_model(), usual_variance(telemetry), plant.reconstructor.clean
     predictor = SlopePredictor(model, variance)
 
@@ -106,7 +106,7 @@ def _kalman(
 def _modal(
     plant: Plant, telemetry: OpenLoopTelemetry, plain_gain: float, plain_left: float, phase: Floats
 ) -> Model:
-    """Return what an integrator with a gain for each mode needs."""
+    """Return the model of an integrator with one gain per mode."""
     trust = max(float(telemetry.trust.mean()), 1e-6)  # by which slopes are smaller than they should be
     weighted = telemetry.trust * telemetry.open_loop_px / trust
     modes = weighted @ plant.reconstructor.matrix.T @ plant.reconstructor.modes
@@ -120,7 +120,7 @@ def _modal(
 def _pseudo_open_loop(
     plant: Plant, telemetry: OpenLoopTelemetry, found: Identified, phase: Floats
 ) -> tuple[float, dict[str, Floats]]:
-    """Return what pseudo-open-loop control needs, for the wavefront of when the command acts."""
+    """Return the model of pseudo-open-loop control for the time at which the command acts."""
     covariances, clean = found.covariances_px2().sum(axis=0), plant.reconstructor.clean
     now, ahead = covariances[0], covariances[min(plant.delay_frames, 2)]
 
@@ -138,7 +138,7 @@ def _best_gain(
     phase: Floats,
     gains: Sequence[float] = _GAINS,
 ) -> tuple[float, float]:
-    """Return the gain that leaves least of telemetry, and how much."""
+    """Return the gain with the smallest residual on the telemetry, and that residual."""
     left = [plant.left(made(gain), telemetry, phase) for gain in gains]
     best = int(np.argmin(left))
     return gains[best], left[best]

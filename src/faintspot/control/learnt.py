@@ -35,7 +35,7 @@ CONTROLS = {
     POLC: "pseudo-open-loop control",
     KALMAN: "predictive Kalman filter",
 }
-"""Kinds of control, and what reports call them."""
+"""Kinds of control and their names in reports."""
 
 SETTLE_FRAMES = 50
 _OF_KIND = {
@@ -59,7 +59,7 @@ _RANGES = {
     "first": (-1e6, 1e6),
     "second": (-1e6, 1e6),
 }
-"""Beyond these, numbers are damaged or in another unit, and sums of their products may overflow."""
+"""Accepted range; other values are damaged or in another unit, and products may overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Plant:
     """Loop properties that a controller needs."""
 
     interaction: Floats
-    """(m, commands): slopes in px that a unit of each command adds."""
+    """(m, commands): slopes [px] per unit of each command."""
     reconstructor: Reconstructor
     delay_frames: int
     leak: float
@@ -77,13 +77,13 @@ class Plant:
         return Integrator(line, self.interaction, self.reconstructor, gain, self.leak)
 
     def left(self, make: Make, telemetry: OpenLoopTelemetry, phase: Floats) -> float:
-        """Return the phase variance that a controller would have left, see `replayed`."""
+        """Return the phase variance that a controller would have left; see `replayed`."""
         return replayed(make, telemetry, self.interaction, phase, self.delay_frames, SETTLE_FRAMES)
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Model of the turbulence that a controller has learnt."""
+    """Learnt model of a controller."""
 
     kind: str
     arrays: Mapping[str, Floats]
@@ -94,13 +94,13 @@ class Model:
     noise_factor: float
     """Factor on the variances of standard errors."""
     left: tuple[float, float]
-    """Phase variance that the learnt and the plain one leave in telemetry, noise included."""
+    """Residual phase variance of the learnt and the plain controller on the telemetry, noise included."""
     phase: Floats
-    """(commands, m): what the two are compared by, see `residual_phase`."""
+    """(commands, m): matrix of the measure that compares both; see `residual_phase`."""
     description: str = ""
 
     def controller(self, plant: Plant, line: CommandDelayLine) -> Controller:
-        """Return the controller that has learnt."""
+        """Return the learnt controller."""
         arrays = self.arrays
         if self.kind == MODAL:
             return plant.integrator(arrays["gains"], line)
@@ -112,16 +112,16 @@ class Model:
 
     @property
     def expected_std_px(self) -> Floats | None:
-        """(m,): how sure it is of the slopes that it expects; None: it does not know."""
+        """(m,): standard deviations of the predicted slopes; None if unknown."""
         return self.predictor().std_px if self.kind == KALMAN else None
 
     def predictor(self) -> SlopePredictor:
-        """Return the filter of what "kalman" has learnt."""
+        """Return the Kalman filter of the model."""
         model, variance = self._slopes, self.arrays["variance_px2"]
         return SlopePredictor(model, variance, covariance=self._covariance)
 
     def with_noise(self, scale: float) -> Model:
-        """Return what "kalman" would have learnt with the variances of the noise so many times as large."""
+        """Return the model of "kalman" with the noise variances scaled by a factor."""
         if scale == 1.0:
             return self
         arrays = {**self.arrays, "variance_px2": scale * self.arrays["variance_px2"]}
@@ -137,7 +137,7 @@ class Model:
         return steady_covariance(self._slopes, self.arrays["variance_px2"])
 
     def save(self, path: str | Path) -> None:
-        """Write it to a NumPy file (.npz).
+        """Write the model to a NumPy file (.npz).
 
         Raises
         ------
@@ -149,7 +149,7 @@ class Model:
 
     @classmethod
     def load(cls, path: str | Path, plant: Plant) -> Model:
-        """Read it, for a loop.
+        """Read a model for a loop.
 
         Raises
         ------
@@ -170,7 +170,7 @@ class Model:
         )
 
     def check(self, plant: Plant) -> None:
-        """Refuse a model that is for another loop, or has numbers out of range.
+        """Refuse a model of another loop, or with numbers out of range.
 
         Raises
         ------
@@ -182,7 +182,7 @@ class Model:
 
 
 def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
-    """Return a model's numbers as float64, of the shapes that the loop needs and within `_RANGES`."""
+    """Return a model's arrays as float64, with checked shapes and ranges."""
     numbers = {name: numbers_between(name, value, *_RANGES.get(name, ())) for name, value in found.items()}
     (slopes, commands), modes = plant.interaction.shape, plant.reconstructor.modes.shape[1]
     shapes: dict[str, tuple[int, ...]] = {"gains": (modes,), "variance_px2": (slopes,), "left": (2,)}
@@ -198,7 +198,7 @@ def _checked(found: Mapping[str, Any], plant: Plant) -> dict[str, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A controller that has learnt, ready to be made for its loop."""
+    """Learnt controller of a loop, from which controllers are made."""
 
     plant: Plant
     model: Model
@@ -210,13 +210,13 @@ class Learnt:
 
     @property
     def expected_std_px(self) -> Floats | None:
-        """(m,): how sure it is of the slopes that it expects; None: it does not know."""
+        """(m,): standard deviations of the predicted slopes; None if unknown."""
         return self.model.expected_std_px
 
     def controller(
         self, line: CommandDelayLine, prior_std_px: Floats | None = None
     ) -> Guarded | CompiledKalman:
-        """Return the controller; with the estimator's prior where it has one."""
+        """Return the controller, with the estimator's prior if it has one."""
         plant, model = self.plant, self.model
         if model.kind == KALMAN:
             return CompiledKalman(

@@ -16,7 +16,7 @@ from faintspot.base.flags import INVALID, SubapertureFlag
 Floats = NDArray[np.float64]
 
 FEWEST_ROUNDS = 4
-"""Rounds needed to estimate errors from their scatter."""
+"""Number of rounds needed to estimate errors from the scatter."""
 _ANSWERS = 1 / 3  # largest relative error of an actuator that counts as responding
 _HOPELESS_ROUNDS = 8  # after which half of the actuators must have shown something
 _CHECKED = 8  # actuators that are poked by half as much, too
@@ -28,12 +28,12 @@ _MOST_INVALID, _MOST_AT_LIMIT = 0.2, 0.02
 
 
 class PokedMirror(Protocol):
-    """A mirror with a sensor behind it."""
+    """Mirror and sensor that can be poked and read."""
 
     commands: int
 
     def slopes(self, command: Floats) -> tuple[Floats, NDArray[np.uint8]]:
-        """Return slopes (frames, 2 n), px, and flags (frames, n) of two or more frames, in their order.
+        """Return slopes (frames, 2 n) [px] and flags (frames, n) of two or more consecutive frames.
 
         The command is to act in all of them.
         """
@@ -44,22 +44,22 @@ class MirrorCalibration:
     """Result of a calibration by pokes."""
 
     interaction: Floats
-    """(2 n, commands): px for a unit of each command; 0 where an actuator does not answer."""
+    """(2 n, commands): px per unit of each command; 0 for actuators without response."""
     interaction_error: Floats
     """(2 n, commands): standard errors."""
     reference: Floats
-    """(2 n,): slopes of the flat mirror, px, as the sensor told them."""
+    """(2 n,): measured slopes of the flat mirror [px]."""
     reference_error: Floats
     amplitude: float
     rounds: int
     relative_error: Floats
-    """(commands,): error of each actuator's slopes, as a part of them."""
+    """(commands,): relative error of each actuator's slopes."""
     linearity: float
     """Response to pokes of half the amplitude, relative to a linear response."""
 
     @property
     def answers(self) -> NDArray[np.bool_]:
-        """(commands,): whether each actuator moves slopes beyond their noise."""
+        """(commands,): whether each actuator's response exceeds the noise."""
         return self.relative_error < _ANSWERS
 
 
@@ -70,7 +70,7 @@ def calibrate_mirror(
     most_rounds: int = 100,
     progress: Callable[[int, float], None] | None = None,
 ) -> MirrorCalibration:
-    """Poke every actuator up and down, again and again, until the errors are small enough.
+    """Poke every actuator up and down repeatedly until the errors are small enough.
 
     Errors are those of the mean of all rounds, from their scatter, which includes noise and turbulence. The
     order of up and down alternates between rounds, so that drifts average out.
@@ -133,7 +133,7 @@ def calibrate_mirror(
 
 
 def centroid_gain(found: MirrorCalibration, former: Floats) -> tuple[float, float]:
-    """Return by how much slopes are larger than those of a former interaction matrix, and its error.
+    """Return the scale of the slopes relative to a former interaction matrix, and its error.
 
     Of a matrix in true pixels it is the estimator's centroid gain.
 
@@ -150,7 +150,7 @@ def centroid_gain(found: MirrorCalibration, former: Floats) -> tuple[float, floa
 
 
 def _linearity(mirror: PokedMirror, pokes: _Pokes, interaction: Floats, found: Floats) -> float:
-    """Poke those that move slopes most by half as much; refuse what is not in proportion."""
+    """Check the linearity with pokes of half the amplitude for the strongest actuators."""
     strongest = np.argsort(np.abs(interaction).max(axis=0))[::-1][:_CHECKED]
     half = _Pokes(mirror, strongest, 0.5 * pokes.amplitude)
     for _ in range(max(FEWEST_ROUNDS, pokes.rounds)):
@@ -172,16 +172,16 @@ def _linearity(mirror: PokedMirror, pokes: _Pokes, interaction: Floats, found: F
 
 
 class _Pokes:
-    """Pokes of some actuators and what they did, round by round."""
+    """Pokes of some actuators and their responses, round by round."""
 
     def __init__(self, mirror: PokedMirror, actuators: NDArray[np.int64], amplitude: float) -> None:
         self._mirror, self._actuators, self.amplitude = mirror, actuators, amplitude
         self._differences: list[Floats] = []
         self._means: list[Floats] = []
         self._ends: Floats | float = 0.0
-        """Sum of what differences would be of the first and of the last frame of each poke."""
+        """Sums of the differences of only the first and only the last frame of each poke."""
         self._counts = np.zeros(3)
-        """Slopes in all, those that are not valid, and those at the end of their search range."""
+        """Numbers of all slopes, of invalid ones, and of those at the limit of the search range."""
 
     @property
     def rounds(self) -> int:
@@ -189,7 +189,7 @@ class _Pokes:
         return len(self._differences)
 
     def round(self) -> None:
-        """Poke all of them up and down, or down and up."""
+        """Poke all actuators up and down, or down and up."""
         signs = (1.0, -1.0) if self.rounds % 2 == 0 else (-1.0, 1.0)
         differences, means = [], []
         for actuator in self._actuators:
@@ -204,17 +204,17 @@ class _Pokes:
 
     @property
     def columns(self) -> tuple[Floats, Floats]:
-        """Slopes for a unit of each command, (2 n, actuators), and their standard errors."""
+        """Slopes per unit of each command, (2 n, actuators), and their standard errors."""
         return _mean(self._differences)
 
     @property
     def middle(self) -> tuple[Floats, Floats]:
-        """Slopes of the mirror between up and down, (2 n,), and their standard errors."""
+        """Mean slopes of up and down, (2 n,), and their standard errors."""
         return _mean(self._means)
 
     @property
     def relative_error(self) -> Floats:
-        """(actuators,): root of the sum of squares of errors, as a part of that of the slopes."""
+        """(actuators,): relative error, root sum of squares over the slopes."""
         columns, errors = self.columns
         noise = np.square(np.where(np.isfinite(errors), errors, 0.0)).sum(axis=0)
         signal = np.square(columns).sum(axis=0) - noise  # noise has added its square, too
@@ -222,7 +222,7 @@ class _Pokes:
             return np.where(signal > 0, np.sqrt(noise / signal), np.inf)
 
     def refuse_hopeless(self, error: float, *, last: bool) -> None:
-        """Raise InputError where half of the actuators show nothing, or many slopes are not valid."""
+        """Raise InputError if half of the actuators have no response or many slopes are invalid."""
         if self.rounds < _HOPELESS_ROUNDS and not last:
             return
         total, invalid, _ = self._counts
@@ -239,7 +239,7 @@ class _Pokes:
             )
 
     def refuse_saturated(self) -> None:
-        """Raise InputError where pokes moved spots to the end of their search range or window."""
+        """Raise InputError if pokes moved spots to the limit of their search range or window."""
         total, _, at_limit = self._counts
         if at_limit > _MOST_AT_LIMIT * total:
             raise InputError(
@@ -248,7 +248,7 @@ class _Pokes:
             )
 
     def refuse_unsettled(self) -> None:
-        """Raise InputError where a poke does not act in the first frame as it does in the last one."""
+        """Raise InputError if the first and the last frame of a poke differ."""
         columns, errors = self.columns
         first, last = np.asarray(self._ends) / self.rounds
         signal = (last * columns).sum()

@@ -1,4 +1,4 @@
-"""The gain of each mode that leaves the least, from recorded open-loop slopes."""
+"""Optimal gain of each mode from recorded open-loop slopes."""
 
 from __future__ import annotations
 
@@ -37,5 +37,5 @@ def modal_gains(modes: Floats, delay_frames: int, leak: float, gains: Floats = G
 
 
 def largest_stable_gain(delay_frames: int) -> float:
-    """Return the gain from which on an integrator without leak is unstable."""
+    """Return the smallest gain at which an integrator without leak is unstable."""
     return float(2 * np.sin(np.pi / (2 * (2 * delay_frames - 1))))

@@ -69,7 +69,7 @@ class SlopeModel:
 
     @cached_property
     def onward(self) -> Floats:
-        """(states, states): from one frame's state to the next one's."""
+        """(states, states): transition matrix of the state."""
         step = np.eye(2 * self.slopes, k=-self.slopes)
         blocks = np.repeat(step[None], self.layers, axis=0)
         blocks[:, : self.slopes] = self.both
@@ -77,11 +77,11 @@ class SlopeModel:
 
     @cached_property
     def seen(self) -> Floats:
-        """(m, states): from the state to z[k]."""
+        """(m, states): matrix from the state to z[k]."""
         return np.tile(np.eye(self.slopes, 2 * self.slopes), self.layers)
 
     def ahead(self, frames: int) -> Floats:
-        """Return (m, states): z so many frames after the state."""
+        """Return (m, states): matrix from the state to z a number of frames later."""
         seen = self.seen
         for _ in range(frames):
             seen = seen @ self.onward

@@ -1,4 +1,4 @@
-"""Residual phase from slopes: the measure by which controllers are compared.
+"""Residual phase from slopes, the measure that compares controllers.
 
 Commands are no such measure: a unit of one combination of actuators moves the phase far more than that of
 another, and the combinations that move it least are the noisiest.

@@ -1,4 +1,4 @@
-"""Control from the open-loop slopes: pseudo-open-loop control, and predictive control."""
+"""Control from open-loop slopes: pseudo-open-loop control and predictive control."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 
 class PseudoOpenLoop:
-    """Pseudo-open-loop control: the most probable wavefront from slopes without the mirror's part.
+    """Pseudo-open-loop control: maximum a posteriori wavefront from open-loop slopes.
 
     Gilles 2005, Appl. Opt. 44, 993. Slopes count by their variance in each frame. As a gain g averages over
     frames, the reconstructor is that for their noise in the mean, g / (2 - g) of a frame's.
@@ -51,7 +51,7 @@ class PseudoOpenLoop:
         return Expected(self._interaction @ (self._line.acting - self._line.latest), None)
 
     def begin(self) -> None:
-        """See `Controller`: all that it knows is on the line."""
+        """See `Controller`; the delay line is the only state."""
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:
         """See `Controller`."""
@@ -64,7 +64,7 @@ class PseudoOpenLoop:
 
 
 class Predictive:
-    """Commands from the open-loop slopes that a Kalman filter predicts for the frame in which they act.
+    """Predictive control: commands from the Kalman filter's prediction for the frame in which they act.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Predictive:
         return Expected(mean, self.predictor.std_px)
 
     def begin(self) -> None:
-        """See `Controller`: open-loop slopes are taken to be those that the mirror takes off."""
+        """See `Controller`; open-loop slopes are assumed to equal the mirror's correction."""
         self.predictor.begin(-(self._interaction @ self._line.latest))
 
     def update(self, slopes_px: Floats, standard_error_px: Floats) -> None:

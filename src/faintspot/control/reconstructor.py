@@ -1,4 +1,4 @@
-"""From slopes to the commands that cause them."""
+"""Reconstruction of commands from slopes."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ _RIDGE = 3e-2  # of the mean square of the driven combinations' slopes: weak one
 
 @dataclass(frozen=True, eq=False)
 class Reconstructor:
-    """From slopes to the commands that cause them, on the combinations of actuators that slopes can see."""
+    """Reconstructor from slopes to commands, for the modes that slopes can see."""
 
     matrix: Floats
-    """(commands, 2 n): regularised least squares, all slopes counting alike."""
+    """(commands, 2 n): regularised least squares with equal weights."""
     modes: Floats
-    """(commands, modes): combinations that are driven, orthonormal."""
+    """(commands, modes): controlled modes, orthonormal."""
     slopes_of_modes: Floats
     """(2 n, modes)"""
     clean: Floats
-    """(commands, 2 n): as `matrix`, for slopes with little noise, hardly regularised."""
+    """(commands, 2 n): as `matrix`, hardly regularised, for slopes with little noise."""
 
     def __call__(self, slopes: Floats) -> Floats:
-        """Return the commands, in the interaction matrix's unit."""
+        """Return the commands in the unit of the interaction matrix."""
         return self.matrix @ slopes
 
     def weighted(self, slopes: Floats, standard_error: Floats) -> Floats:
-        """Return the commands from slopes that count by the inverse of their variance; infinite: not at all.
+        """Return the commands by weighted least squares, with inverse variances as weights.
 
         Regularised like `matrix`, which it is where all errors are the same.
         """

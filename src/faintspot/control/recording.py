@@ -1,4 +1,4 @@
-"""Learning from what a running engine has recorded, without knowing the air."""
+"""Learning from telemetry recorded by a running engine, without knowledge of the atmosphere."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def check_commands(recording: Recording, control: Control, what: str) -> None:
 def recorded_slopes(
     recording: Recording, control: Control, rows: NDArray[np.int64], predicted: bool, what: str
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return slopes, their errors, the mirror's part, and the slopes that an integrator expected.
+    """Return slopes, their errors, the slopes of the mirror, and an integrator's predicted slopes.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def recorded_slopes(
 
 
 def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -> SlopeTurbulence:
-    """Return what is known of slopes in turbulence before a recording: geometry, outer scale, winds.
+    """Return prior knowledge of slopes in turbulence: geometry, outer scale, winds.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def site_of(layout: Layout, layers: Sequence[tuple[float, float, float]] = ()) -
 
 
 def _longest(frame: NDArray[np.int64], closed: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return first frame, and the one after the last, of the longest run of consecutive closed ones."""
+    """Return the bounds of the longest run of consecutive frames with a closed loop."""
     if not len(frame):
         return 0, 0
     ends = np.flatnonzero((np.diff(frame) != 1) | (np.diff(closed.astype(np.int8)) != 0)) + 1

@@ -28,9 +28,9 @@ class SlopeRecords:
     slopes: Floats
     """(frames, m): interpolated in time where not measured, without their mean."""
     noise_px2: Floats
-    """(m,): mean variance of the noise as the standard errors have it."""
+    """(m,): mean variance of the noise according to the standard errors."""
     measured: NDArray[np.bool_]
-    """(frames,): whether most of the slopes were."""
+    """(frames,): whether most of the slopes were measured."""
 
     @classmethod
     def of(cls, telemetry: OpenLoopTelemetry, site: SlopeTurbulence) -> SlopeRecords:
@@ -65,7 +65,7 @@ class SlopeRecords:
         return self.slopes @ mode_shapes(self.site.positions_m).T
 
     def segments(self, every: int, length: int) -> Floats:
-        """Return half-overlapping pieces (pieces, length, m) of every so-many-th frame."""
+        """Return half-overlapping pieces (pieces, length, m) of every n-th frame."""
         found = []
         for first in range(every):
             slopes, measured = self.slopes[first::every], self.measured[first::every]
@@ -82,7 +82,7 @@ class SlopeRecords:
 
 
 def _interpolated(values: Floats, measured: NDArray[np.bool_]) -> Floats:
-    """Return values (frames, m) with those that were not measured interpolated in time."""
+    """Return values (frames, m), interpolated in time where not measured."""
     if measured.all():
         return values
     frames, result = np.arange(len(values)), values.copy()

@@ -1,4 +1,4 @@
-"""Telemetry of a loop, from which its controller learns."""
+"""Telemetry from which a controller learns."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ LEAST_VARIANCE_PX2 = 1e-8  # of slopes that are known without an error
 
 @dataclass(frozen=True, eq=False)
 class OpenLoopTelemetry:
-    """Open-loop slopes of consecutive frames, with their noise, and how the loop saw them."""
+    """Open-loop slopes of consecutive frames, with their noise and the estimator's weight on them."""
 
     open_loop_px: Floats
-    """(frames, m): measured slopes without what the mirror added; anything finite where not measured."""
+    """(frames, m): open-loop slopes; any finite value where not measured."""
     variance_px2: Floats
-    """(frames, m): of their noise; infinite: not measured."""
+    """(frames, m): variance of their noise; infinite: not measured."""
     trust: Floats
     """(frames, m): part of a deviation from what was expected that the estimator gives: 1, of estimators with
     a prior less, where not measured 0."""
@@ -35,11 +35,11 @@ class OpenLoopTelemetry:
         return len(self.open_loop_px)
 
     def part(self, start: int, stop: int) -> OpenLoopTelemetry:
-        """Return some of the frames."""
+        """Return a selection of frames."""
         return OpenLoopTelemetry(*(each[start:stop] for each in vars(self).values()))
 
     def scaled(self, noise_factor: float) -> OpenLoopTelemetry:
-        """Return the same with another size of the noise."""
+        """Return the same telemetry with the noise scaled."""
         return OpenLoopTelemetry(self.open_loop_px, self.variance_px2 * noise_factor, self.trust)
 
 
@@ -68,7 +68,7 @@ def make_telemetry(
 def without_prior(
     slopes_px: Floats, standard_error_px: Floats, expected_px: Floats, prior_std_px: Floats | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return what a frame alone says: slopes, variances and `Telemetry.trust`.
+    """Return slopes without the estimator's prior, their variances, and `Telemetry.trust`.
 
     A posterior's mean and variance s hold the prior of variance v, too; fed back to the filter that the
     prior came from, it would count twice. The frame alone has the variance 1 / (1 / s - 1 / v), at most
@@ -101,7 +101,7 @@ def replayed(
     delay_frames: int,
     settle_frames: int = 0,
 ) -> float:
-    """Return how well a controller would have done on recorded frames: mean square of what is left.
+    """Return the mean square residual that a controller would have left on recorded frames.
 
     The commands that it would have sent are added to the recorded open-loop slopes. As these commands do not
     know the noise of the frame that they act in, that noise adds the same to every controller's result.
@@ -133,7 +133,7 @@ def replayed(
 
 
 def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:
-    """Return the slopes that an estimator would have given a controller: drawn towards what it expects."""
+    """Return the slopes that an estimator with a prior would have given a controller."""
     if controller.undoes_prior:
         return slopes_px
     expected = controller.expected().mean_px

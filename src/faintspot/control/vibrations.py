@@ -31,7 +31,7 @@ _START_DAMPING = 3e-3
 
 @dataclass(frozen=True)
 class Vibration:
-    """A damped oscillator that white noise drives."""
+    """Damped oscillator driven by white noise."""
 
     mode: str
     """One of `MODES`."""
@@ -50,12 +50,12 @@ class Vibration:
         return 2 * radius * math.cos(angle), -(radius**2)
 
     def driving_variance(self, rate_hz: float) -> float:
-        """Return the variance of the recursion's noise for an oscillation of variance 1."""
+        """Return the driving variance of the recursion for an oscillation of variance 1."""
         one, two = self.recursion(rate_hz)
         return (1 + two) * ((1 - two) ** 2 - one**2) / (1 - two)
 
     def correlation(self, rate_hz: float, frames: int) -> Floats:
-        """Return the correlation with itself 0, 1, ... frames later."""
+        """Return the autocorrelation at lags of 0, 1, ... frames."""
         one, two = self.recursion(rate_hz)
         found = [1.0, one / (1 - two)]
         while len(found) < frames:
@@ -73,7 +73,7 @@ def mode_shapes(positions_m: Floats) -> Floats:
 
 
 def find_vibrations(amplitudes: Floats, rate_hz: float, slopes: int) -> tuple[Vibration, ...]:
-    """Return the narrow lines that stand out of the spectra of `MODES`.
+    """Return the significant narrow lines in the spectra of `MODES`.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def with_vibrations(
 
 
 class _Lines:
-    """The spectrum of a mode, in which lines are searched for."""
+    """Spectrum of a mode that is searched for lines."""
 
     def __init__(self, spectrum: Floats, window: Floats, segments: int, rate_hz: float, slopes: int) -> None:
         self._spectrum, self._segments, self._rate_hz, self._slopes = spectrum, segments, rate_hz, slopes
@@ -138,7 +138,7 @@ class _Lines:
         self._correlation = np.correlate(window, window, "full")[len(window) - 1 :]
 
     def peaks(self) -> list[int]:
-        """Return the bins of the highest peaks that are no chance."""
+        """Return the bins of the significant highest peaks."""
         ratio = self._spectrum / self._background
         first = max(3, math.ceil(_LOWEST_HZ / self._bin_hz))
         ratio[:first] = ratio[-3:] = 0.0
