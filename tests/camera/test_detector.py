@@ -227,6 +227,8 @@ def test_inputs_stay_as_they_were_and_the_detector_is_immutable() -> None:
         ({"bits": 12.5}, "bits"),
         ({"bits": 33}, "bits"),
         ({"full_well_e": 0}, "full_well_e"),
+        ({"relative_gain": 0.0}, "relative_gain"),
+        ({"blinking_pixels": [(1, 2)]}, "blinking_pixels"),
         ({"hot_pixels": [(1, 2)]}, "hot_pixels"),
         ({"hot_pixels": 0.1}, "hot_pixels"),
         ({"hot_pixels": [(-1, 2, 3.0)]}, "hot_pixels"),
@@ -278,3 +280,44 @@ def test_a_generator_that_cannot_spawn_is_refused() -> None:
 def test_non_finite_adu_are_refused() -> None:
     with pytest.raises(InputError, match="adu"):
         Detector().to_electrons([np.nan])
+
+
+class TestCMOS:
+    def test_distribution_of_the_noise(self) -> None:
+        """Of 10,000 log-normal values: the median to 0.9 %, the root mean square to 1 %; four of these."""
+        noise = np.asarray(
+            Detector.cmos((100, 100), 0.3, spread=0.7, rng=np.random.default_rng(1)).read_noise_e
+        )
+        assert np.median(noise) == pytest.approx(0.3, rel=0.04)
+        assert np.sqrt(np.mean(noise**2)) == pytest.approx(0.3 * np.exp(0.49), rel=0.05)
+
+    def test_same_seed_same_camera(self) -> None:
+        options: dict[str, Any] = {"blinking_fraction": 0.05, "gain_spread": 0.02, "bits": 12}
+        first, second = (Detector.cmos((20, 30), rng=np.random.default_rng(2), **options) for _ in range(2))
+        np.testing.assert_array_equal(first.read_noise_e, second.read_noise_e)
+        assert first.blinking_pixels == second.blinking_pixels
+        assert first.bits == 12
+        assert len(first.blinking_pixels) > 10
+
+    def test_blinking_pixels_have_two_levels(self) -> None:
+        detector = Detector(0.0, blinking_pixels=[(1, 2, 8.0)], offset_adu=50.0)
+        out = detector.expose(np.zeros((4000, 3, 4)), np.random.default_rng(3)).astype(np.float64)
+        assert set(out[:, 1, 2]) == {46.0, 54.0}
+        assert abs(out[:, 1, 2].mean() - 50.0) < STANDARD_ERRORS * 4 / np.sqrt(4000)
+        assert np.all(np.delete(out.reshape(4000, 12), 6, axis=1) == 50)
+        assert detector.variance(np.zeros((3, 4)))[1, 2] == 16.0
+
+    def test_other_noise_does_not_depend_on_blinking(self) -> None:
+        plain, blinking = (
+            Detector(1.0, blinking_pixels=pixels).expose(np.full((5, 4, 4), 3.0), np.random.default_rng(4))
+            for pixels in ((), [(0, 0, 9.0)])
+        )
+        np.testing.assert_array_equal(plain[:, 1:], blinking[:, 1:])
+
+    def test_relative_gain_is_the_flat(self) -> None:
+        gain = np.array([[1.0, 1.2], [0.9, 1.1]])
+        detector = Detector(0.0, relative_gain=gain, gain_e_per_adu=2.0, offset_adu=10.0)
+        adu = detector.expose(np.full((2, 2), 1e6), np.random.default_rng(5))
+        ideal = Detector(0.0, gain_e_per_adu=2.0).expose(np.full((2, 2), 1e6), np.random.default_rng(5))
+        np.testing.assert_allclose(adu - 10.0, ideal * gain, rtol=1e-6)
+        np.testing.assert_allclose(detector.to_electrons(adu), 2.0 * ideal, rtol=1e-6)

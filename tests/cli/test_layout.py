@@ -152,6 +152,27 @@ def test_exists_already_and_overwrite_keeps_the_calibration(folder: Path, run: C
 
 
 @pytest.mark.usefixtures("no_picture")
+def test_dark_frames_give_the_noise_of_each_pixel(folder: Path, run: Commands) -> None:
+    """Variances of 40 darks are known to 23 %; bad pixels that are known stay, those that blink join them."""
+    noise = np.random.default_rng(3).lognormal(1.0, 0.5, SHAPE)
+    blinking = [(20, 30, 60.0)]
+    camera = Detector(noise, offset_adu=100.0, gain_e_per_adu=2.0, blinking_pixels=blinking)
+    np.save("a.npy", frames())
+    np.save("darks.npy", camera.expose(np.zeros((40, *SHAPE)), np.random.default_rng(4)))
+    np.save("list.npy", [[3, 5]])
+    options = ("--dark", "darks.npy", "--gain-e-per-adu", 2, "--pixels", 16, "--bad-pixels", "list.npy")
+    output = run.ok("layout", "a.npy", "-o", "new.toml", *options)
+    assert "read noise of each pixel" in output.out
+    calibration = Calibration.load("new.toml")
+    assert [20, 30] in np.asarray(calibration.bad_pixels).tolist()
+    assert [3, 5] in np.asarray(calibration.bad_pixels).tolist()
+    ratio = np.delete(np.asarray(calibration.read_noise_e) / noise, 20 * SHAPE[1] + 30)
+    assert np.sqrt(np.mean(np.log(ratio) ** 2)) < 0.15
+    run.ok("layout", "a.npy", "-o", "number.toml", *options, "--read-noise-e", 3)
+    assert Calibration.load("number.toml").read_noise_e == 3.0
+
+
+@pytest.mark.usefixtures("no_picture")
 def test_maps_of_the_camera(folder: Path, run: Commands) -> None:
     """A cube of darks is averaged, a flat divided by its mean, bad pixels come as a map or a list."""
     rng = np.random.default_rng(2)

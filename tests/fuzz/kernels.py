@@ -110,13 +110,14 @@ def _layout(rng: np.random.Generator) -> fs.Layout:
 def _calibration(rng: np.random.Generator, shape: tuple[int, int]) -> fs.Calibration:
     dark = rng.normal(20.0, 1.0, shape)
     dark[rng.random(shape) < 0.05] = rng.choice(_HOSTILE)
+    noise = rng.choice([0.0, 0.3, 3.0, 1e6, np.nan], shape)
     return fs.Calibration(
         dark=dark if rng.random() < 0.5 else 20.0,
         gain_e_per_adu=float(rng.choice([1e-9, 1.0, 1.7, 1e9])),
         em_gain=float(rng.choice([1.0, 50.0])),
         bad_pixels=rng.random(shape) < rng.choice([0.0, 0.05, 0.9]),
         saturation_adu=float(rng.choice([1.0, 3000.0, 1e30])),
-        read_noise_e=float(rng.choice([0.0, 0.3, 3.0, 1e6])),
+        read_noise_e=noise if rng.random() < 0.3 else float(rng.choice([0.0, 0.3, 3.0, 1e6])),
         background_e=float(rng.choice([0.0, 2.0, 1e9])),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -165,6 +165,15 @@ class Calibration:
             return None
         good = np.isfinite(self.maps(frame_shape)).all(axis=0)
         return np.where(good, self.read_noise_e / self.em_gain, np.nan)
+
+    def with_bad_pixels(self, rows_and_columns: NDArray[np.int64]) -> Calibration:
+        """Return the same calibration with further bad pixels, (n, 2)."""
+        known = self.bad_pixels
+        if known is None:
+            known = np.empty((0, 2), np.int64)
+        elif known.dtype == np.bool_:
+            known = np.argwhere(known)
+        return replace(self, bad_pixels=np.unique(np.concatenate([known, rows_and_columns]), axis=0))
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:

@@ -16,6 +16,8 @@ from faintspot.base.generators import spawn
 LARGEST_MEAN_E = 1e12
 """Largest mean number of electrons per pixel accepted (far above any full well)."""
 
+_LEVELS = ("read_noise_e", "dark_e", "background_e", "relative_gain")  # numbers or maps
+
 
 @dataclass(frozen=True, eq=False)
 class Detector:
@@ -56,6 +58,12 @@ class Detector:
         Maximum number of electrons in a pixel before multiplication.
     hot_pixels : sequence of (row, column, electrons)
         Pixels with additional dark electrons per frame (mean), on top of `dark_e`.
+    blinking_pixels : sequence of (row, column, electrons)
+        Pixels with random telegraph noise: two levels at the output, so many electrons apart, drawn anew for
+        each frame with equal probability. Their mean is that of other pixels.
+    relative_gain : float or array_like, shape (ny, nx)
+        Gain of each pixel's amplifier relative to the nominal one, the `flat` of a calibration: ADU above the
+        offset are multiplied by it.
 
     Raises
     ------
@@ -82,12 +90,11 @@ class Detector:
     bits: int | None = None
     full_well_e: float | None = None
     hot_pixels: Sequence[tuple[int, int, float]] = ()
+    blinking_pixels: Sequence[tuple[int, int, float]] = ()
+    relative_gain: float | NDArray[np.float64] = 1.0
 
     def __post_init__(self) -> None:
-        checked: dict[str, Any] = {
-            name: _number_or_map(name, getattr(self, name))
-            for name in ("read_noise_e", "dark_e", "background_e")
-        }
+        checked: dict[str, Any] = {name: _number_or_map(name, getattr(self, name)) for name in _LEVELS}
         checked["em_gain"] = number_between("em_gain", self.em_gain, 1)
         checked["gain_e_per_adu"] = number_between("gain_e_per_adu", self.gain_e_per_adu, 0, low_open=True)
         checked["offset_adu"] = number_between("offset_adu", self.offset_adu)
@@ -95,9 +102,79 @@ class Detector:
             checked["bits"] = int(number_between("bits", self.bits, 1, 32, integer=True))
         if self.full_well_e is not None:
             checked["full_well_e"] = number_between("full_well_e", self.full_well_e, 0, low_open=True)
-        checked["hot_pixels"] = _hot_pixels(self.hot_pixels)
+        for name in ("hot_pixels", "blinking_pixels"):
+            checked[name] = _single_pixels(name, getattr(self, name))
+        if not np.all(np.asarray(checked["relative_gain"]) > 0):
+            raise InputError("relative_gain: expected numbers above 0, got 0")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def cmos(
+        cls,
+        shape: tuple[int, int],
+        read_noise_e: float = 1.0,
+        *,
+        spread: float = 0.5,
+        blinking_fraction: float = 0.0,
+        blinking_e: float = 10.0,
+        gain_spread: float = 0.0,
+        rng: np.random.Generator | None = None,
+        **options: Any,
+    ) -> Detector:
+        """Return a CMOS camera, whose pixels have amplifiers of their own.
+
+        The read noise follows a log-normal distribution, with a tail of noisy pixels as real cameras have:
+        data sheets of scientific CMOS cameras state medians of about 1 e- (Andor Zyla 5.5: 1.38 e-) and root
+        mean squares of 1.3 to 1.7 times that, and those of photon-counting ones about 0.3 e-. What the
+        distribution means for slopes was studied by Basden (2015, JATIS 1, 039002; arXiv:1506.07929).
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Rows and columns of a frame.
+        read_noise_e : float
+            Median read noise [electrons].
+        spread : float
+            Standard deviation of the logarithm of the read noise: root mean square over median is
+            exp(spread^2).
+        blinking_fraction : float
+            Fraction of the pixels that blink, see `blinking_pixels`.
+        blinking_e : float
+            Mean distance of their two levels [electrons], of an exponential distribution.
+        gain_spread : float
+            Standard deviation of `relative_gain`.
+        rng : numpy.random.Generator, optional
+            Generator of the camera's pixels.
+        options
+            Other parameters of `Detector`.
+
+        Raises
+        ------
+        InputError
+            If a value is out of range.
+
+        Examples
+        --------
+        >>> import numpy as np, faintspot as fs
+        >>> camera = fs.simulate.Detector.cmos((64, 64), 1.0, spread=0.7, rng=np.random.default_rng(1))
+        >>> noise = camera.read_noise_e
+        >>> print(f"median {np.median(noise):.1f} e-, rms {np.sqrt(np.mean(noise**2)):.1f} e-")
+        median 1.0 e-, rms 1.6 e-
+        """
+        median = number_between("read_noise_e", read_noise_e, 0.0)
+        fraction = number_between("blinking_fraction", blinking_fraction, 0.0, 1.0)
+        noise, gain, where, step = spawn(rng, 4)
+        pixels = noise.lognormal(0.0, number_between("spread", spread, 0.0, 3.0), shape)
+        relative = gain.normal(1.0, number_between("gain_spread", gain_spread, 0.0, 0.2), shape)
+        blinking = np.argwhere(where.random(shape) < fraction)
+        steps = step.exponential(number_between("blinking_e", blinking_e, 0.0), len(blinking))
+        return cls(
+            median * pixels,
+            blinking_pixels=np.column_stack([blinking, steps]),  # type: ignore[arg-type]
+            relative_gain=np.maximum(relative, 0.01),
+            **options,
+        )
 
     @property
     def excess_noise_factor(self) -> float:
@@ -132,7 +209,7 @@ class Detector:
             maps or do not contain its hot pixels.
         """
         mean = self._checked_mean(mean_e)
-        photon, dark, background, register, read = spawn(rng, 5)
+        photon, dark, background, register, read, *blinking = spawn(rng, 5 + bool(self.blinking_pixels))
         electrons = photon.poisson(mean).astype(np.float64)
         for generator, level in ((dark, self._dark_map(mean.shape)), (background, self.background_e)):
             if np.any(level):
@@ -143,12 +220,15 @@ class Detector:
             electrons = self.em_gain * register.standard_gamma(electrons)
         if np.any(self.read_noise_e):
             electrons += self.read_noise_e * read.standard_normal(mean.shape)
+        for row, column, step in self.blinking_pixels:
+            electrons[..., row, column] += step * (blinking[0].integers(0, 2, mean.shape[:-2]) - 0.5)
         return self._digitise(electrons)
 
     def to_electrons(self, adu: ArrayLike) -> NDArray[np.float32] | NDArray[np.float64]:
-        """Return the photo-electrons of a read-out: (adu - offset_adu) * gain_e_per_adu / em_gain.
+        """Return the photo-electrons of a read-out.
 
-        Background and dark current are not subtracted.
+        They are (adu - offset_adu) * gain_e_per_adu / (em_gain * relative_gain). Background and dark current
+        are not subtracted.
 
         Parameters
         ----------
@@ -166,15 +246,16 @@ class Detector:
             If `adu` is not finite.
         """
         values = finite_array("adu", adu)
-        electrons = (values.astype(np.float64) - self.offset_adu) * (self.gain_e_per_adu / self.em_gain)
+        scale = self.gain_e_per_adu / self.em_gain / self.relative_gain
+        electrons = (values.astype(np.float64) - self.offset_adu) * scale
         return electrons if values.dtype == np.float64 else electrons.astype(np.float32)
 
     def variance(self, mean_e: ArrayLike) -> NDArray[np.float64]:
         """Return the variance [photo-electrons^2] of a read-out converted to photo-electrons.
 
-        It is excess_noise_factor * (mean_e + dark + background) + (read_noise_e / em_gain)^2, and with
-        `bits` one twelfth of an ADU squared. Saturation and full well are ignored, and the last term is
-        valid if the noise is at least half an ADU.
+        It is excess_noise_factor * (mean_e + dark + background) + (read_noise_e / em_gain)^2, with `bits` one
+        twelfth of an ADU squared, and in blinking pixels a quarter of their step squared. Saturation and full
+        well are ignored, and the term of the ADU is valid if the noise is at least half an ADU.
 
         Parameters
         ----------
@@ -194,7 +275,11 @@ class Detector:
         collected = mean + self._dark_map(mean.shape) + self.background_e
         at_output = np.square(self.read_noise_e)
         if self.bits is not None:
-            at_output = at_output + self.gain_e_per_adu**2 / 12
+            at_output = at_output + np.square(self.gain_e_per_adu / self.relative_gain) / 12
+        if self.blinking_pixels:
+            at_output = np.broadcast_to(at_output, mean.shape[-2:]).copy()
+            for row, column, step in self.blinking_pixels:
+                at_output[row, column] += 0.25 * step**2
         variance: NDArray[np.float64] = self.excess_noise_factor * collected + at_output / self.em_gain**2
         return variance
 
@@ -203,14 +288,14 @@ class Detector:
         mean: NDArray[np.float64] = numbers_between("mean_e", mean_e, 0, LARGEST_MEAN_E)
         if mean.ndim < 2:
             raise InputError(f"mean_e: expected shape (..., rows, columns), got {mean.shape}")
-        for name in ("read_noise_e", "dark_e", "background_e"):
+        for name in _LEVELS:
             expected = np.shape(getattr(self, name))
             if expected not in ((), mean.shape[-2:]):
                 raise InputError(f"mean_e: expected images of shape {expected}, as {name}, got {mean.shape}")
-        for row, column, _ in self.hot_pixels:
+        for row, column, _ in (*self.hot_pixels, *self.blinking_pixels):
             if row >= mean.shape[-2] or column >= mean.shape[-1]:
                 raise InputError(
-                    f"mean_e: hot pixel ({row}, {column}) is outside images of {mean.shape[-2:]}"
+                    f"mean_e: hot or blinking pixel ({row}, {column}) is outside images of {mean.shape[-2:]}"
                 )
         return mean
 
@@ -227,7 +312,7 @@ class Detector:
         self, electrons_out: NDArray[np.float64]
     ) -> NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]:
         """Convert electrons at the output to ADU; round and saturate them if `bits` is set."""
-        adu = self.offset_adu + electrons_out / self.gain_e_per_adu
+        adu = self.offset_adu + self.relative_gain * electrons_out / self.gain_e_per_adu
         if self.bits is None:
             return adu.astype(np.float32)
         whole = np.clip(np.rint(adu), 0, 2**self.bits - 1)
@@ -245,17 +330,17 @@ def _number_or_map(name: str, value: Any) -> float | NDArray[np.float64]:
     return level
 
 
-def _hot_pixels(value: Any) -> tuple[tuple[int, int, float], ...]:
-    """Return hot pixels as (row, column, electrons)."""
+def _single_pixels(name: str, value: Any) -> tuple[tuple[int, int, float], ...]:
+    """Return hot or blinking pixels as (row, column, electrons)."""
     if not isinstance(value, Sequence | np.ndarray):
-        raise InputError(f"hot_pixels: expected a list of (row, column, electrons), got {value!r}")
+        raise InputError(f"{name}: expected a list of (row, column, electrons), got {value!r}")
     if len(value) == 0:
         return ()
-    table = finite_array("hot_pixels", value)
+    table = finite_array(name, value)
     if table.ndim != 2 or table.shape[1] != 3:
-        raise InputError(f"hot_pixels: expected (row, column, electrons) for each, got shape {table.shape}")
-    where = numbers_between("hot_pixels row or column", table[:, :2], 0, 2**31, integer=True)
-    levels = numbers_between("hot_pixels electrons", table[:, 2], 0, LARGEST_MEAN_E)
+        raise InputError(f"{name}: expected (row, column, electrons) for each, got shape {table.shape}")
+    where = numbers_between(f"{name} row or column", table[:, :2], 0, 2**31, integer=True)
+    levels = numbers_between(f"{name} electrons", table[:, 2], 0, LARGEST_MEAN_E)
     return tuple(
         (int(row), int(column), float(level)) for (row, column), level in zip(where, levels, strict=True)
     )

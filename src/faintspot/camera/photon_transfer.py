@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from faintspot.base.checks import finite_array, number_between, numbers_between
 from faintspot.base.errors import InputError
+from faintspot.camera.dark_frames import DarkPixels, dark_pixels
 from faintspot.sensor.layout import Layout
 
 Floats = NDArray[np.float64]
@@ -51,6 +52,8 @@ class DetectorMeasurement:
         flux, or the flux moves too much. The last of `notes` gives the reason.
     notes : tuple of str
         Method used for each value, and problems found.
+    pixels : DarkPixels or None
+        Dark level and noise [ADU] of each pixel, and the pixels that blink or are hot, from dark frames.
     """
 
     read_noise_adu: float
@@ -65,6 +68,7 @@ class DetectorMeasurement:
     bright_gain_e_per_adu: float | None
     reliable: bool
     notes: tuple[str, ...]
+    pixels: DarkPixels | None = None
 
 
 class _Dark(NamedTuple):
@@ -73,6 +77,7 @@ class _Dark(NamedTuple):
     level: Any
     typical: float
     typical_error: float
+    pixels: DarkPixels | None = None
 
 
 class _Value(NamedTuple):
@@ -122,9 +127,10 @@ def measure_detector(
     frames : (n, h, w) array, optional
         Frames [ADU], at least 2 consecutive ones, with flux that moves by less than about 0.2 px.
     darks : (n, h, w) array, optional
-        Frames without flux [ADU], at least 2. The noise of their dark current is included in the read
-        noise. Without them, the read noise is that of the darkest pixels of `frames`, to about 10 % if
-        these get some flux.
+        Frames without flux [ADU], at least 2. They also give dark level and noise of each pixel, and from 10
+        frames on the pixels that blink. The noise of their dark current is included in the read noise.
+        Without them, the read noise is that of the darkest pixels of `frames`, to about 10 % if these get
+        some flux.
     layout : Layout, optional
         Sub-apertures of `frames` to use, each of which moves separately, instead of the whole frame.
     em_gain : float
@@ -191,24 +197,22 @@ def _measure_dark(darks: Floats) -> tuple[_Dark, _Value]:
     """Measure the dark level of each pixel and the read noise of the median pixel."""
     level = darks.mean(axis=0)
     drift = np.median(darks - level, axis=(1, 2))
-    variance = np.var(darks - drift[:, None, None], axis=0, ddof=1)
+    residuals = darks - level - drift[:, None, None]
+    variance = np.var(residuals, axis=0, ddof=1)
     degrees = len(darks) - 1
     # The median of a chi-squared distribution lies below its mean.
     read_noise = math.sqrt(float(np.median(variance)) * degrees / float(chi2.median(degrees)))
     # Variance of the median of many variances: 1.25 times that of their mean.
     relative = 1.25 * math.sqrt(2 / (degrees * level.size))
     spread = 1.25 * 1.4826 * float(np.median(np.abs(level - np.median(level)))) / math.sqrt(level.size)
-    return _Dark(level, float(np.median(level)), spread), _Value(read_noise, 0.5 * relative * read_noise)
+    dark = _Dark(level, float(np.median(level)), spread, dark_pixels(level, residuals))
+    return dark, _Value(read_noise, 0.5 * relative * read_noise)
 
 
 def _dark_without_darks(frames: Floats, dark_level_adu: float | None) -> tuple[_Dark, str]:
     if dark_level_adu is not None:
         level = number_between("dark_level_adu", dark_level_adu)
-        return _Dark(
-            level,
-            level,
-            0.0,
-        ), "dark level: given"
+        return _Dark(level, level, 0.0), "dark level: given"
     mean = frames.mean(axis=0)
     level = float(np.quantile(mean, _DARKEST))
     noise = math.sqrt(float(np.median(np.square(np.diff(frames, axis=0)))) / len(frames))
@@ -368,6 +372,7 @@ def _result(
         bright_gain_e_per_adu=bright and bright.value,
         reliable=problem is None,
         notes=tuple(notes) if problem is None else (*notes, problem),
+        pixels=dark.pixels,
     )
 
 

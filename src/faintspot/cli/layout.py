@@ -17,6 +17,7 @@ from faintspot.camera.calibration import Calibration
 from faintspot.camera.hot_pixels import find_hot_pixels
 from faintspot.cli import layout_grid, layout_options
 from faintspot.cli.commands import SectionedCommand, option
+from faintspot.cli.layout_darks import measured_darks, with_measured_pixels
 from faintspot.cli.layout_options import plain
 from faintspot.cli.needs import suggested_slopes
 from faintspot.cli.output import picture_file
@@ -94,7 +95,8 @@ _OPTIONS = {
 @_camera(
     "--dark",
     metavar="FILE|ADU",
-    help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU.",
+    help="Dark frame, or several (averaged), as FILE[:ARRAY], or a number of ADU. From 10 frames on, the "
+    "read noise of each pixel is measured, and pixels that blink or are hot are masked.",
 )
 @_camera("--flat", metavar="FILE", help="Flat field, or several (averaged), divided by its mean.")
 @_camera(
@@ -197,6 +199,10 @@ def command(
         notes.append(f"  gain: 1 would leave {plain(seen.flux)} electrons of a spot; {likely:g} is assumed")
         calibration = replace(calibration, gain_e_per_adu=likely)
         unit, seen = "e-", first_settings(layout, calibration, first)
+    if (measured := measured_darks(of_camera["dark"])) is not None:
+        keeps_noise = of_camera["read_noise_e"] is not None
+        calibration, lines = with_measured_pixels(calibration, measured, keeps_noise=keeps_noise)
+        notes += lines
     settings = configuration.load(target, "settings") if keeps_settings else seen.settings
     if keeps_settings:
         notes.append(f"  the settings that {output} has are kept")
@@ -355,11 +361,6 @@ def _completed(
             f"  dark {calibration.dark:g} ADU, the frame's background; --dark gives the camera's own"
         )
     if len(hot):
-        known = calibration.bad_pixels
-        if known is None:
-            known = np.empty((0, 2), int)
-        elif known.dtype == np.bool_:
-            known = np.argwhere(known)
-        calibration = replace(calibration, bad_pixels=np.unique(np.concatenate([known, hot]), axis=0))
+        calibration = calibration.with_bad_pixels(hot)
         notes.append(f"  {len(hot)} hot pixels masked")
     return calibration, notes
