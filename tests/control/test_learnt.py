@@ -77,7 +77,7 @@ def test_another_controller_of_the_same_loop(learnt: dict[str, Learnt]) -> None:
     assert (control.prediction, filtered.prediction) == ("none", "controller")
     assert filtered.with_controller("integrator").options == control.options
     assert control.with_controller("integrator") is control
-    with pytest.raises(InputError, match="expected what 'modal' has learnt, got that of 'kalman'"):
+    with pytest.raises(InputError, match="expected a model of controller 'modal', got one of 'kalman'"):
         control.with_controller("modal")
 
 
@@ -91,9 +91,9 @@ def test_what_is_refused(learnt: dict[str, Learnt], tmp_path: Path) -> None:
         assert message in str(caught.value)
 
     kalman = ControlOptions(controller="kalman")
-    refused("model: expected a file with what predictive Kalman filter has learnt, got none", kalman, None)
+    refused("model: expected a file with the learnt model", kalman, None)
     model.save(path)
-    refused("expected what 'polc' has learnt, got that of 'kalman'", ControlOptions(controller="polc"))
+    refused("expected a model of controller 'polc'", ControlOptions(controller="polc"))
     with pytest.raises(InputError, match="which need the camera's read noise"):
         Control(INTERACTION, None, kalman, model).check_errors(Calibration())
     Control(INTERACTION, None, kalman, model).check_errors(Calibration(read_noise_e=1.0))
