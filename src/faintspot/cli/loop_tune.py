@@ -154,11 +154,12 @@ def strehl_table(answer: LoopAnswer) -> Table:
 def gain_table(answer: LoopAnswer) -> Table:
     """Return limiting magnitudes and what is gained over both references as a table."""
     from faintspot.experiments import loop_text
+    from faintspot.experiments.loop_question import REFERENCES
 
     table = results_table("method", "limiting\nmagnitude", "mag over\nwindow", "mag over\nbrightest")
     for name in answer.kinds:
         cells = [loop_text.limit_in_words(answer, name)]
-        for reference in loop_text.REFERENCES:
+        for reference in REFERENCES:
             same = name == reference
             cells.append("" if same else loop_text.gain_in_words(answer, name, reference))
         table.add_row(name, *cells, style="bold" if name == answer.best.name else None)

@@ -104,7 +104,7 @@ class Answer:
         free = [result for result in self.results if Knowledge.of(result.arm.estimator) < Knowledge.SPOT]
         if self.best in free:
             return self.best
-        return min(free, key=lambda result: _finite(result.statistics.corrected_rms.value))
+        return min(free, key=lambda result: result.statistics.ranking_rms)
 
     @property
     def prior_rms_px(self) -> float:
@@ -147,7 +147,7 @@ class Answer:
 
     def _repr_html_(self) -> str:
         rows = {"recommended": f"{self.best.arm.label} ({settings_in_words(self.best.settings)})"}
-        for result in sorted(self.results, key=lambda each: _finite(each.statistics.corrected_rms.value)):
+        for result in sorted(self.results, key=lambda each: each.statistics.ranking_rms):
             rows[result.arm.label] = (
                 f"rms {result.statistics.corrected_rms.value:.3g} px, corrected for the gain; "
                 f"R {result.error_px[self.at_star]:.3g} px"
@@ -192,7 +192,3 @@ def settings_in_words(settings: Settings) -> str:
     for name, value in settings.chosen().items():
         pairs.append(f'{name} "{value}"' if isinstance(value, str) else f"{name} {value:g}")
     return ", ".join(pairs)
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else math.inf

@@ -81,7 +81,7 @@ def promise_lines(answer: Answer) -> list[str]:
     if not promise.contradicted and promise.expected_px > _PLACED * promise.promised_px:
         text += _TEXT("answer.placed", **errors)
     lines = [text]
-    simulated = min(answer.results, key=lambda result: _rms(result.statistics.corrected_rms.value))
+    simulated = min(answer.results, key=lambda result: result.statistics.ranking_rms)
     factor = answer.promises[simulated.arm.name].factor
     if factor > 1 and simulated is not answer.best:
         lines.append(_TEXT("answer.contradicted_best", label=simulated.arm.label, factor=factor))
@@ -92,10 +92,6 @@ def promise_lines(answer: Answer) -> list[str]:
             expected = _TEXT("answer.not_corrected", **errors)
         lines.append(f"{CONTRADICTED}: {expected}{why}")
     return lines
-
-
-def _rms(value: float) -> float:
-    return value if math.isfinite(value) else math.inf
 
 
 def foundations(answer: Answer) -> list[str]:

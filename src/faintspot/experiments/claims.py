@@ -11,6 +11,7 @@ from faintspot.experiments import judges
 from faintspot.experiments.arms import NO_TV, SMOOTHING, TV, TV_OVER_NO_TV
 from faintspot.experiments.curves import Curve, Gain, gain_at_error
 from faintspot.experiments.judges import LEVEL_PX
+from faintspot.experiments.specification import BEST
 from faintspot.experiments.statistics import magnitudes
 from faintspot.experiments.study_curves import (
     Configuration,
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     import xarray
 
 
-BEST_MODE = "best"
 FIXED_MODE = "fixed40"
 
 
@@ -51,7 +51,7 @@ def verdicts(dataset: xarray.Dataset, seed: int = 2015) -> list[Verdict]:
     for number, (text, judge) in enumerate(zip(_TEXT["claims"], judges.JUDGES, strict=True), start=1):
         rule = text["rule"].format(level=LEVEL_PX, equal=judges.EQUAL)
         findings = []
-        for mode in (BEST_MODE, fixed_mode(dataset)):
+        for mode in (BEST, fixed_mode(dataset)):
             rng = np.random.default_rng([seed, number])
             findings.append(Finding(mode, judge(dataset, mode, rng) if mode in modes else []))
         results.append(Verdict(number, text["claim"], rule, *findings))
@@ -87,7 +87,7 @@ def guidance(dataset: xarray.Dataset, seed: int = 2015) -> list[str]:
     if not {NO_TV, TV} <= arms:
         return [_TEXT["guidance.no_tv"]]
     rng = np.random.default_rng(seed)
-    curves = study_curves(dataset, BEST_MODE)
+    curves = study_curves(dataset, BEST)
     best = _compared(curves, rng, SMOOTHING in arms)
     if not best:
         return [_TEXT("guidance.no_gains", level=LEVEL_PX)]

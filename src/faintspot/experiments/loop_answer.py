@@ -26,7 +26,6 @@ from faintspot.experiments.loop_question import (
     BASELINE,
     MODEL_ERROR,
     PLACES,
-    SECOND,
     LoopQuestion,
     known_magnitudes,
     sky_coverage,
@@ -327,6 +326,3 @@ def _interpolation_error(faint: Floats, strehl: Floats, value: float) -> float:
 def _simplicity(kind: ArmKind) -> tuple[Any, ...]:
     own = kind.name != BASELINE, kind.control != INTEGRATOR
     return *own, int(Knowledge.of(kind.estimator)), kind.estimator.cost, kind.name
-
-
-__all__ = ["BASELINE", "SECOND", "Coverage", "Limit", "LoopAnswer"]

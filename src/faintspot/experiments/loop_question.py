@@ -14,6 +14,8 @@ from faintspot.ao_loop.configuration import CLOSED, LoopConfiguration
 from faintspot.base.checks import number_between, numbers_between, one_of
 from faintspot.base.errors import InputError
 from faintspot.control.learning import INTEGRATOR, KALMAN
+from faintspot.estimators.brightest import BrightestPixels
+from faintspot.estimators.window import Window
 from faintspot.experiments.loop_arms import ArmKind, arm_kind
 
 Floats = NDArray[np.float64]
@@ -148,7 +150,7 @@ def _counts(visual: Floats, scale: float, alpha: float, beta: float, power: floa
     return counts
 
 
-BASELINE, SECOND = "window", "brightest"
+REFERENCES = BASELINE, SECOND = Window.name, BrightestPixels.name
 """Baselines of every gain, first and second, both with the integrator."""
 _CANDIDATES = (SECOND, BASELINE, "map_predicted", "window+kalman", "map+kalman")
 _FAINTER = 4.0  # than the faintest star of the configuration: limiting magnitudes are there

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from faintspot.experiments.loop_answer import BASELINE, SECOND, Coverage, LoopAnswer
+from faintspot.experiments.loop_answer import Coverage, LoopAnswer
 from faintspot.experiments.loop_arms import LOOP_GAIN, Choice
-from faintspot.experiments.loop_question import MODEL_ERROR, PLACES, magnitudes_apart
+from faintspot.experiments.loop_question import BASELINE, MODEL_ERROR, PLACES, REFERENCES, magnitudes_apart
 from faintspot.experiments.words import plain_number, with_error
 from faintspot.report.texts import Texts
 
 _TEXT = Texts("faintspot.experiments")
-REFERENCES = (BASELINE, SECOND)
 _SMALLEST_ERROR = 0.001
 
 

@@ -10,9 +10,7 @@ import numpy as np
 
 from faintspot.ao_loop.files import BUDGET_FILE, INTERLEAVED_FILE, MAGNITUDE_FILE
 from faintspot.base.errors import InputError
-from faintspot.estimators.brightest import BrightestPixels
 from faintspot.estimators.total_variation import TotalVariation
-from faintspot.estimators.window import Window
 from faintspot.experiments.loop_analysis import (
     NO_TV,
     TV,
@@ -25,6 +23,7 @@ from faintspot.experiments.loop_analysis import (
     measurements,
 )
 from faintspot.experiments.loop_arms import VARIANTS
+from faintspot.experiments.loop_question import REFERENCES
 from faintspot.experiments.loop_results import (
     BudgetResult,
     InterleavedResult,
@@ -35,8 +34,6 @@ from faintspot.experiments.statistics import Estimate
 from faintspot.experiments.words import with_interval
 
 NOWHERE = "TV raises the Strehl ratio nowhere beyond its error"
-REFERENCES = (Window.name, BrightestPixels.name)
-"""Names of the arms that others are compared with: the strongest that systems run, then the usual one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,6 +99,12 @@ class SlopeStatistics:
     invalid_fraction: Estimate
     """Fraction of slopes that are not valid; they count as they are in everything else."""
 
+    @property
+    def ranking_rms(self) -> float:
+        """The gain-corrected rms; infinite where it is not defined."""
+        rms = self.corrected_rms.value
+        return rms if math.isfinite(rms) else math.inf
+
 
 def slope_statistics(
     x: ArrayLike,

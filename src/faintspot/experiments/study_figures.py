@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from faintspot.algorithms.noise import suggested_strength
 from faintspot.algorithms.total_variation import tv_denoise
 from faintspot.experiments.arms import NO_TV, TV, knows_the_spot, label_of, style_of
-from faintspot.experiments.claims import BEST_MODE, fixed_mode
+from faintspot.experiments.claims import fixed_mode
+from faintspot.experiments.specification import BEST
 from faintspot.experiments.study_curves import kept_panels
 from faintspot.experiments.study_tables import (
     mode_in_words,
@@ -168,7 +169,7 @@ def _axis_of(table: list[dict[str, Any]]) -> str:
 
 def _modes(dataset: xarray.Dataset) -> list[str]:
     known = [str(mode) for mode in dataset["mode"].values]
-    return [mode for mode in (BEST_MODE, fixed_mode(dataset)) if mode in known]
+    return [mode for mode in (BEST, fixed_mode(dataset)) if mode in known]
 
 
 def _lines(
@@ -261,7 +262,7 @@ def _draw_over_k(panel: Axes, dataset: xarray.Dataset, cell: int, label: str, co
         known = np.isfinite(y)
         panel.plot(k[known], y[known], ls=style, color=colour, lw=1.9, label=label if arm == TV else None)
         panel.fill_between(k[known], (y - se)[known], (y + se)[known], color=colour, alpha=0.25, lw=0)
-        chosen = float(part["chosen_k"].sel(mode=BEST_MODE))
+        chosen = float(part["chosen_k"].sel(mode=BEST))
         if np.isfinite(chosen):
             there = y[k == int(chosen)]
             panel.plot([chosen] * len(there), there, "o", color=colour, mfc="white", ms=7, mew=1.6)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from faintspot.experiments.arms import NO_TV, TV, TV_OVER_NO_TV, label_of
-from faintspot.experiments.claims import BEST_MODE, fixed_mode
+from faintspot.experiments.claims import fixed_mode
 from faintspot.experiments.curves import Gain, gain_at_error
 from faintspot.experiments.judges import LEVEL_PX
-from faintspot.experiments.specification import CORRECTED
+from faintspot.experiments.specification import BEST, CORRECTED
 from faintspot.experiments.study_curves import (
     Configuration,
     Finding,
@@ -37,7 +37,7 @@ def mode_in_words(mode: str) -> str:
     """Return "best k", "fixed k = 40", or "best gain-corrected rms"."""
     if mode == CORRECTED:
         return "best gain-corrected rms"
-    return "best k" if mode == BEST_MODE else f"fixed k = {mode.removeprefix('fixed')}"
+    return "best k" if mode == BEST else f"fixed k = {mode.removeprefix('fixed')}"
 
 
 def parameters_of(dataset: xarray.Dataset, cells: Sequence[int]) -> list[dict[str, Any]]:

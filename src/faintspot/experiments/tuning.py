@@ -359,8 +359,7 @@ def _ranked(
     """
 
     def corrected(result: ArmResult) -> float:
-        rms = result.statistics.corrected_rms.value * factors.get(result.arm.name, 1.0)
-        return rms if math.isfinite(rms) else math.inf
+        return result.statistics.ranking_rms * factors.get(result.arm.name, 1.0)
 
     best = min(results, key=corrected)
     equal = [best]
