@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from pathlib import Path
-
 import pytest
-from tests.experiments.study_cases import dataset, power_law
 
 from faintspot.base.errors import InputError
 from faintspot.experiments import built_in_studies as paper
-from faintspot.experiments.study_page import write_study_report
-from faintspot.report import drawing
 
 
 def test_full_study_has_every_figure_of_the_paper() -> None:
@@ -57,17 +51,3 @@ def test_one_figure(name: str, quick: bool) -> None:
 def test_bad_figures_are_refused(figures: list[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         paper.paper_study(figures=figures)
-
-
-def test_report_writes_page_pictures_and_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing, "DOTS_PER_INCH", 20)
-    specification = paper.paper_study(quick=True, figures=["fig3"])
-    data = dataset([asdict(cell) for cell in specification.cells()], power_law(lambda *_: 1.0))
-    data.attrs["specification"] = specification.to_text()
-    written = write_study_report(data, tmp_path / "study.html")
-    names = [path.relative_to(tmp_path).as_posix() for path in written]
-    assert names[0] == "study.html"
-    assert {"study-figures/fig1.png", "study-figures/fig3.svg", "study-figures/fig3.csv"} <= set(names)
-    assert all(path.stat().st_size > 100 for path in written)
-    with pytest.raises(InputError, match="does not exist"):
-        write_study_report(data, tmp_path / "nowhere" / "study.html")

@@ -15,7 +15,6 @@ from faintspot.base.errors import InputError
 from faintspot.experiments import built_in_studies as paper
 from faintspot.experiments.specification import StudySpecification, Sweep
 from faintspot.experiments.study_page import report_of_study, study_report
-from faintspot.report.drawing import svg
 
 pytestmark = pytest.mark.usefixtures("undrawn_pictures")
 
@@ -67,15 +66,6 @@ class TestPage:
         data = of(paper.paper_study(quick=True, figures=["fig3"]))
         html = study_report(data.sel(arm=["brightest", "smoothed"], arm2=["brightest", "smoothed"]))
         assert "No verdicts" in html
-
-
-def test_pictures_are_svg_without_the_time_of_day() -> None:
-    from faintspot.experiments.study_figures import sweep_figure
-
-    data = of(paper.paper_study(quick=True, figures=["fig3"]))
-    first, second = (svg(sweep_figure(data, [0, 1], "a", "b").figure) for _ in range(2))
-    assert first == second
-    assert b"<svg" in first
 
 
 def test_study_without_a_finished_cell_is_refused() -> None:
