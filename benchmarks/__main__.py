@@ -29,6 +29,7 @@ _ORDER = (
     "realtime",
     "realtime_loop",
     "advice",
+    "telemetry",
     "live_page",
     "latency",
     "realtime_sustained",

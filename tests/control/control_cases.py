@@ -28,7 +28,7 @@ LAYERS = SlopeModel.of_covariances(np.array([layer.lagged_px2(FRAME_S) for layer
 INTERACTION = np.random.default_rng(1).standard_normal((18, 12))
 ERRORS = np.full(18, 0.3)
 PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
-PHASE = residual_phase(PLANT.reconstructor, INTERACTION, CELLS.astype(int))
+PHASE = residual_phase(PLANT.reconstructor.matrix, INTERACTION, CELLS.astype(int))
 
 
 def telemetry(

@@ -30,7 +30,7 @@ def _slopes_of_corners() -> np.ndarray:
 
 INTERACTION = _slopes_of_corners()
 PLANT = Plant(INTERACTION, make_reconstructor(INTERACTION), 2, 0.01)
-PHASE = residual_phase(PLANT.reconstructor, INTERACTION, CELLS)
+PHASE = residual_phase(PLANT.reconstructor.matrix, INTERACTION, CELLS)
 
 
 def test_it_is_the_variance_of_the_commands_surface() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,15 @@ from faintspot.base.errors import InputError
 from faintspot.camera.calibration import Calibration
 from faintspot.sensor.layout import Layout
 from faintspot.training.psf_learning import learn_psf_from_images
-from faintspot.turbulence.seeing import estimate_r0
+from faintspot.turbulence.seeing import estimate_r0, slope_variance
 from faintspot.turbulence.slope_covariance import SlopeTurbulence
 
 Floats = NDArray[np.float64]
 
 OUTER_SCALE_M = 25.0
 """Outer scale assumed for r0 and wind [m]."""
+_SCALE_SPREAD = 0.7  # of the logarithm of the outer scale, where it is assumed
+_THEORY_ERROR = 0.03  # of r0: centroids are not quite mean gradients over squares
 _STRETCHES = 5  # parts of the telemetry whose scatter gives an error
 _FEWEST_IMAGES = 10
 _FEWEST_OF_STRETCH = 40  # frames
@@ -46,6 +49,25 @@ class Measured:
     """Standard error; NaN if it is not known."""
     remark: str = ""
     """Reason why it is not known, or assumptions of the value."""
+
+    def with_relative_error(self, more: float) -> Measured:
+        """Return the quantity with a further independent error, relative to its value."""
+        return replace(self, error=math.hypot(self.error, more * self.value))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval; of positive values with small errors it is that of the logarithm."""
+        if not self.value > 0 or self.error > 0.5 * self.value:
+            return self.value - 1.96 * self.error, self.value + 1.96 * self.error
+        factor = math.exp(1.96 * self.error / self.value)
+        return self.value / factor, self.value * factor
+
+    def as_values(self) -> dict[str, Any]:
+        """Return plain values, for JSON; None is not known."""
+        low, high = self.interval
+        numbers = {"value": self.value, "error": self.error, "low": low, "high": high}
+        plain = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        return {"name": self.name, "unit": self.unit, **plain, "remark": self.remark}
 
     def in_words(self) -> str:
         """Format the quantity as a line of text."""
@@ -143,6 +165,81 @@ def _r0(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout,
     return _of_stretches(
         kind, whole, [estimated(part) for part in parts], f"outer scale {OUTER_SCALE_M:g} m assumed"
     )
+
+
+def outer_scale_and_r0(
+    atmosphere: Floats,
+    run: NDArray[np.int64],
+    site: SlopeTurbulence,
+    vibration_px2: float,
+    known_m: float | None,
+) -> list[Measured]:
+    """Return outer scale and r0 from the variance of slopes with and without their mean over the pupil.
+
+    Parameters
+    ----------
+    atmosphere : (frames, 2 n) array
+        Open-loop slopes.
+    run : (frames,) array of int
+        Frames with the same number are consecutive.
+    site : SlopeTurbulence
+        Geometry.
+    vibration_px2 : float
+        Variance of the slopes due to vibrations.
+    known_m : float, optional
+        Outer scale, where it is known; else 25 m are assumed within a factor of two, and corrected.
+    """
+    cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
+    static, without_tilt = atmosphere.mean(axis=0), len(cells) > 2
+
+    def r0_m(rows: NDArray[np.int64], scale_m: float, without_tilt: bool = without_tilt) -> float:
+        return estimate_r0(
+            atmosphere[rows],
+            cells=cells,
+            subaperture_m=site.subaperture_m,
+            pixel_scale_rad=site.pixel_scale_rad,
+            outer_scale_m=scale_m,
+            segment=run[rows],
+            static_px=static,
+            remove_tip_tilt=without_tilt,
+        ).r0_m
+
+    def share(rows: NDArray[np.int64]) -> float:
+        within, total = (
+            r0_m(rows, OUTER_SCALE_M, each) ** (-5 / 3)
+            * slope_variance(site.subaperture_m, OUTER_SCALE_M, positions=site.positions_m if each else None)
+            for each in (True, False)
+        )
+        return float(within / max(total - vibration_px2 * site.pixel_scale_rad**2, within))
+
+    whole, parts = np.arange(len(atmosphere)), np.array_split(np.arange(len(atmosphere)), _STRETCHES)
+    if known_m is not None:
+        outer = Measured("outer scale", "m", known_m, 0.0, "given")
+    elif without_tilt:
+        outer = _outer_scale(site, share(whole), [share(part) for part in parts])
+    else:
+        outer = Measured("outer scale", "m", OUTER_SCALE_M, _SCALE_SPREAD * OUTER_SCALE_M, "assumed")
+    values = [r0_m(rows, outer.value) for rows in (whole, *parts)]
+    found = _of_stretches(Measured("r0 at 500 nm", "m"), values[0], values[1:], "")
+    if not math.isfinite(found.value):
+        return [outer, found]
+    change = (r0_m(whole, 1.2 * outer.value) / found.value - 1) / 0.2
+    of_scale = change * outer.error / outer.value
+    error = math.hypot(1.4 * found.error, found.value * math.hypot(of_scale, _THEORY_ERROR))
+    return [outer, Measured(found.name, found.unit, found.value, error)]
+
+
+def _outer_scale(site: SlopeTurbulence, whole: float, parts: list[float]) -> Measured:
+    """Return the outer scale from the share of the slopes' variance that is not their mean over the pupil."""
+    scales = np.geomspace(4.0, 160.0, 9)
+    side, positions = site.subaperture_m, site.positions_m
+    theory = [slope_variance(side, each, positions=positions) / slope_variance(side, each) for each in scales]
+    logarithms = np.interp([whole, *parts], theory[::-1], np.log(scales)[::-1])
+    scatter = float(np.std(logarithms[1:], ddof=1)) / math.sqrt(len(parts))
+    weight = _SCALE_SPREAD**-2 / (_SCALE_SPREAD**-2 + (1.4 * max(scatter, 0.05)) ** -2)
+    value = math.exp(weight * math.log(OUTER_SCALE_M) + (1 - weight) * logarithms[0])
+    remark = f"{OUTER_SCALE_M:g} m within a factor of two was expected"
+    return Measured("outer scale", "m", value, value * _SCALE_SPREAD * math.sqrt(weight), remark)
 
 
 def _wind(kind: Measured, seen: LoopTelemetry, atmosphere: Floats, layout: Layout, side: float) -> Measured:

@@ -26,6 +26,7 @@ _COMMANDS = {
     "report": "Write a web page of pictures and tables from slopes, studies or telemetry.",
     "slopes": "Measure slopes from recorded frames.",
     "study": "Measure the slope error by Monte-Carlo simulation.",
+    "telemetry": "Report noise, turbulence, vibrations and control of a recorded loop.",
     "tune": "Recommend an estimator and settings for a camera and a star.",
     "wavefront": "Fit Zernike modes to slopes, and draw the wavefront.",
 }

@@ -34,7 +34,8 @@ __all__ = ["CONTROLS", "INTEGRATOR", "KALMAN", "MODAL", "POLC", "Learnt", "Plant
 Floats = NDArray[np.float64]
 
 
-_GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
+GAINS = (0.03, 0.05, 0.07, 0.1, 0.13, 0.16, 0.2, 0.25, 0.3, 0.36, 0.43, 0.5, 0.6, 0.7, 0.8)
+"""Gains of an integrator that are tried."""
 _POLC_GAINS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.65)
 _LARGEST_PART = 0.85  # of the gain at which a mode would be unstable where slopes are fully trusted
 
@@ -66,7 +67,7 @@ def learn(
         Factor on the noise variance that telemetry shows.
     """
     cells = np.rint(site.positions_m[:, ::-1] / site.subaperture_m).astype(np.int64)
-    phase = residual_phase(plant.reconstructor, plant.interaction, cells)
+    phase = residual_phase(plant.reconstructor.matrix, plant.interaction, cells)
     gain, plain_left = _best_gain(lambda gain: partial(plant.integrator, gain), plant, telemetry, phase)
     if kind == MODAL:
         return Learnt(plant, _modal(plant, telemetry, gain, plain_left, phase))
@@ -136,7 +137,7 @@ def _best_gain(
     plant: Plant,
     telemetry: OpenLoopTelemetry,
     phase: Floats,
-    gains: Sequence[float] = _GAINS,
+    gains: Sequence[float] = GAINS,
 ) -> tuple[float, float]:
     """Return the gain with the smallest residual on the telemetry, and that residual."""
     left = [plant.left(made(gain), telemetry, phase) for gain in gains]

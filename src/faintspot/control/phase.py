@@ -9,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from faintspot.control.reconstructor import Reconstructor
-
 Floats = NDArray[np.float64]
 
 _CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
@@ -18,7 +16,7 @@ _UNSEEN = 0.05  # of the largest singular value: piston and waffle, which slopes
 _MASS = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6  # products of linear elements, integrated over a side
 
 
-def residual_phase(reconstructor: Reconstructor, interaction: Floats, cells: ArrayLike) -> Floats:
+def residual_phase(matrix: Floats, interaction: Floats, cells: ArrayLike) -> Floats:
     """Return the matrix (commands, 2 n) from slopes to amplitudes whose sum of squares is the phase variance.
 
     The slopes' commands cause a wavefront that is bilinear between the corners of the sub-apertures (Fried
@@ -26,7 +24,8 @@ def residual_phase(reconstructor: Reconstructor, interaction: Floats, cells: Arr
 
     Parameters
     ----------
-    reconstructor : Reconstructor
+    matrix : (commands, 2 n) array
+        From slopes to commands, as of a `Reconstructor`.
     interaction : (2 n, commands) array
         Slopes for a unit of each command.
     cells : (n, 2) array of int
@@ -37,7 +36,7 @@ def residual_phase(reconstructor: Reconstructor, interaction: Floats, cells: Arr
     corners -= mean @ corners
     values, vectors = np.linalg.eigh(corners.T @ mass @ corners)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return np.asarray(root @ reconstructor.matrix)
+    return np.asarray(root @ matrix)
 
 
 def _corner_geometry(cells: NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:

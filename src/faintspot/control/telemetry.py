@@ -101,10 +101,7 @@ def replayed(
     delay_frames: int,
     settle_frames: int = 0,
 ) -> float:
-    """Return the mean square residual that a controller would have left on recorded frames.
-
-    The commands that it would have sent are added to the recorded open-loop slopes. As these commands do not
-    know the noise of the frame that they act in, that noise adds the same to every controller's result.
+    """Return the mean square residual that a controller would have left: the mean of `replayed_frames`.
 
     Parameters
     ----------
@@ -117,6 +114,25 @@ def replayed(
     delay_frames, settle_frames : int
         Frames at the start that are not scored.
     """
+    frames = replayed_frames(make, telemetry, interaction, phase, delay_frames)
+    seen = float(frames[settle_frames:].mean())
+    share = np.square(telemetry.trust[settle_frames:]).mean()
+    return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
+
+
+def replayed_frames(
+    make: Callable[[CommandDelayLine], Controller],
+    telemetry: OpenLoopTelemetry,
+    interaction: Floats,
+    phase: Floats,
+    delay_frames: int,
+) -> Floats:
+    """Return the squared residual that a controller would have left on recorded frames, (frames,).
+
+    The commands that it would have sent are added to the recorded open-loop slopes. As these commands do not
+    know the noise of the frame that they act in, that noise adds the same to every controller's result.
+    Parameters are those of `replayed`; slopes count by `OpenLoopTelemetry.trust`.
+    """
     line = CommandDelayLine(interaction.shape[1], delay_frames)
     controller = make(line)
     error = np.sqrt(telemetry.variance_px2)
@@ -127,9 +143,7 @@ def replayed(
             trust = telemetry.trust[frame]
             left[frame] = trust * residual
             controller.update(as_estimated(residual, trust, controller), error[frame])
-        seen = np.square(left[settle_frames:] @ phase.T).sum(axis=1).mean()
-    share = np.square(telemetry.trust[settle_frames:]).mean()
-    return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
+        return np.asarray(np.square(left @ phase.T).sum(axis=1))
 
 
 def as_estimated(slopes_px: Floats, trust: Floats, controller: Controller) -> Floats:

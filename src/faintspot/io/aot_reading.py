@@ -26,6 +26,20 @@ from faintspot.sensor.layout import Layout
 _PIXELS = ("pix", "pixel", "px")
 
 
+@dataclass(frozen=True, eq=False)
+class AotLoop:
+    """A control loop of an AOT file that a sensor drives; missing data are None."""
+
+    is_closed: bool
+    commands: NDArray[np.float64] | None
+    """(t, commands)"""
+    control_matrix: NDArray[np.float64] | None
+    """(commands, 2 n): slopes all x, then all y."""
+    frame_rate_hz: float | None
+    delay_frames: float | None
+    """From the middle of an exposure to the middle of its command."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class AotSensor:
     """A Shack-Hartmann sensor of an AOT file, with the data that the file holds; missing data are None.
@@ -64,6 +78,13 @@ class AotSensor:
     """Flux as stored, (t, n)."""
     interaction: NDArray[np.float64] | None
     """Interaction matrix of the first loop with one, (2 n, commands): all x, then all y, per unit command."""
+    loop: AotLoop | None
+    """First loop with commands, else the first one."""
+    cells: NDArray[np.int64] | None
+    """(n, 2): row and column of each sub-aperture."""
+    diameter_m: float | None
+    """Diameter of the telescope's pupil."""
+    pixel_scale_arcsec: float | None
 
     def __repr__(self) -> str:
         """Return the name, the number of sub-apertures and the available data."""
@@ -148,9 +169,7 @@ def read_aot(path: str | Path, sensor: str | None = None) -> AotSensor:
     sensors = [each for each in system.wavefront_sensors if isinstance(each, aotpy.ShackHartmann)]
     found = _chosen(path, sensors, sensor)
     loops = [
-        each
-        for each in system.loops
-        if isinstance(each, aotpy.ControlLoop) and each.input_sensor is found and each.interaction_matrix
+        each for each in system.loops if isinstance(each, aotpy.ControlLoop) and each.input_sensor is found
     ]
     try:
         return _sensor(path, found, system, loops)
@@ -199,6 +218,7 @@ def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
     if slopes is not None and slopes.shape[1:] != (2, n):
         raise InputError(f"measurements: expected shape (t, 2, {n}), got {slopes.shape}")
     numbers, times = _time_of(found.measurements)
+    scale = _number(found.detector, "pixel_scale")
     return AotSensor(
         path,
         str(found.uid),
@@ -214,22 +234,46 @@ def _sensor(path: Path, found: Any, system: Any, loops: list[Any]) -> AotSensor:
         numbers,
         times,
         flux,
-        _interaction(loops, n),
+        _interaction([each for each in loops if each.interaction_matrix], n),
+        _loop(loops, n),
+        _cells(found, n),
+        _number(system.main_telescope, "enclosing_diameter"),
+        None if scale is None else scale * 180 / np.pi * 3600,
     )
+
+
+def _loop(loops: list[Any], n: int) -> AotLoop | None:
+    """Return the first loop with commands, else the first one."""
+    if not loops:
+        return None
+    found = next((each for each in loops if _data_of(each, "commands") is not None), loops[0])
+    commands, control = (_data_of(found, name) for name in ("commands", "control_matrix"))
+    if commands is not None and commands.ndim != 2:
+        raise InputError(f"commands: expected shape (t, commands), got {commands.shape}")
+    if control is not None and control.shape[1:] != (2, n):
+        raise InputError(f"control_matrix: expected shape (commands, 2, {n}), got {control.shape}")
+    return AotLoop(
+        bool(found.closed),
+        None if commands is None else commands.astype(np.float64),
+        None if control is None else control.reshape(len(control), -1).astype(np.float64),
+        _number(found, "framerate"),
+        _number(found, "delay"),
+    )
+
+
+def _number(owner: Any, name: str) -> float | None:
+    """Return a positive number, or None."""
+    value = None if owner is None else getattr(owner, name)
+    return float(value) if value is not None and np.isfinite(value) and value > 0 else None
 
 
 def _layout(found: Any, n: int, size: tuple[int, int] | None) -> Layout | None:
     """Return the layout, in AOT a grid of squares of pixels; None if data for it are missing."""
-    mask = _data_of(found, "subaperture_mask")
-    if mask is None or not found.mask_offsets or found.subaperture_size is None:
+    cells = _cells(found, n)
+    if cells is None or not found.mask_offsets or found.subaperture_size is None:
         return None
     if len(found.mask_offsets) != 1:
         raise InputError(f"mask_offsets: expected one, got {len(found.mask_offsets)}")
-    places = np.argwhere(mask >= 0)
-    numbers = mask[mask >= 0]
-    if not np.array_equal(np.sort(numbers), np.arange(n)):
-        raise InputError(f"subaperture_mask: expected the numbers 0 to {n - 1}, each once, got other numbers")
-    cells = places[np.argsort(numbers)]
     side, offset = float(found.subaperture_size), found.mask_offsets[0]
     first = np.array([float(offset.y), float(offset.x)])
     corners = np.rint(finite_array("mask_offsets", first) + cells * side).astype(np.int64)
@@ -238,6 +282,17 @@ def _layout(found: Any, n: int, size: tuple[int, int] | None) -> Layout | None:
         bottom, right = (corners + window).max(axis=0).tolist()
         size = bottom, right
     return Layout(size, (window, window), corners, cells=cells)
+
+
+def _cells(found: Any, n: int) -> NDArray[np.int64] | None:
+    """Return row and column of the sub-apertures, (n, 2); None without a mask."""
+    mask = _data_of(found, "subaperture_mask")
+    if mask is None:
+        return None
+    numbers = mask[mask >= 0]
+    if not np.array_equal(np.sort(numbers), np.arange(n)):
+        raise InputError(f"subaperture_mask: expected the numbers 0 to {n - 1}, each once, got other numbers")
+    return np.argwhere(mask >= 0)[np.argsort(numbers)]
 
 
 def _reference(found: Any, n: int) -> NDArray[np.float64] | None:

@@ -1,0 +1,185 @@
+"""What other controllers would have left of the turbulence of a recorded loop, by replay of its slopes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.advice.measured import Measured
+from faintspot.advice.open_loop import OpenLoop
+from faintspot.advice.recorded_loop import ARCSEC, RecordedLoop
+from faintspot.base.errors import InputError
+from faintspot.control.learning import GAINS, KALMAN, learn
+from faintspot.control.learnt import SETTLE_FRAMES, Make, Plant
+from faintspot.control.loop_delay import LoopDelay
+from faintspot.control.phase import residual_phase
+from faintspot.control.reconstructor import make_reconstructor
+from faintspot.control.telemetry import OpenLoopTelemetry, replayed_frames
+from faintspot.experiments.statistics import mean_by_blocks
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+BEST, AS_RUN, FILTER = "integrator, best gain", "as it ran", "predictive Kalman filter"
+FEWEST_FRAMES = 600
+_MOST_SLOPES = 500  # beyond, the filter takes too long to learn
+_LEAK = 0.01
+_BLOCKS = 12
+_FITTING, _FITTING_ERROR = 0.28, 0.04  # rad^2 at (sub-aperture / r0)^(5/3): continuous mirrors
+_R0_WAVELENGTH_NM = 500.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A controller and what it would have left in the second half of the recording."""
+
+    name: str
+    residual: Measured
+    """Wavefront that the mirror could have corrected, rms."""
+    less: Measured
+    """Root of the variance that the loop as it ran has left more; below 0: less."""
+    total: Measured
+    """With the fitting error."""
+    strehl: Measured
+    gain: float = math.nan
+    """Of an integrator."""
+
+    def as_values(self) -> dict[str, Any]:
+        """Return plain values."""
+        names = ("residual", "less", "total", "strehl")
+        gain = self.gain if math.isfinite(self.gain) else None
+        return {"name": self.name, "gain": gain, **{name: getattr(self, name).as_values() for name in names}}
+
+
+def compared_choices(
+    loop: RecordedLoop, seen: OpenLoop, delay: LoopDelay, site: SlopeTurbulence, r0: Measured
+) -> list[Choice]:
+    """Replay integrators of several gains and a predictive filter that learns from the first half.
+
+    Raises
+    ------
+    InputError
+        When there are too few frames, or the mirror cannot be controlled by the slopes.
+    """
+    telemetry, frames = seen.telemetry, len(seen.telemetry)
+    assert loop.interaction is not None
+    if frames < FEWEST_FRAMES:
+        raise InputError(f"{frames} frames, expected {FEWEST_FRAMES} for a replay")
+    reconstructor = make_reconstructor(loop.interaction)
+    plant = Plant(loop.interaction, reconstructor, max(1, round(delay.delay_frames)), _LEAK)
+    phase = residual_phase(reconstructor.clean, loop.interaction, loop.cells)
+    scored = telemetry.part(frames // 2, frames)
+    noise = float(seen.variance @ np.square(phase).sum(axis=0))
+    noise_error = noise * float(seen.variance_error.mean()) / math.sqrt(len(reconstructor.modes.T))
+    scale = _Scale.of(loop, r0, delay)
+
+    def left(make: Make) -> Floats:
+        found = replayed_frames(make, scored, plant.interaction, phase, plant.delay_frames)
+        return found[SETTLE_FRAMES:][_whole(scored)[SETTLE_FRAMES:]]
+
+    def integrator(gain: float) -> Floats:
+        return left(partial(plant.integrator, gain))
+
+    ran = None
+    if loop.is_closed and loop.commands is not None:
+        residual = seen.residual[frames // 2 :]
+        ran = np.square(residual @ phase.T).sum(axis=1)[SETTLE_FRAMES:][_whole(scored)[SETTLE_FRAMES:]]
+    compare = partial(_choice, ran=ran, noise=(noise, noise_error), scale=scale)
+    found = [] if ran is None else [compare(AS_RUN, ran)]
+    first = telemetry.part(0, frames // 2)
+    if len(seen.variance) <= _MOST_SLOPES:
+        learnt = learn(KALMAN, plant, first, site, loop.frame_rate_hz)
+        best = learnt.model.plain_gain
+        own = learnt.model.controller
+        found.append(compare(FILTER, left(lambda line: own(plant, line))))
+    else:
+        ranked = [plant.left(partial(plant.integrator, gain), first, phase) for gain in GAINS]
+        best = GAINS[int(np.argmin(ranked))]
+    found.insert(len(found) - 1, compare(BEST, integrator(best), gain=best))
+    for gain in GAINS[1::2]:
+        values = integrator(gain)
+        if np.isfinite(values).all():
+            found.append(compare("integrator", values, gain=gain))
+    return [_at_gain(each, delay.gain) for each in found]
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """From the unit of phases to wavefronts and the Strehl ratio."""
+
+    unit: str
+    factor: float
+    fitting_nm2: float
+    fitting_error_nm2: float
+    wavelength_nm: float
+    gain_error: float
+    """Relative error of variances due to the centroid gain: spots that move far have another one."""
+
+    @classmethod
+    def of(cls, loop: RecordedLoop, r0: Measured, delay: LoopDelay) -> _Scale:
+        gain_error = math.hypot(1 - delay.gain, 2 * np.nan_to_num(delay.gain_error))
+        if loop.subaperture_m is None or loop.pixel_scale_arcsec is None:
+            unit = f"{loop.slope_unit} x sub-aperture"
+            return cls(unit, 1.0, math.nan, math.nan, math.nan, gain_error)
+        factor = loop.pixel_scale_arcsec * ARCSEC * loop.subaperture_m * 1e9
+        square = (loop.subaperture_m / r0.value) ** (5 / 3) * (_R0_WAVELENGTH_NM / (2 * math.pi)) ** 2
+        error = square * math.hypot(_FITTING_ERROR, _FITTING * 5 / 3 * r0.error / r0.value)
+        return cls("nm", factor, _FITTING * square, error, loop.science_wavelength_m * 1e9, gain_error)
+
+
+def _choice(
+    name: str,
+    left: Floats,
+    ran: Floats | None,
+    noise: tuple[float, float],
+    scale: _Scale,
+    gain: float = math.nan,
+) -> Choice:
+    block = max(1, len(left) // _BLOCKS)
+    mean = mean_by_blocks(left, block)
+    square = scale.factor**2 * (mean.value - noise[0])
+    error = math.hypot(scale.factor**2 * math.hypot(mean.standard_error, noise[1]), scale.gain_error * square)
+    less = Measured("less than as it ran", scale.unit, remark="the loop was open")
+    if ran is not None:
+        difference = mean_by_blocks(ran - left, block)
+        squares = scale.factor**2 * difference.value, scale.factor**2 * difference.standard_error
+        less = _root(less.name, scale.unit, *squares)
+    total = square + scale.fitting_nm2
+    total_error = math.hypot(error, scale.fitting_error_nm2)
+    wave = (2 * math.pi / scale.wavelength_nm) ** 2
+    strehl = math.exp(-wave * total) if math.isfinite(total) else math.nan
+    remark = "" if math.isfinite(total) else "r0, pixel_scale_arcsec or subaperture_m is not known"
+    return Choice(
+        name,
+        _root("residual", scale.unit, square, error),
+        less,
+        _root("with the fitting error", scale.unit, total, total_error, remark),
+        Measured("Strehl ratio", "", min(strehl, 1.0), strehl * wave * total_error, remark),
+        gain,
+    )
+
+
+def _root(name: str, unit: str, square: float, error: float, remark: str = "") -> Measured:
+    """Return the root of a variance, with its sign."""
+    if not math.isfinite(square):
+        return Measured(name, unit, remark=remark)
+    root = math.copysign(math.sqrt(abs(square)), square)
+    if name == "residual" and square < error:
+        return Measured(name, unit, remark=f"less than {math.sqrt(max(square, 0.0) + 2 * error):.3g}")
+    return Measured(name, unit, root, error / max(2 * abs(root), math.sqrt(error), 1e-12), remark)
+
+
+def _whole(telemetry: OpenLoopTelemetry) -> NDArray[np.bool_]:
+    """Return the frames in which all slopes were measured, or half of the most."""
+    share = telemetry.trust.mean(axis=1)
+    return np.asarray(share >= max(0.999 * float(share.max()), 1e-9))
+
+
+def _at_gain(choice: Choice, gain: float) -> Choice:
+    """Return a choice whose integrator's gain is that of slopes as measured."""
+    return Choice(**{**vars(choice), "gain": choice.gain / gain})

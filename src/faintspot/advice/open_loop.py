@@ -1,0 +1,110 @@
+"""Open-loop slopes of a recorded loop, and the noise that they show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintspot.advice.recorded_loop import ARCSEC, RecordedLoop
+from faintspot.base.errors import InputError
+from faintspot.control.loop_delay import LoopDelay
+from faintspot.control.recording import OUTER_SCALE_M
+from faintspot.control.telemetry import LEAST_VARIANCE_PX2, OpenLoopTelemetry
+from faintspot.turbulence.slope_covariance import SlopeTurbulence
+
+Floats = NDArray[np.float64]
+
+FEWEST_FRAMES = 200
+_MOST_LOST = 0.3  # of the frames; with more, the longest run without a gap is used
+_LEAST_SIGNAL = 1e-6  # of the slopes' variance, that their noise is taken to have
+
+
+@dataclass(frozen=True, eq=False)
+class OpenLoop:
+    """Slopes of a recording on a regular grid of frames, in the interaction matrix's slopes."""
+
+    telemetry: OpenLoopTelemetry
+    residual: Floats
+    """(frames, 2 n)"""
+    run: NDArray[np.int64]
+    """(frames,): numbers of runs without a gap."""
+    variance_error: Floats
+    """(2 n,): relative standard error of the noise's variance."""
+
+    @property
+    def variance(self) -> Floats:
+        """(2 n,): of the noise."""
+        return np.asarray(np.min(self.telemetry.variance_px2, axis=0))
+
+
+def site_of_loop(loop: RecordedLoop) -> SlopeTurbulence:
+    """Return the geometry; unknown scales are 1 m and 1 arcsec, which only r0 and winds depend on."""
+    side, scale = loop.subaperture_m or 1.0, (loop.pixel_scale_arcsec or 1.0) * ARCSEC
+    outer = loop.outer_scale_m or OUTER_SCALE_M
+    positions = np.asarray(loop.cells[:, ::-1] * side, np.float64)
+    return SlopeTurbulence(positions, side, scale, 0.15, outer, np.ones(1), np.zeros((1, 2)))
+
+
+def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return a number for each frame, the same for consecutive ones, (frames,)."""
+    return np.cumsum(np.diff(frame, prepend=frame[0] - 1) > 1).astype(np.int64)
+
+
+def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
+    """Return open-loop slopes, with the noise that deviations from a parabola in time show.
+
+    Raises
+    ------
+    InputError
+        When fewer than 200 frames have known commands, or are without a gap where many are lost.
+    """
+    held, usable = _held(loop, delay)
+    usable &= np.isfinite(loop.slopes).any(axis=1)
+    rows = np.flatnonzero(usable)
+    if not len(rows) or np.ptp(loop.frame[rows]) + 1 > (1 + _MOST_LOST) * len(rows):
+        runs = runs_of(loop.frame[rows]) if len(rows) else rows
+        rows = rows[runs == np.bincount(runs).argmax()] if len(rows) else rows
+    if len(rows) < FEWEST_FRAMES:
+        raise InputError(f"{len(rows)} frames with known commands, expected {FEWEST_FRAMES}")
+    place = loop.frame[rows] - loop.frame[rows[0]]
+    grid = np.full((2, int(place[-1]) + 1, loop.slopes.shape[1]), np.nan)
+    grid[:, place] = loop.slopes[rows] / delay.gain
+    grid[1, place] -= held[rows]
+    with np.errstate(invalid="ignore"):
+        grid -= np.nansum(grid, axis=1, keepdims=True) / np.isfinite(grid).sum(axis=1, keepdims=True)
+    residual, atmosphere = grid
+    measured = np.isfinite(atmosphere)
+    variance, count = _noise_variance(atmosphere)
+    variance = np.maximum(variance, max(LEAST_VARIANCE_PX2, _LEAST_SIGNAL * float(np.nanvar(atmosphere))))
+    telemetry = OpenLoopTelemetry(
+        np.where(measured, atmosphere, 0.0), np.where(measured, variance, np.inf), measured.astype(np.float64)
+    )
+    runs = np.repeat(runs_of(place), np.diff(place, append=place[-1] + 1))
+    # Products of Gaussian noise with its deviation from a parabola have this variance.
+    error = np.sqrt(2.5 / np.maximum(count, 1))
+    return OpenLoop(telemetry, np.where(measured, residual, 0.0), runs, error)
+
+
+def _held(loop: RecordedLoop, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return what the mirror added to the slopes of each frame, and whether that is known."""
+    held, known = np.zeros_like(loop.slopes), np.ones(len(loop.slopes), np.bool_)
+    if loop.commands is None or loop.interaction is None or not loop.is_closed:
+        return held, known
+    whole, part = int(delay.delay_frames), delay.delay_frames % 1
+    caused = loop.commands @ loop.interaction.T
+    for lag, share in ((whole, 1 - part), (whole + 1, part)):
+        if share > 0:
+            held[lag:] += share * caused[: len(caused) - lag]
+            known[:lag] = False
+            known[lag:] &= loop.frame[lag:] - loop.frame[: len(caused) - lag] == lag
+    return held, known
+
+
+def _noise_variance(slopes: Floats) -> tuple[Floats, Floats]:
+    """Return the variance of each slope's noise, and the number of frames that it is from."""
+    near, far = slopes[3:-1] + slopes[1:-3], slopes[4:] + slopes[:-4]
+    products = slopes[2:-2] * (slopes[2:-2] - (4 * near - far) / 6)
+    count = np.isfinite(products).sum(axis=0)
+    return np.nansum(products, axis=0) / np.maximum(count, 1), count
