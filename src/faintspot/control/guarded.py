@@ -13,10 +13,10 @@ from faintspot.control.telemetry import as_estimated, without_prior
 
 Floats = NDArray[np.float64]
 
-MEMORY_FRAMES = 400
+MEMORY_FRAMES = 100
 CORRELATED_FRAMES = 5  # over which residuals are alike
 FEWEST_FRAMES = 50  # before the first change
-STANDARD_ERRORS = 2.5  # by which one must leave less than the other
+STANDARD_ERRORS = 1.0  # by which one must leave less than the other
 
 
 class Guarded:
