@@ -115,7 +115,8 @@ def replayed(
         Frames at the start that are not scored.
     """
     frames = replayed_frames(make, telemetry, interaction, phase, delay_frames)
-    seen = float(frames[settle_frames:].mean())
+    with np.errstate(over="ignore", invalid="ignore"):
+        seen = float(frames[settle_frames:].mean())
     share = np.square(telemetry.trust[settle_frames:]).mean()
     return float(seen / share) if np.isfinite(seen) and share > 0 else math.inf
 
