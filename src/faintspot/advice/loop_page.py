@@ -128,7 +128,10 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
         return None
     figure = new_figure(WIDTH, 7.2)
     rows = []
-    for panel, name in zip(figure.subplots(2, 2).ravel(), spectra.measured, strict=True):
+    panels = figure.subplots(2, 2).ravel()
+    for panel in panels[len(spectra.measured) :]:
+        panel.set_visible(False)
+    for panel, name in zip(panels, spectra.measured, strict=False):
         measured, model = spectra.measured[name], spectra.model[name]
         panel.loglog(spectra.frequency_hz, measured, color=GREY, lw=1, label="measured")
         panel.loglog(spectra.frequency_hz, model, color=ARM_COLOURS[0], lw=1.6, label="found")

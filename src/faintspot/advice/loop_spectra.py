@@ -63,11 +63,12 @@ def modal_spectra(telemetry: OpenLoopTelemetry, found: Identified) -> ModalSpect
         (total - modes.sum(axis=0)) / others,
         (whole - expected.sum(axis=0)) / others,
     )
+    seen = [name for name, values in measured.items() if (values > 0).all()]  # few slopes have no focus
     density = 2 / rate
     return ModalSpectra(
         bins * rate / length,
-        {name: density * values for name, values in measured.items()},
-        {name: density * values for name, values in model.items()},
+        {name: density * measured[name] for name in seen},
+        {name: density * model[name] for name in seen},
         len(starts),
     )
 

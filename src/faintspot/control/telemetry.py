@@ -143,7 +143,10 @@ def replayed_frames(
             residual = slopes + interaction @ line.acting
             trust = telemetry.trust[frame]
             left[frame] = trust * residual
-            controller.update(as_estimated(residual, trust, controller), error[frame])
+            try:
+                controller.update(as_estimated(residual, trust, controller), error[frame])
+            except ArithmeticError:  # its commands are not finite
+                return np.full(len(left), np.inf)
         return np.asarray(np.square(left @ phase.T).sum(axis=1))
 
 
