@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from faintspot.spots.fixed_weights import FixedWeights as FixedWeights
     from faintspot.spots.psf import PSF as PSF
     from faintspot.spots.score import TrainedScore as TrainedScore
-    from faintspot.training import RunningPSF as RunningPSF
     from faintspot.training import learn_psf as learn_psf
     from faintspot.training import train_estimator as train_estimator
     from faintspot.wavefront import Wavefront as Wavefront
@@ -74,7 +73,6 @@ _HOMES = {
     "MeanFlux": "faintspot.pipeline.mean_flux",
     "MissingExtraError": "faintspot.base.errors",
     "PSF": "faintspot.spots.psf",
-    "RunningPSF": "faintspot.training",
     "Settings": "faintspot.pipeline.settings",
     "SlopePipeline": "faintspot.pipeline.slope_pipeline",
     "Slopes": "faintspot.pipeline.slopes",

@@ -17,7 +17,6 @@ from faintspot.spots.psf import PSF
 from faintspot.training.psf_learning import image_stack, learn_psf, learn_psf_from_images
 from faintspot.training.registration import Tables, register
 from faintspot.training.registration import start as first_positions
-from faintspot.training.running_psf import RunningPSF
 
 
 @pytest.mark.parametrize(
@@ -157,34 +156,6 @@ def test_wrong_scope() -> None:
     for scope in ("pupil", [1, 2, 3]):
         with pytest.raises(InputError, match="scope"):
             learn_psf(np.ones((16, 32)), layout, scope=scope)
-
-
-def test_a_running_psf_follows_a_change() -> None:
-    rng = np.random.default_rng(12)
-    before, after = true_psf("gaussian"), true_psf("elongated")
-    camera = Calibration(read_noise_e=0.1)
-    running = RunningPSF(before, calibration=camera, forgetting=0.9, refit_every=5, rng=rng)
-    for number in range(40):
-        images, positions = simulated(rng, after, 50, 100.0, 0.1)
-        close = positions + 0.3 * rng.standard_normal(positions.shape)
-        running.update(images, close if number % 2 else None)
-    fresh, positions = simulated(rng, after, 2000, 100.0, 0.1)
-    best = slope_error(after, fresh, positions, 0.1)
-    assert slope_error(before, fresh, positions, 0.1) > 1.1 * best
-    assert slope_error(running.psf, fresh, positions, 0.1) < 1.03 * best
-    assert abs(running.background_e[0]) < 0.05
-
-
-def test_a_running_psf_survives_the_dark() -> None:
-    psf = true_psf("gaussian")
-    running = RunningPSF(psf, calibration=Calibration(read_noise_e=0.1), refit_every=1)
-    learnt = running.update(np.zeros((10, 16, 16)))
-    fresh, positions = simulated(np.random.default_rng(1), psf, 200, 1000.0, 0.1)
-    assert slope_error(learnt, fresh, positions, 0.1) < 1.02 * slope_error(psf, fresh, positions, 0.1)
-    with pytest.raises(InputError, match="positions"):
-        running.update(np.zeros((10, 16, 16)), np.zeros((3, 2)))
-    with pytest.raises(InputError, match="index"):
-        running.update(np.zeros((10, 16, 16)), index=[0])
 
 
 def test_real_spots() -> None:

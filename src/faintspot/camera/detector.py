@@ -124,10 +124,8 @@ class Detector:
     ) -> Detector:
         """Return a CMOS camera, whose pixels have amplifiers of their own.
 
-        The read noise follows a log-normal distribution, with a tail of noisy pixels as real cameras have:
-        data sheets of scientific CMOS cameras state medians of about 1 e- (Andor Zyla 5.5: 1.38 e-) and root
-        mean squares of 1.3 to 1.7 times that, and those of photon-counting ones about 0.3 e-. What the
-        distribution means for slopes was studied by Basden (2015, JATIS 1, 039002; arXiv:1506.07929).
+        The read noise follows a log-normal distribution, with a tail of noisy pixels. The effect of such
+        distributions on slopes was studied by Basden (2015, JATIS 1, 039002; arXiv:1506.07929).
 
         Parameters
         ----------

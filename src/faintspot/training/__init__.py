@@ -3,13 +3,11 @@
 from faintspot.training.centroid_gain import CentroidGain, measure_centroid_gain
 from faintspot.training.psf_learning import LearntPSF, learn_psf, learn_psf_from_images
 from faintspot.training.recorded import train_from_frames
-from faintspot.training.running_psf import RunningPSF
 from faintspot.training.simulation import train_estimator
 
 __all__ = [
     "CentroidGain",
     "LearntPSF",
-    "RunningPSF",
     "learn_psf",
     "learn_psf_from_images",
     "measure_centroid_gain",

@@ -29,14 +29,14 @@ class Sums:
     image: float = 0.0
     """Sum of weight * image."""
 
-    def combined(self, other: Sums, keep: float = 1.0) -> Sums:
-        """Return `keep` times these sums, and another's."""
+    def combined(self, other: Sums) -> Sums:
+        """Return these sums plus another's."""
         return Sums(
-            keep * self.square + other.square,
-            keep * self.cross + other.cross,
-            keep * self.product + other.product,
-            keep * self.weight + other.weight,
-            keep * self.image + other.image,
+            self.square + other.square,
+            self.cross + other.cross,
+            self.product + other.product,
+            self.weight + other.weight,
+            self.image + other.image,
         )
 
     def folded(self, transform: Any) -> Sums:
