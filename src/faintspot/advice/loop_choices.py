@@ -154,7 +154,7 @@ def _choice(
     total_error = math.hypot(error, scale.fitting_error_nm2)
     wave = (2 * math.pi / scale.wavelength_nm) ** 2
     strehl = math.exp(-wave * total) if math.isfinite(total) else math.nan
-    remark = "" if math.isfinite(total) else "r0, pixel_scale_arcsec or subaperture_m is not known"
+    remark = "" if math.isfinite(total) else "r0, pixel_scale_arcsec or subaperture_m is unknown"
     return Choice(
         name,
         _root("residual", scale.unit, square, error),

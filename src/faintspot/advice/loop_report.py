@@ -135,7 +135,7 @@ def _loop(report: LoopReport, _: None) -> LoopDelay | None:
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
     if loop.commands is None or loop.interaction is None:
         absent = "commands" if loop.commands is None else "an interaction or control matrix"
-        why = f"The recording has no {absent}: slopes without the mirror's part are not known."
+        why = f"The recording has no {absent}: its open-loop slopes are unknown."
         for name in ("loop", "turbulence", "vibrations", "spectra", "choices"):
             report.parts[name].missing = why
         return LoopDelay(1.0, 0.0, 1.0, 0.0)
@@ -224,7 +224,7 @@ def _turbulence(report: LoopReport, found: tuple[OpenLoop, LoopDelay]) -> tuple[
     if loop.subaperture_m is None:
         part.missing = "Without subaperture_m (or diameter_m) neither r0 nor winds are known."
         return found
-    r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is not known")
+    r0 = Measured("r0 at 500 nm", "m", remark="pixel_scale_arcsec is unknown")
     if loop.pixel_scale_arcsec is not None:
         shaking = sum(each.rms_px**2 for each in identified.vibrations)
         part.known += outer_scale_and_r0(

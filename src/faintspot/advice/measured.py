@@ -46,9 +46,9 @@ class Measured:
     value: float = math.nan
     """Measured value; NaN: not known."""
     error: float = math.nan
-    """Standard error; NaN if it is not known."""
+    """Standard error; NaN if unknown."""
     remark: str = ""
-    """Reason why it is not known, or assumptions of the value."""
+    """Reason why it is unknown, or assumptions of the value."""
 
     def with_relative_error(self, more: float) -> Measured:
         """Return the quantity with a further independent error, relative to its value."""
@@ -63,7 +63,7 @@ class Measured:
         return self.value / factor, self.value * factor
 
     def as_values(self) -> dict[str, Any]:
-        """Return plain values, for JSON; None is not known."""
+        """Return plain values, for JSON; None if unknown."""
         low, high = self.interval
         numbers = {"value": self.value, "error": self.error, "low": low, "high": high}
         plain = {name: value if math.isfinite(value) else None for name, value in numbers.items()}

@@ -44,7 +44,7 @@ _TABLES = (".npz", ".npy", ".csv", ".txt")
 
 @dataclass(frozen=True, eq=False)
 class RecordedLoop:
-    """Slopes and commands of a loop with n sub-apertures; None is not known."""
+    """Slopes and commands of a loop with n sub-apertures; None if unknown."""
 
     name: str
     slopes: Floats
