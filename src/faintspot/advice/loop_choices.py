@@ -1,4 +1,4 @@
-"""What other controllers would have left of the turbulence of a recorded loop, by replay of its slopes."""
+"""Residual wavefront of other controllers, by replay of the slopes of a recorded loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording of a loop tells of noise, turbulence, vibrations and control, each with its error."""
+"""Report of a recorded loop: noise, turbulence, vibrations and control, each with its error."""
 
 from __future__ import annotations
 

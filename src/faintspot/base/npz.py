@@ -169,7 +169,7 @@ class NpzFile:
     """Object with arrays and numbers that are its constructor's arguments, saved in an .npz file."""
 
     WHAT: ClassVar[str]
-    """What a file holds, for errors."""
+    """Kind of file, named in errors."""
     FIELDS: ClassVar[tuple[str, ...]]
     """Names of the values in a file."""
     OPTIONAL: ClassVar[tuple[str, ...]] = ("index",)

@@ -195,7 +195,7 @@ class StreamCounters:
 
 
 class Follower:
-    """Connection to a stream by its name: it may be missing, unusable, removed and recreated.
+    """Connection to a named stream, which may be missing, unusable, removed or recreated.
 
     Parameters
     ----------
