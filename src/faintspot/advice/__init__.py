@@ -1,1 +1,1 @@
-"""Advice for a running loop: measurements from its telemetry, possible improvements, and their tests."""
+"""Measurements from the telemetry of running or recorded loops."""

@@ -36,18 +36,18 @@ _R0_WAVELENGTH_NM = 500.0
 
 @dataclass(frozen=True)
 class Choice:
-    """A controller and what it would have left in the second half of the recording."""
+    """Controller and its replayed residual in the second half of the recording."""
 
     name: str
     residual: Measured
-    """Wavefront that the mirror could have corrected, rms."""
+    """Rms of the residual wavefront within the mirror's reach."""
     less: Measured
-    """Root of the variance that the loop as it ran has left more; below 0: less."""
+    """Root of the variance saved relative to the loop as it ran; negative if it is larger."""
     total: Measured
-    """With the fitting error."""
+    """Strehl ratio, including the fitting error."""
     strehl: Measured
     gain: float = math.nan
-    """Of an integrator."""
+    """Gain of an integrator."""
 
     def as_values(self) -> dict[str, Any]:
         """Return plain values."""
@@ -111,7 +111,7 @@ def compared_choices(
 
 @dataclass(frozen=True)
 class _Scale:
-    """From the unit of phases to wavefronts and the Strehl ratio."""
+    """Conversion of phase variances to wavefronts and Strehl ratios."""
 
     unit: str
     factor: float
@@ -119,7 +119,7 @@ class _Scale:
     fitting_error_nm2: float
     wavelength_nm: float
     gain_error: float
-    """Relative error of variances due to the centroid gain: spots that move far have another one."""
+    """Relative error of variances due to the centroid gain, which differs for large displacements."""
 
     @classmethod
     def of(cls, loop: RecordedLoop, r0: Measured, delay: LoopDelay) -> _Scale:
@@ -176,7 +176,7 @@ def _root(name: str, unit: str, square: float, error: float, remark: str = "") -
 
 
 def _whole(telemetry: OpenLoopTelemetry) -> NDArray[np.bool_]:
-    """Return the frames in which all slopes were measured, or half of the most."""
+    """Return the frames with all slopes, or with at least half of the largest number."""
     share = telemetry.trust.mean(axis=1)
     return np.asarray(share >= max(0.999 * float(share.max()), 1e-9))
 

@@ -122,7 +122,7 @@ def _wind_figure(report: LoopReport) -> FigureWithData | None:
 
 @styled
 def _spectra_figure(report: LoopReport) -> FigureWithData | None:
-    """Draw spectra of open-loop slopes and of what was found in them."""
+    """Draw spectra of open-loop slopes and of the fitted model."""
     spectra = report.spectra
     if spectra is None:
         return None
@@ -147,7 +147,7 @@ def _spectra_figure(report: LoopReport) -> FigureWithData | None:
 
 @styled
 def _gain_figure(report: LoopReport) -> FigureWithData | None:
-    """Draw the residual against the gain of an integrator, and what the loop and the filter have left."""
+    """Draw the residual of integrators against gain, and those of the loop and the filter."""
     curve = [each for each in report.choices if np.isfinite(each.gain) and each.name != BEST]
     curve = [each for each in curve if np.isfinite(each.residual.value)]
     if not curve:

@@ -35,7 +35,7 @@ class Part:
     title: str
     known: list[Measured] = field(default_factory=list)
     missing: str = ""
-    """Why there is nothing, or what else cannot be known."""
+    """Reason for missing values."""
 
 
 @dataclass
@@ -69,7 +69,7 @@ class LoopReport:
 
 
 def report_of_loop(loop: RecordedLoop, progress: Callable[[str], None] = lambda _: None) -> LoopReport:
-    """Measure what a recording of a loop tells.
+    """Analyse a recorded loop.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _frames(report: LoopReport) -> None:
 
 
 def _loop(report: LoopReport, _: None) -> LoopDelay | None:
-    """Return delay and gain; None where open-loop slopes cannot be known."""
+    """Return delay and gain; None without open-loop slopes."""
     loop, part = report.loop, report.parts["loop"]
     part.known.append(_saturated(loop))
     is_still = loop.commands is None or not np.ptp(loop.commands, axis=0).any()
@@ -145,7 +145,7 @@ def _loop(report: LoopReport, _: None) -> LoopDelay | None:
 
 
 def _delay(loop: RecordedLoop) -> tuple[list[Measured], LoopDelay]:
-    """Return delay and gain as reported, and as used: whole frames where nothing is against it."""
+    """Return delay and gain as reported and as used, the latter rounded to whole frames if consistent."""
     assert loop.commands is not None
     assert loop.interaction is not None
     names, given = (("delay", "frames"), ("centroid gain", "")), loop.delay_frames

@@ -1,4 +1,4 @@
-"""Spectra of open-loop slopes, and those of the turbulence, noise and vibrations found in them."""
+"""Spectra of open-loop slopes and of the fitted turbulence, noise and vibrations."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class ModalSpectra:
     measured: dict[str, Floats]
     model: dict[str, Floats]
     pieces: int
-    """Number of half-overlapping pieces that the mean is of."""
+    """Number of averaged half-overlapping pieces."""
 
 
 def modal_spectra(telemetry: OpenLoopTelemetry, found: Identified) -> ModalSpectra:
-    """Return measured spectra and those of what was found.
+    """Return measured and fitted spectra.
 
     Raises
     ------

@@ -44,7 +44,7 @@ class Measured:
     name: str
     unit: str
     value: float = math.nan
-    """Measured value; NaN: not known."""
+    """Measured value; NaN if unknown."""
     error: float = math.nan
     """Standard error; NaN if unknown."""
     remark: str = ""

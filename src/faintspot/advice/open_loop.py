@@ -1,4 +1,4 @@
-"""Open-loop slopes of a recorded loop, and the noise that they show."""
+"""Open-loop slopes of a recorded loop and their noise."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class OpenLoop:
 
     @property
     def variance(self) -> Floats:
-        """(2 n,): of the noise."""
+        """(2 n,): standard deviation of the noise."""
         return np.asarray(np.min(self.telemetry.variance_px2, axis=0))
 
 
@@ -53,7 +53,7 @@ def runs_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
-    """Return open-loop slopes, with the noise that deviations from a parabola in time show.
+    """Return open-loop slopes, with the noise from deviations from a parabola in time.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def open_loop_of(loop: RecordedLoop, delay: LoopDelay) -> OpenLoop:
 
 
 def _held(loop: RecordedLoop, delay: LoopDelay) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return what the mirror added to the slopes of each frame, and whether that is known."""
+    """Return the slopes of the mirror in each frame, and whether they are known."""
     held, known = np.zeros_like(loop.slopes), np.ones(len(loop.slopes), np.bool_)
     if loop.commands is None or loop.interaction is None or not loop.is_closed:
         return held, known

@@ -1,4 +1,4 @@
-"""A recorded loop of any system: slopes, commands and what is known of its geometry."""
+"""Recorded loop of any system: slopes, commands and geometry."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class RecordedLoop:
     science_wavelength_m: float = SCIENCE_WAVELENGTH_M
     is_closed: bool = True
     remarks: tuple[str, ...] = ()
-    """What was assumed."""
+    """Assumptions made."""
 
     def __post_init__(self) -> None:
         n, slopes = len(self.cells), self.slopes.shape
@@ -296,7 +296,7 @@ def _timing(values: dict[str, Any], frames: int, rate: float | None) -> tuple[ND
 
 
 def _with_sign(loop: RecordedLoop) -> RecordedLoop:
-    """Return a loop whose commands add to the slopes: they go against the slopes that they follow from."""
+    """Return a loop with the sign of commands such that they add to the slopes."""
     if loop.commands is None or loop.interaction is None or not loop.is_closed:
         return loop
     change = np.diff(loop.commands, axis=0) @ loop.interaction.T

@@ -1,4 +1,4 @@
-"""Delay and centroid gain of a closed loop, from its slopes and commands alone.
+"""Delay and centroid gain of a closed loop from its slopes and commands.
 
 With the right delay and gain, slopes without the mirror's part are turbulence and white noise. With wrong
 ones the noise that the loop has sent to the mirror is left in them and modulates their spectrum. So the mean
@@ -39,7 +39,7 @@ class LoopDelay:
     """The command computed from frame k acts first during frame k + delay; fractions: within it."""
     delay_error: float
     gain: float
-    """Slope measured for a slope of 1 px of the interaction matrix."""
+    """Centroid gain relative to the interaction matrix."""
     gain_error: float
 
 
@@ -127,7 +127,7 @@ def _products(slopes: Floats, held: Floats, run: NDArray[np.int64], window: Floa
 
 
 def _spectra(products: Floats, delay: float, gains: Floats) -> Floats:
-    """Return mean spectra (gains, frequencies) of slopes without the mirror's part."""
+    """Return mean spectra (gains, frequencies) of open-loop slopes."""
     whole = min(int(delay), _MOST_DELAY)
     weight = np.zeros((len(gains), products.shape[1]))
     weight[:, 0] = 1.0
@@ -154,7 +154,7 @@ def _turbulence(site: SlopeTurbulence, rate_hz: float, window: Floats) -> Floats
 
 
 def _misfit(spectra: Floats, parts: Floats) -> Floats:
-    """Return half the deviance of spectra (k, frequencies) from the best sums of positive parts, (k,)."""
+    """Return half the deviance of spectra (k, frequencies) from non-negative sums of components, (k,)."""
     strength = 0.1 * spectra.mean(axis=1)[:, None] / parts.mean(axis=1)
     for _ in range(_UPDATES):
         model = strength @ parts
