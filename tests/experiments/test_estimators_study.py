@@ -98,7 +98,7 @@ def test_enough_photons() -> None:
 def test_findings_count_cells() -> None:
     found = findings(study())
     assert found[0].startswith("ml: photon efficiency of at least 0.95 in 0 of 10 cells")
-    assert "map has the smallest R of all arms" in " ".join(found)
+    assert "map has the smallest R of all methods" in " ".join(found)
     assert "d/r0 up to 1, 4 cells" in " ".join(found)
     assert "ml 4 (worst 0 %)" in " ".join(found)
     assert findings(study(unfinished=range(21))) == []

@@ -290,10 +290,11 @@ class Follower:
 
     def wait(self, limit_s: float) -> bool:
         """Wait up to `limit_s` for a new publication, else look for the stream; return whether one came."""
-        source = self.source
-        if source is not None and source.wait(self.seen, limit_s):
+        if self.source is not None and self.source.wait(self.seen, limit_s):
             return True
-        self.look()
+        opened = self.look()
+        if opened is not None:
+            return opened.wait(self.seen, limit_s)
         if self.source is None:
             time.sleep(limit_s)
         return False
